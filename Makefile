@@ -1,0 +1,74 @@
+# The only door: people, hooks and CI call the same targets. `make help` lists them.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+CACHE := $(CURDIR)/.cache
+# Compiled planner: kept beside the checkout, so that the second start is quick.
+export NUMBA_CACHE_DIR ?= $(CACHE)/numba
+
+PACKAGES := common robot_client cloud_server loadgen
+BENCH_READY := $(VENV)/.bench-ready
+DEV_READY := $(VENV)/.dev-ready
+
+.PHONY: help demo install format lint type test unit integration compose up down table lock wheel clean
+
+help: ## list the targets
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+
+demo: $(BENCH_READY) ## 350 plans on a real map, three processes on loopback; writes out/demo/
+	$(BIN)/loadgen demo --out out/demo
+
+install: $(DEV_READY) ## everything for working on the code
+
+format: $(DEV_READY) ## rewrite the code in the house's format
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+lint: $(DEV_READY) ## ruff
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+type: $(DEV_READY) ## mypy, strict on the four packages
+	$(BIN)/mypy
+
+test: $(DEV_READY) ## every test that this machine can run; what is skipped says why
+	$(BIN)/pytest
+
+unit: $(DEV_READY) ## tests without sockets
+	$(BIN)/pytest tests/unit
+
+integration: $(DEV_READY) ## tests with real sockets and processes
+	$(BIN)/pytest tests/integration
+
+compose: $(DEV_READY) ## tests with real containers; needs a Docker engine
+	$(BIN)/pytest tests/compose
+
+up: ## the three containers, then the robot's table; the server stays up
+	docker compose up --build
+
+down: ## remove the containers and their volumes
+	docker compose down --volumes
+
+table: $(BENCH_READY) ## Table II of the last demo
+	$(BIN)/loadgen table out/demo/trace.jsonl --windows 5,10,20,30,40,50
+
+wheel: $(DEV_READY) ## build dist/*.whl
+	$(BIN)/python -m build --wheel
+
+lock: ## pin every dependency with hashes
+	$(PYTHON) requirements/lock.py
+
+clean: ## remove what the targets made, but out/
+	rm -rf $(VENV) $(CACHE) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
+
+$(BENCH_READY): requirements/bench.txt pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --require-hashes -r requirements/bench.txt
+	$(BIN)/python -m pip install --quiet --no-deps --editable .
+	touch $@
+
+$(DEV_READY): requirements/dev.txt pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --require-hashes -r requirements/dev.txt
+	$(BIN)/python -m pip install --quiet --no-deps --editable .
+	touch $@ $(BENCH_READY)

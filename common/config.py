@@ -1,0 +1,256 @@
+"""Settings of a process: a frozen dataclass filled from flag, environment, TOML file, default, in that order.
+
+What the settings are is the business of each process's own `config.py`.
+"""
+
+import argparse
+import dataclasses
+import difflib
+import sys
+import tomllib
+import types
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
+
+from common.errors import ConfigError, DataError, OffloadError
+
+C = TypeVar("C")
+
+REQUIRED: Any = dataclasses.MISSING
+
+
+def setting(
+    default: Any,
+    help: str,
+    *,
+    name: str | None = None,
+    minimum: float | None = None,
+    maximum: float | None = None,
+    choices: Sequence[str] | None = None,
+    metavar: str | None = None,
+) -> Any:
+    """One field of a config dataclass; `name` is the flag where it is not the field's own name."""
+    metadata = {"help": help, "name": name, "metavar": metavar}
+    bounds = {"minimum": minimum, "maximum": maximum, "choices": choices}
+    return dataclasses.field(default=default, metadata=metadata | bounds)
+
+
+def check(config: Any) -> None:
+    """Call from `__post_init__`: every value is within its bounds, or ConfigError names it."""
+    for field in dataclasses.fields(config):
+        if field.metadata:
+            _check_value(f"--{_flag(field)}", field, getattr(config, field.name))
+
+
+def load(
+    cls: type[C],
+    argv: Sequence[str],
+    *,
+    prog: str,
+    description: str,
+    environ: Mapping[str, str],
+    prefix: str,
+) -> C:
+    """Build `cls` from `argv`, then `PREFIX_NAME` in `environ`, then the TOML file of `--config`."""
+    parser = CommandParser(prog=prog, description=description)
+    add_flags(parser, cls)
+    parser.add_argument("--config", type=Path, metavar="FILE", help="TOML file with the same names")
+    return resolve(cls, parser.parse_args(argv), environ=environ, prefix=prefix)
+
+
+def resolve(cls: type[C], flags: argparse.Namespace, *, environ: Mapping[str, str], prefix: str) -> C:
+    """Merge parsed flags, environment and the `--config` file into one checked `cls`."""
+    from_file = _read_toml(getattr(flags, "config", None), cls)
+    values: dict[str, Any] = {}
+    for field in _settings(cls):
+        name = _flag(field)
+        variable = f"{prefix}_{name.upper().replace('-', '_')}"
+        flag = getattr(flags, field.name, None)
+        if flag is not None:
+            values[field.name] = _convert(f"--{name}", field, cls, flag)
+        elif environ.get(variable, "") != "":
+            values[field.name] = _convert(variable, field, cls, environ[variable])
+        elif name in from_file:
+            values[field.name] = _convert(f"{flags.config}: {name}", field, cls, from_file[name])
+        elif field.default is REQUIRED:
+            raise ConfigError(f"--{name} is missing: {field.metadata['help']}")
+    return cls(**values)
+
+
+def from_table(cls: type[C], table: Mapping[str, Any], path: Path, section: str) -> C:
+    """Fill `cls` from one table of a TOML file; unknown keys and wrong values name file and key."""
+    fields = {_flag(field): field for field in _settings(cls)}
+    for key in table:
+        if key not in fields:
+            raise unknown_key(path, key, list(fields))
+    try:
+        return cls(
+            **{
+                field.name: _convert(f"{path}: {section}.{name}", field, cls, table[name])
+                for name, field in fields.items()
+                if name in table or (field.default is REQUIRED and _missing(path, section, name))
+            }
+        )
+    except ConfigError as error:
+        raise DataError(str(error)) from error
+
+
+def add_flags(parser: argparse.ArgumentParser, cls: type) -> None:
+    """One flag a setting; values stay text until `resolve` converts them."""
+    for field in _settings(cls):
+        help = field.metadata["help"]
+        if field.default is not REQUIRED and field.default not in (None, ()):
+            help += f" (default: {_shown(field.default)})"
+        parser.add_argument(
+            f"--{_flag(field)}",
+            dest=field.name,
+            metavar=field.metadata["metavar"] or _metavar(field, cls),
+            help=help.replace("%", "%%"),
+            **_arity(field, cls),
+        )
+
+
+def as_dict(config: Any) -> dict[str, Any]:
+    """The resolved settings under their flag names, for the log line at start and `/config`."""
+    return {_flag(f): _plain(getattr(config, f.name)) for f in dataclasses.fields(config)}
+
+
+def unknown_key(path: Path, key: str, known: Sequence[str]) -> DataError:
+    """The error for a TOML key nobody reads: file, line and the nearest key that is read."""
+    starts = (key, f"[{key}", f"[[{key}")
+    lines = enumerate(path.read_text().splitlines(), 1)
+    line = next((number for number, text in lines if text.strip().startswith(starts)), 1)
+    near = difflib.get_close_matches(key, known, n=1)
+    hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(sorted(known))}"
+    return DataError(f"{path}:{line}: unknown key {key!r}; {hint}")
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The file's tables, or DataError naming file and line."""
+    try:
+        return tomllib.loads(path.read_text())
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise DataError(f"{path}: {error}") from error
+
+
+class CommandParser(argparse.ArgumentParser):
+    """argparse that says what is wrong in one line, exit code 2."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+
+def run_command(prog: str, command: Callable[[], int]) -> int:
+    """Run a console command; a user's mistake is one line and 2, a failed run one line and 1."""
+    try:
+        return command()
+    except (ConfigError, DataError) as error:
+        print(f"{prog}: {error}", file=sys.stderr)
+        return 2
+    except OffloadError as error:
+        print(f"{prog}: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+
+
+def _settings(cls: type) -> list[dataclasses.Field[Any]]:
+    return [f for f in dataclasses.fields(cls) if f.metadata]
+
+
+def _flag(field: dataclasses.Field[Any]) -> str:
+    return field.metadata.get("name") or field.name.replace("_", "-")
+
+
+def _base_type(field: dataclasses.Field[Any], cls: type) -> tuple[type, bool]:
+    """The field's plain type, and whether it takes many values (`tuple[T, ...]`)."""
+    hint = typing.get_type_hints(cls)[field.name]
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        hint = next(arg for arg in typing.get_args(hint) if arg is not type(None))
+    if typing.get_origin(hint) is tuple:
+        return typing.get_args(hint)[0], True
+    return hint, False
+
+
+def _metavar(field: dataclasses.Field[Any], cls: type) -> str:
+    if field.metadata["choices"]:
+        return "|".join(field.metadata["choices"])
+    base, _ = _base_type(field, cls)
+    return {int: "K", float: "X", Path: "FILE"}.get(base, "TEXT")
+
+
+def _arity(field: dataclasses.Field[Any], cls: type) -> dict[str, Any]:
+    base, many = _base_type(field, cls)
+    if base is bool:
+        return {"nargs": "?", "const": "true"}
+    return {"action": "append"} if many else {}
+
+
+def _convert(where: str, field: dataclasses.Field[Any], cls: type, value: Any) -> Any:
+    base, many = _base_type(field, cls)
+    if many:
+        items = value.split(",") if isinstance(value, str) else value
+        if not isinstance(items, list):
+            raise ConfigError(f"{where}: {value!r} is not a list")
+        parts = [part for item in items for part in (item.split(",") if isinstance(item, str) else [item])]
+        converted: Any = tuple(_convert_one(where, base, part) for part in parts)
+    else:
+        converted = _convert_one(where, base, value)
+    _check_value(where, field, converted)
+    return converted
+
+
+def _convert_one(where: str, base: type, value: Any) -> Any:
+    text = str(value).strip()
+    if base is bool:
+        if text.lower() in ("1", "true", "yes", "on"):
+            return True
+        if text.lower() in ("0", "false", "no", "off"):
+            return False
+        raise ConfigError(f"{where}: {text!r} is neither true nor false")
+    try:
+        return base(text)
+    except ValueError:
+        wanted = {int: "a whole number", float: "a number"}.get(base, base.__name__)
+        raise ConfigError(f"{where}: {text!r} is not {wanted}") from None
+
+
+def _check_value(where: str, field: dataclasses.Field[Any], value: Any) -> None:
+    low, high = field.metadata["minimum"], field.metadata["maximum"]
+    choices = field.metadata["choices"]
+    for item in value if isinstance(value, tuple) else (value,):
+        if item is None:
+            continue
+        if choices and item not in choices:
+            raise ConfigError(f"{where}: {item!r} is not one of {', '.join(choices)}")
+        if low is not None and not item >= low:
+            raise ConfigError(f"{where}: {item} is below {low:g}, the least allowed")
+        if high is not None and not item <= high:
+            raise ConfigError(f"{where}: {item} is above {high:g}, the most allowed")
+
+
+def _read_toml(path: Path | None, cls: type) -> dict[str, Any]:
+    if path is None:
+        return {}
+    table = read_toml(path)
+    known = [_flag(field) for field in _settings(cls)]
+    for key in table:
+        if key not in known:
+            raise unknown_key(path, key, known)
+    return table
+
+
+def _missing(path: Path, section: str, name: str) -> NoReturn:
+    raise DataError(f"{path}: {section}.{name} is missing")
+
+
+def _shown(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+def _plain(value: Any) -> Any:
+    return str(value) if isinstance(value, Path) else list(value) if isinstance(value, tuple) else value

@@ -1,0 +1,128 @@
+"""What can be run: the `@task` decorator, the registry of kinds, loading task modules by name.
+
+Where a task runs is decided in `robot_client`; how it crosses the wire is `common.wire`.
+"""
+
+import hashlib
+import importlib
+import inspect
+import itertools
+import math
+import textwrap
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from common.errors import BadValue, ConfigError, UnknownTask
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+NAME_LENGTH_MAX = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A registered function.
+
+    `size` maps the function's arguments to the input size d (finite, >= 0); `types` are the dataclasses
+    that its arguments and result may hold; `warm` is called once a process before the first task; a kind
+    with `duplicate=False` is never run on two sites.
+    """
+
+    name: str
+    function: Callable[..., Any]
+    size: Callable[..., float]
+    duplicate: bool = True
+    types: tuple[type, ...] = ()
+    warm: Callable[[], None] | None = None
+    source_hash: str = ""
+
+    def bind(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:
+        """The call as positional arguments, defaults filled in; TypeError as Python itself would say it."""
+        bound = inspect.signature(self.function).bind(*args, **kwargs)
+        bound.apply_defaults()
+        return bound.args
+
+    def size_of(self, args: tuple[Any, ...]) -> float:
+        """Input size d of a call; BadValue where the size function gives no finite number >= 0."""
+        size = float(self.size(*args))
+        if not (math.isfinite(size) and size >= 0):
+            raise BadValue(f"task {self.name}: input size {size} is not a finite number >= 0")
+        return size
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One call of a kind: what to run, on what, and how big it is."""
+
+    kind: Kind
+    args: tuple[Any, ...]
+    size: float
+    id: int = field(default_factory=itertools.count(1).__next__)
+
+
+_kinds: dict[str, Kind] = {}
+
+
+def task(
+    name: str,
+    *,
+    size: Callable[..., float],
+    duplicate: bool = True,
+    types: tuple[type, ...] = (),
+    warm: Callable[[], None] | None = None,
+) -> Callable[[F], F]:
+    """Register a function as a kind of task; it stays an ordinary function.
+
+    The same module is loaded on both sides; a kind whose source differs there stays onboard.
+    """
+    if not name or len(name) > NAME_LENGTH_MAX or not name.isidentifier():
+        raise ConfigError(f"task name {name!r} is not an identifier of at most {NAME_LENGTH_MAX} characters")
+
+    def register(function: F) -> F:
+        kind = Kind(name, function, size, duplicate, types, warm, _source_hash(function))
+        known = _kinds.get(name)
+        if known is not None and known.source_hash != kind.source_hash:
+            raise ConfigError(f"task {name} is registered twice, with different source")
+        _kinds[name] = kind
+        return function
+
+    return register
+
+
+def kind_of(function: Callable[..., Any]) -> Kind:
+    """The kind that `function` was registered as."""
+    for kind in _kinds.values():
+        if kind.function is function:
+            return kind
+    raise UnknownTask(f"{getattr(function, '__qualname__', function)} is not a task; decorate it with @task")
+
+
+def kind_named(name: str) -> Kind:
+    try:
+        return _kinds[name]
+    except KeyError:
+        raise UnknownTask(f"no task named {name!r}; known: {', '.join(sorted(_kinds)) or 'none'}") from None
+
+
+def kinds() -> tuple[Kind, ...]:
+    """All kinds registered in this process."""
+    return tuple(_kinds.values())
+
+
+def load_modules(names: Iterable[str]) -> None:
+    """Import the modules that register tasks; ConfigError names one that cannot be imported."""
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            raise ConfigError(f"task module {name!r} cannot be imported: {error}") from error
+
+
+def _source_hash(function: Callable[..., Any]) -> str:
+    """SHA-256 of the function's source; empty, which equals no other, where the source is not to be had."""
+    try:
+        source = textwrap.dedent(inspect.getsource(function))
+    except (OSError, TypeError):
+        return ""
+    return hashlib.sha256(source.encode()).hexdigest()

@@ -1,0 +1,298 @@
+"""The messages between robot and server, version 1: a small msgpack header, then raw frames.
+
+Frame 0 is `[VERSION, type, fields]`; a reader ignores fields it does not know, so version 1 can grow.
+Arguments and results are `common.values`, whose names can be had from here too.
+"""
+
+import dataclasses
+import importlib.metadata
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgpack
+
+from common.blobs import BlobStore, Buffer, StoredBlob
+from common.errors import BadValue, ProtocolError
+from common.tasks import NAME_LENGTH_MAX
+from common.values import (
+    ARRAYS_MAX,
+    BLOB_BYTES_MIN,
+    BLOBS_MAX,
+    Body,
+    decode,
+    encode,
+    unpack_bounded,
+)
+
+__all__ = [
+    "BLOB_BYTES_MIN",
+    "VERSION",
+    "Blob",
+    "BlobStore",
+    "Body",
+    "Buffer",
+    "Cancel",
+    "Hello",
+    "Message",
+    "Ping",
+    "Pong",
+    "Reply",
+    "Request",
+    "StoredBlob",
+    "VersionMismatch",
+    "byte_count",
+    "decode",
+    "encode",
+    "pack",
+    "software_version",
+    "unpack",
+]
+
+VERSION = 1
+HEADER_BYTES_MAX = 64 * 1024
+FRAMES_MAX = 2 + ARRAYS_MAX  # header, value, its arrays
+TASKS_MAX = 256
+TEXT_LENGTH_MAX = 128  # software version, source hash
+ERROR_LENGTH_MAX = 2000
+ID_MAX = 2**63 - 1
+COUNT_MAX = 2**31 - 1
+SECONDS_MAX = 1e6
+DIGEST_BYTES = 32
+STATUSES = ("ok", "failed", "unknown_task", "busy", "expired", "need_blob")
+
+
+class VersionMismatch(ProtocolError):
+    """The peer speaks another version of the wire format."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hello:
+    """First message each way: the task names known, with the hash of each one's source."""
+
+    tasks: dict[str, str]
+    software: str
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """Run a task: `body` is the encoded list of its arguments, `blobs` the digests that it refers to.
+
+    `budget_s` is the time left when it was sent; `attempt` counts from 1 and grows when the same id is
+    sent again after `need_blob`.
+    """
+
+    id: int
+    kind: str
+    budget_s: float
+    attempt: int = 1
+    blobs: tuple[bytes, ...] = ()
+    body: list[Buffer] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """How a request went; `body` is the encoded result, empty unless `status` is ok."""
+
+    id: int
+    status: str
+    error: str = ""
+    queue_s: float = 0.0
+    run_s: float = 0.0
+    queue_depth: int = 0
+    missing: tuple[bytes, ...] = ()
+    body: list[Buffer] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class Ping:
+    id: int
+
+
+@dataclass(frozen=True, slots=True)
+class Pong:
+    id: int
+    queue_depth: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Cancel:
+    """The answer to this request is no longer wanted."""
+
+    id: int
+
+
+@dataclass(frozen=True, slots=True)
+class Blob:
+    """The bytes of one blob; the receiver computes the digest itself."""
+
+    data: Buffer
+
+
+Message = Hello | Request | Reply | Ping | Pong | Cancel | Blob
+
+
+def pack(message: Message) -> list[Buffer]:
+    """The frames of a message; buffers in it are not copied. BadValue where it breaks a bound."""
+    name, raw = type(message).__name__.lower(), _RAW.get(type(message))
+    fields = {f.name: getattr(message, f.name) for f in dataclasses.fields(message) if f.name != raw}
+    if isinstance(message, Reply):
+        fields["error"] = message.error[:ERROR_LENGTH_MAX].encode("utf-8", "replace").decode()
+    header: bytes = msgpack.packb([VERSION, name, fields])
+    frames: list[Buffer] = [header]
+    if isinstance(message, Request | Reply):
+        frames += message.body
+    elif isinstance(message, Blob):
+        frames.append(message.data)
+    if len(header) > HEADER_BYTES_MAX or len(frames) > FRAMES_MAX:
+        raise BadValue(f"a {name} with a header of {len(header)} bytes and {len(frames)} frames is too big")
+    return frames
+
+
+def unpack(frames: Sequence[Buffer]) -> Message:
+    """The message in `frames`; VersionMismatch for another version, ProtocolError for all else."""
+    if not 1 <= len(frames) <= FRAMES_MAX:
+        raise ProtocolError(f"message of {len(frames)} frames, 1 to {FRAMES_MAX} are allowed")
+    header = unpack_bounded(frames[0], HEADER_BYTES_MAX)
+    if not isinstance(header, list) or not header or type(header[0]) is not int:
+        raise ProtocolError("header is not [version, type, fields]")
+    if header[0] != VERSION:
+        raise VersionMismatch(f"peer speaks wire version {header[0]}, this is version {VERSION}")
+    if len(header) != 3 or not isinstance(header[1], str) or not isinstance(header[2], dict):
+        raise ProtocolError("header is not [version, type, fields]")
+    read = _READERS.get(header[1])
+    if read is None:
+        raise ProtocolError(f"unknown message type {header[1]!r:.80}")
+    return read(_Fields(header[1], header[2]), list(frames[1:]))
+
+
+def byte_count(frames: Iterable[Buffer]) -> int:
+    """Bytes in all frames, without transport headers."""
+    return sum(f.nbytes if isinstance(f, memoryview) else len(f) for f in frames)
+
+
+def software_version() -> str:
+    """Version of the installed package, as `hello` and `/health` say it."""
+    try:
+        return importlib.metadata.version("offboard")
+    except importlib.metadata.PackageNotFoundError:
+        return "uninstalled"
+
+
+class _Fields:
+    """Takes checked values out of a header's map."""
+
+    def __init__(self, message: str, values: dict[Any, Any]) -> None:
+        self.message = message
+        self.values = values
+
+    def whole(self, name: str, low: int, high: int) -> int:
+        value = self.values.get(name)
+        if type(value) is not int or not low <= value <= high:
+            raise self.wrong(name, f"a whole number {low} to {high}")
+        return value
+
+    def seconds(self, name: str) -> float:
+        value: Any = self.values.get(name)
+        if type(value) not in (int, float) or not (math.isfinite(value) and 0 <= value <= SECONDS_MAX):
+            raise self.wrong(name, f"a number 0 to {SECONDS_MAX:g}")
+        return float(value)
+
+    def text(self, name: str, length_max: int) -> str:
+        value = self.values.get(name)
+        if not isinstance(value, str) or len(value) > length_max:
+            raise self.wrong(name, f"a text of at most {length_max} characters")
+        return value
+
+    def digests(self, name: str) -> tuple[bytes, ...]:
+        value = self.values.get(name)
+        if not isinstance(value, list) or len(value) > BLOBS_MAX:
+            raise self.wrong(name, f"a list of at most {BLOBS_MAX} digests")
+        if not all(isinstance(item, bytes) and len(item) == DIGEST_BYTES for item in value):
+            raise self.wrong(name, f"a list of digests of {DIGEST_BYTES} bytes")
+        return tuple(value)
+
+    def tasks(self, name: str) -> dict[str, str]:
+        value = self.values.get(name)
+        if not isinstance(value, dict) or len(value) > TASKS_MAX:
+            raise self.wrong(name, f"a map of at most {TASKS_MAX} tasks")
+        for key, text in value.items():
+            if not (isinstance(key, str) and 0 < len(key) <= NAME_LENGTH_MAX):
+                raise self.wrong(name, f"a map of names of 1 to {NAME_LENGTH_MAX} characters")
+            if not (isinstance(text, str) and len(text) <= TEXT_LENGTH_MAX):
+                raise self.wrong(name, f"a map to texts of at most {TEXT_LENGTH_MAX} characters")
+        return value
+
+    def wrong(self, name: str, allowed: str) -> ProtocolError:
+        return ProtocolError(f"{self.message}.{name} is {self.values.get(name)!r:.80}, not {allowed}")
+
+
+def _hello(fields: _Fields, rest: list[Buffer]) -> Hello:
+    _frame_count("hello", rest, 0)
+    return Hello(fields.tasks("tasks"), fields.text("software", TEXT_LENGTH_MAX))
+
+
+def _request(fields: _Fields, rest: list[Buffer]) -> Request:
+    kind, budget_s = fields.text("kind", NAME_LENGTH_MAX), fields.seconds("budget_s")
+    if not kind or not budget_s > 0:
+        raise ProtocolError("request without a kind or a budget")
+    if not rest:
+        raise ProtocolError("request without a body")
+    attempt = fields.whole("attempt", 1, COUNT_MAX)
+    return Request(fields.whole("id", 0, ID_MAX), kind, budget_s, attempt, fields.digests("blobs"), rest)
+
+
+def _reply(fields: _Fields, rest: list[Buffer]) -> Reply:
+    status = fields.text("status", TEXT_LENGTH_MAX)
+    if status not in STATUSES:
+        raise fields.wrong("status", f"one of {', '.join(STATUSES)}")
+    if (status == "ok") != bool(rest):
+        raise ProtocolError(f"reply with status {status} and {len(rest)} body frames")
+    return Reply(
+        id=fields.whole("id", 0, ID_MAX),
+        status=status,
+        error=fields.text("error", ERROR_LENGTH_MAX),
+        queue_s=fields.seconds("queue_s"),
+        run_s=fields.seconds("run_s"),
+        queue_depth=fields.whole("queue_depth", 0, COUNT_MAX),
+        missing=fields.digests("missing"),
+        body=rest,
+    )
+
+
+def _ping(fields: _Fields, rest: list[Buffer]) -> Ping:
+    _frame_count("ping", rest, 0)
+    return Ping(fields.whole("id", 0, ID_MAX))
+
+
+def _pong(fields: _Fields, rest: list[Buffer]) -> Pong:
+    _frame_count("pong", rest, 0)
+    return Pong(fields.whole("id", 0, ID_MAX), fields.whole("queue_depth", 0, COUNT_MAX))
+
+
+def _cancel(fields: _Fields, rest: list[Buffer]) -> Cancel:
+    _frame_count("cancel", rest, 0)
+    return Cancel(fields.whole("id", 0, ID_MAX))
+
+
+def _blob(_: _Fields, rest: list[Buffer]) -> Blob:
+    _frame_count("blob", rest, 1)
+    return Blob(rest[0])
+
+
+def _frame_count(name: str, rest: list[Buffer], wanted: int) -> None:
+    if len(rest) != wanted:
+        raise ProtocolError(f"{name} with {len(rest)} frames after the header, not {wanted}")
+
+
+_RAW: dict[type, str] = {Request: "body", Reply: "body", Blob: "data"}
+_READERS: dict[str, Callable[[_Fields, list[Buffer]], Message]] = {
+    "hello": _hello,
+    "request": _request,
+    "reply": _reply,
+    "ping": _ping,
+    "pong": _pong,
+    "cancel": _cancel,
+    "blob": _blob,
+}

@@ -1,0 +1,86 @@
+"""The walls of the house: who may import whom."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+ROOMS = {
+    "common": set(),
+    "robot_client": {"common"},
+    "cloud_server": {"common"},
+    "loadgen": {"common", "robot_client"},
+}
+# Heavy or optional libraries, and the files that may import them.
+OWNERS = {
+    "zmq": {"robot_client/cloud.py", "cloud_server/server.py"},
+    "fastapi": {"cloud_server/web.py", "loadgen/control.py"},
+    "uvicorn": {"cloud_server/web.py", "loadgen/control.py"},
+    "numba": {"common/compiled.py"},
+    "PIL": {"common/maps.py"},
+    "yaml": {"common/maps.py"},
+}
+
+
+def imported(path: Path) -> set[str]:
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            assert node.level == 0, f"{path}: relative import"
+            names.add(node.module.partition(".")[0])
+    return names
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_imports_point_one_way(room: str) -> None:
+    """A package imports itself and the packages below it, and no other of ours."""
+    for path in (ROOT / room).rglob("*.py"):
+        ours = imported(path) & ROOMS.keys()
+        assert ours <= ROOMS[room] | {room}, f"{path} imports {sorted(ours)}"
+
+
+@pytest.mark.parametrize("library", OWNERS)
+def test_heavy_libraries_have_one_owner_a_room(library: str) -> None:
+    """A heavy or optional library is imported by the files that own it, and those do import it."""
+    users = {
+        str(path.relative_to(ROOT))
+        for room in ROOMS
+        for path in (ROOT / room).rglob("*.py")
+        if library in imported(path)
+    }
+    assert users == OWNERS[library]
+
+
+def test_the_robot_library_needs_no_extra() -> None:
+    """robot_client imports where fastapi, uvicorn, docker, numba, Pillow and yaml are absent."""
+    block = (
+        "import sys\n"
+        "for name in ('fastapi', 'uvicorn', 'docker', 'numba', 'PIL', 'yaml', 'httpx', 'rich'):\n"
+        "    sys.modules[name] = None\n"
+        "import robot_client, robot_client.cloud, robot_client.metrics\n"
+        "print(robot_client.Offloader.__name__)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True, cwd=ROOT, timeout=30)
+    assert done.stdout == "Offloader\n", done.stderr
+
+
+@pytest.mark.parametrize("command", ["robot_client", "cloud_server", "loadgen"])
+def test_help_loads_no_heavy_library(command: str) -> None:
+    """--help answers with exit code 0 without importing zmq, numba or fastapi."""
+    probe = (
+        "import runpy, sys\n"
+        f"sys.argv = [{command!r}, '--help']\n"
+        "try:\n"
+        f"    runpy.run_module({command!r}, run_name='__main__')\n"
+        "except SystemExit as end:\n"
+        "    assert end.code in (0, None), end.code\n"
+        "print([name for name in ('zmq', 'numba', 'fastapi') if name in sys.modules], file=sys.stderr)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, cwd=ROOT, timeout=30)
+    assert done.stderr == "[]\n", done.stderr
+    assert "--" in done.stdout

@@ -1,0 +1,300 @@
+"""The compiled search against a plain heap planner, and against the published optima of MovingAI."""
+
+import heapq
+import math
+import threading
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from common import maps, planner, search
+from common.flood import DISTANCE_MAX, STRAIGHT
+from common.search import Field, Hits
+
+ROOT = Path(__file__).parents[2]
+SAMPLES = ROOT / "tests/samples"
+MOVINGAI = ROOT.parent / "shared/maps/movingai"
+planner.warm()  # compiles before the clock of any test runs
+
+Cell = tuple[int, int]
+FACTORS = [(50 + 0.8 * cost) / 50 for cost in range(253)]
+
+
+def oracle(
+    free: NDArray[np.bool_], start: Cell, goal: Cell, costs: NDArray[np.uint8] | None = None
+) -> float | None:
+    """Textbook Dijkstra with a heap, plain Python; None when there is no path."""
+    open_: Any = free.tolist()
+    height, width = free.shape
+    weights: Any = (np.zeros(free.shape, np.uint8) if costs is None else costs).tolist()
+    best, heap = {start: 0.0}, [(0.0, start)]
+    while heap:
+        done, (row, col) = heapq.heappop(heap)
+        if (row, col) == goal:
+            return done
+        if done > best[row, col]:
+            continue
+        for dr in (-1, 0, 1):
+            for dc in (-1, 0, 1):
+                r, c = row + dr, col + dc
+                if not (0 <= r < height and 0 <= c < width and open_[r][c]):
+                    continue
+                if dr and dc and not (open_[row][c] and open_[r][col]):
+                    continue
+                length = done + math.hypot(dr, dc) * FACTORS[weights[r][c]]
+                if length < best.get((r, c), math.inf):
+                    best[r, c] = length
+                    heapq.heappush(heap, (length, (r, c)))
+    return None
+
+
+def path_cost(
+    free: NDArray[np.bool_], cells: NDArray[np.int32], costs: NDArray[np.uint8] | None = None
+) -> float:
+    """Length of a path, every move of which must be allowed."""
+    total = 0.0
+    for (row, col), (r, c) in zip(cells.tolist(), cells[1:].tolist(), strict=False):
+        assert max(abs(r - row), abs(c - col)) == 1
+        assert free[r, c]
+        assert free[row, c]
+        assert free[r, col]
+        total += math.hypot(r - row, c - col) * FACTORS[0 if costs is None else costs[r, c]]
+    return total
+
+
+def check(
+    free: NDArray[np.bool_], start: Cell, goal: Cell, route: search.Route, expected: float | None,
+    costs: NDArray[np.uint8] | None = None,
+) -> None:  # fmt: skip
+    if expected is None:
+        assert (route.status, len(route.cells)) == ("NO_VALID_PATH", 0)
+        return
+    assert route.status == "NONE"
+    assert route.cost == pytest.approx(expected, rel=1e-9, abs=1e-9)
+    assert (tuple(route.cells[0]), tuple(route.cells[-1])) == (start, goal)
+    assert path_cost(free, route.cells, costs) == pytest.approx(expected, rel=1e-9, abs=1e-9)
+
+
+def random_maze(rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Small maps of every kind: noise of any density, corridors one cell wide, single rows and columns."""
+    height, width = rng.integers(1, 13, 2)
+    free = rng.random((height, width)) > rng.choice([0.0, 0.2, 0.35, 0.5])
+    if rng.random() < 0.3:
+        free[1::2, rng.random(width) > 0.25] = False
+    return np.asarray(free)
+
+
+def random_cells(rng: np.random.Generator, free: NDArray[np.bool_]) -> tuple[Cell, Cell]:
+    choice = rng.choice(np.argwhere(free), 2)
+    return (int(choice[0][0]), int(choice[0][1])), (int(choice[1][0]), int(choice[1][1]))
+
+
+def test_two_thousand_small_mazes_equal_the_heap() -> None:
+    """Cost, path and reachability equal textbook Dijkstra's, plain and weighted alike."""
+    rng = np.random.default_rng(11)
+    unreachable = same = 0
+    for n in range(2_000):
+        free = random_maze(rng)
+        if not free.any():
+            continue
+        start, goal = random_cells(rng, free)
+        costs = None
+        if n % 2:
+            costs = np.where(free, rng.integers(0, 253, free.shape), 255).astype(np.uint8)
+            costs[start] = min(costs[start], 252)
+        expected = oracle(free, start, goal, costs)
+        blocked_by_cost = np.ones_like(free) if costs is not None else free
+        check(free, start, goal, Field(blocked_by_cost).route(start, goal, costs=costs), expected, costs)
+        unreachable += expected is None
+        same += start == goal
+    assert unreachable > 100
+    assert same > 10
+
+
+def test_a_corner_is_never_cut() -> None:
+    """Two free cells that touch at a corner are joined only round a free cell beside both."""
+    crossed = np.array([[1, 0], [0, 1]], np.bool_)
+    half = np.array([[1, 1], [0, 1]], np.bool_)
+    assert Field(crossed).route((0, 0), (1, 1)).status == "NO_VALID_PATH"
+    assert Field(half).route((0, 0), (1, 1)).cost == 2.0
+    assert Field(np.ones((2, 2), np.bool_)).route((0, 0), (1, 1)).cost == math.sqrt(2)
+
+
+def test_the_search_stops_at_the_goal() -> None:
+    """A near goal settles few cells of a large map, and start = goal none."""
+    field = Field(np.ones((400, 400), np.bool_))
+    assert field.route((200, 200), (200, 210)).expanded < 4 * 11**2
+    here = field.route((7, 7), (7, 7))
+    assert (here.status, here.cost, here.expanded, here.cells.tolist()) == ("NONE", 0.0, 0, [[7, 7]])
+
+
+def serpentine(side: int) -> NDArray[np.bool_]:
+    """One corridor of about side * side / 2 cells, folded."""
+    free = np.zeros((side, side), np.bool_)
+    free[::2] = True
+    free[1::4, -1] = True
+    free[3::4, 0] = True
+    return free
+
+
+def test_a_path_too_long_for_uint32_is_exact() -> None:
+    """Beyond 53,166 cells the float64 search takes over, and the corridor's length is exact."""
+    free = serpentine(331)
+    end = (330, 330 if (330 // 2) % 2 == 0 else 0)
+    moves = int(free.sum()) - 1
+    assert moves > 53_166
+    route = Field(free).route((0, 0), end)
+    assert (route.status, route.cost, len(route.cells)) == ("NONE", moves, moves + 1)
+
+
+def test_the_longest_path_that_uint32_holds_is_exact() -> None:
+    """Just below the bound no distance overflows."""
+    free = serpentine(331)
+    end = (330, 330 if (330 // 2) % 2 == 0 else 0)
+    moves = int(free[12:].sum()) - 1
+    assert 0 < DISTANCE_MAX / STRAIGHT - moves < 50
+    assert Field(free).route((12, 0), end).cost == moves
+
+
+@pytest.mark.parametrize("name", ["random512-10-0-crop", "32room_000-crop"])
+def test_the_float64_search_equals_the_uint32_search(name: str) -> None:
+    """Both kernels give the same cost and reach on real maps."""
+    grid = maps.read_map(SAMPLES / f"{name}.map")
+    field, level = Field(maps.passable(grid)), np.zeros(grid.cells.shape, np.uint8)
+    for start, goal in maps.free_pairs(grid, 100, seed=2).tolist():
+        plain, weighted = field.route(start, goal), field.route(start, goal, costs=level)
+        assert plain.cost == pytest.approx(weighted.cost, rel=1e-9)
+        assert abs(plain.expanded - weighted.expanded) <= plain.expanded * 0.05 + 50
+
+
+@pytest.mark.parametrize("name", ["random512-10-0-crop", "32room_000-crop"])
+def test_crops_of_the_benchmarks_equal_the_heap(name: str) -> None:
+    """On the samples in the repository every optimum is that of an independent planner."""
+    grid = maps.read_map(SAMPLES / f"{name}.map")
+    free = grid.cells == 0
+    field = Field(free)
+    rng = np.random.default_rng(8)
+    costs = rng.integers(0, 253, free.shape).astype(np.uint8)
+    for n in range(24):
+        start, goal = random_cells(rng, free)
+        weights = costs if n % 3 == 0 else None
+        expected = oracle(free, start, goal, weights)
+        check(free, start, goal, field.route(start, goal, costs=weights), expected, weights)
+
+
+@pytest.mark.skipif(not MOVINGAI.is_dir(), reason="the MovingAI files of ../shared/maps are not here")
+@pytest.mark.parametrize("part", [0, 1, 2])
+@pytest.mark.parametrize("name", ["arena", "32room_000", "random512-10-0", "Berlin_1_1024"])
+def test_published_optima(name: str, part: int) -> None:
+    """All problems of arena and 300 spread over each other file have the published length within 1e-3."""
+    grid = maps.read_map(MOVINGAI / f"{name}.map")
+    field = Field(maps.passable(grid))
+    problems = (MOVINGAI / f"{name}.map.scen").read_text().splitlines()[1:]
+    if name != "arena":
+        problems = [problems[k] for k in np.linspace(0, len(problems) - 1, 300).astype(int)]
+    assert len(problems) == (160 if name == "arena" else 300)
+    for line in problems[part::3]:
+        *_, x, y, goal_x, goal_y, optimum = line.split()
+        route = field.route((int(y), int(x)), (int(goal_y), int(goal_x)))
+        assert route.cost == pytest.approx(float(optimum), abs=1e-3), line
+
+
+def test_hits_block_their_discs_for_one_request_only() -> None:
+    """A route goes round the disc of a hit, and the next request does not know of it."""
+    free = np.ones((41, 41), np.bool_)
+    field = Field(free)
+    rng = np.random.default_rng(5)
+    before = field.route((20, 0), (20, 40))
+    for _ in range(20):
+        rows, cols = rng.integers(5, 36, (2, 3))
+        hits = Hits(rows, cols, rng.uniform(0, 4.5, 3))
+        world = free.copy()
+        for row, col in np.ndindex(free.shape):
+            world[row, col] = (np.hypot(row - rows, col - cols) > hits.reach).all()
+        route = field.route((20, 0), (20, 40), hits)
+        check(world, (20, 0), (20, 40), route, oracle(world, (20, 0), (20, 40)))
+        weighted = field.route((20, 0), (20, 40), hits, np.zeros(free.shape, np.uint8))
+        assert weighted.cost == pytest.approx(route.cost, rel=1e-9)
+        again = field.route((20, 0), (20, 40))
+        assert again.cells.tolist() == before.cells.tolist()
+
+
+def test_hits_at_the_border_stay_on_the_map() -> None:
+    """Discs that reach over the border, or hits outside the map, touch nothing else."""
+    field = Field(np.ones((9, 9), np.bool_))
+    outside = Hits(np.array([-3, 12, 4, 0]), np.array([4, 4, -50, 8]), np.array([1.0, 1.0, 2.0, 3.0]))
+    assert field.route((8, 0), (4, 4), outside).status == "NONE"
+    assert field.route((8, 0), (0, 8), outside).status == "GOAL_OCCUPIED"
+    assert field.route((0, 8), (8, 0), outside).status == "START_OCCUPIED"
+    assert field.route((0, 8), (8, 0)).cost == pytest.approx(8 * math.sqrt(2))
+
+
+def test_buckets_grow_when_a_frontier_is_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search that starts with room for a few cells grows and ends at the same answer."""
+    free = np.random.default_rng(1).random((200, 200)) > 0.1
+    free[0, 0] = free[199, 199] = True
+    costs = np.full(free.shape, 30, np.uint8)
+    wide = [Field(free).route((0, 0), (199, 199), costs=weights) for weights in (None, costs)]
+    monkeypatch.setattr(search, "_first_capacity", lambda *_: 8)
+    small = [Field(free).route((0, 0), (199, 199), costs=weights) for weights in (None, costs)]
+    for one, other in zip(wide, small, strict=True):
+        assert (one.cost, one.expanded) == (other.cost, other.expanded)
+        assert one.cells.tolist() == other.cells.tolist()
+
+
+def test_threads_on_one_map_do_not_meet() -> None:
+    """Four threads at once, plain and weighted and with hits, answer as each does alone."""
+    grid = maps.read_map(SAMPLES / "random512-10-0-crop.map")
+    field = Field(maps.passable(grid))
+    costs = np.random.default_rng(0).integers(0, 253, grid.cells.shape).astype(np.uint8)
+    pairs = maps.free_pairs(grid, 60, seed=9).tolist()
+    hits = Hits(np.arange(10, 120, 7), np.full(16, 64), np.full(16, 2.0))
+
+    def answers() -> list[tuple[str, float, list[list[int]]]]:
+        routes = []
+        for n, (start, goal) in enumerate(pairs):
+            seen = hits if n % 2 else search.NO_HITS
+            routes.append(field.route(start, goal, seen, costs if n % 3 == 0 else None))
+        return [(route.status, route.cost, route.cells.tolist()) for route in routes]
+
+    alone = answers()
+    together: list[object] = []
+    threads = [threading.Thread(target=lambda: together.append(answers())) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert together == [alone] * 4
+
+
+def test_requests_allocate_nothing_of_the_maps_size() -> None:
+    """After the first request of each form, the peak of another is far below one byte a cell."""
+    field = Field(np.ones((1000, 1000), np.bool_))
+    costs = np.zeros((1000, 1000), np.uint8)
+    for weights in (None, costs):
+        field.route((0, 0), (999, 999), costs=weights)
+    tracemalloc.start()
+    for weights in (None, costs):
+        for _ in range(3):
+            field.route((0, 0), (999, 999), costs=weights)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 200_000
+
+
+def test_idle_workspaces_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many searches ran at once, only so many workspaces are kept; a failed one is not."""
+    monkeypatch.setattr(search, "IDLE_MAX", 2)
+    pool = search._Pool(object)
+    borrowed = [pool.borrow() for _ in range(5)]
+    assert len({id(one.__enter__()) for one in borrowed}) == 5
+    for one in borrowed:
+        one.__exit__(None, None, None)
+    assert len(pool._idle) == 2
+    with pytest.raises(KeyError), pool.borrow():
+        raise KeyError
+    assert len(pool._idle) == 1
