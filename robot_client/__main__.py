@@ -1,0 +1,92 @@
+"""`robot-client`: a simulated robot that plans on a real map, each plan where its policy says."""
+
+import logging
+import os
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from typing import NoReturn
+
+from common.config import as_dict, load, run_command
+from common.errors import ConfigError
+from robot_client.config import RobotConfig
+from robot_client.runner import ONBOARD
+from robot_client.trace import Record
+
+log = logging.getLogger("robot_client")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    arguments = sys.argv[1:] if argv is None else argv
+    return run_command("robot-client", lambda: _run(arguments))
+
+
+def _run(argv: Sequence[str]) -> int:
+    config = load(
+        RobotConfig,
+        argv,
+        prog="robot-client",
+        description="Drive a simulated robot over a map; each plan runs onboard or in the cloud.",
+        environ=os.environ,
+        prefix="ROBOT",
+    )
+    logging.basicConfig(level=config.log.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    log.info("config %s", as_dict(config))
+    signal.signal(signal.SIGTERM, _interrupt)
+    return _drive(config)
+
+
+def _drive(config: RobotConfig) -> int:
+    # Loaded after the flags are read: --help answers without compiling anything.
+    from common.planner import plan_path
+    from robot_client.drive import Drive, read_prior
+    from robot_client.offloader import Offloader
+    from robot_client.trace import Trace
+
+    prior = read_prior(config.map, config.resolution)
+    trace = Trace(config.trace) if config.trace else None
+    observers = ([trace.write] if trace else []) + _metrics(config)
+    try:
+        with Offloader.connect(
+            config.cloud,
+            sites=config.sites(),
+            policy=config.policy,
+            predictor=config.predictor,
+            window=config.window,
+            timeout_s=config.timeout_s,
+            observers=observers,
+        ) as offload:
+            drive = Drive(config, prior, offload, print)
+            drive.warm()
+            for site, why in offload.wait_for_sites(plan_path, config.connect_s).items():
+                log.warning("starting without %s: %s; tasks run %s", site, why, ONBOARD)
+            return drive.run()
+    finally:
+        if trace:
+            trace.close()
+
+
+def _metrics(config: RobotConfig) -> list[Callable[[Record], None]]:
+    if config.metrics is None:
+        return []
+    from prometheus_client import CollectorRegistry
+
+    from robot_client.metrics import Metrics
+
+    host, _, port = config.metrics.rpartition(":")
+    if not host or not port.isdigit():
+        raise ConfigError(f"--metrics: {config.metrics!r} is not HOST:PORT")
+    metrics = Metrics(CollectorRegistry())
+    try:
+        metrics.serve(host, int(port))
+    except OSError as error:
+        raise ConfigError(f"--metrics: {config.metrics}: {error.strerror}") from error
+    return [metrics]
+
+
+def _interrupt(*_: object) -> NoReturn:
+    raise KeyboardInterrupt
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,333 @@
+"""The runner of a remote site: one DEALER socket, owned by one I/O thread.
+
+Answers are matched by id; whatever arrives late is dropped. What a message looks like is `common.wire`.
+"""
+
+import contextlib
+import heapq
+import logging
+import math
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import zmq
+import zmq.utils.monitor
+
+from common import VERSION as SOFTWARE
+from common import wire
+from common.errors import (
+    BadValue,
+    CloudBroken,
+    CloudBusy,
+    CloudError,
+    CloudTimeout,
+    ConfigError,
+    OffloadError,
+    ProtocolError,
+    TaskFailed,
+)
+from common.tasks import Kind, Task, kinds
+from robot_client.runner import CLOUD, Execution, check_endpoint
+
+PENDING_MAX = 1024
+ATTEMPTS_MAX = 4  # sends of one request: the first, and one after each `need_blob`
+MESSAGE_BYTES_MAX = 256 * 1024 * 1024
+SEND_QUEUE_MAX = 1000  # messages, per socket
+HELLO_EVERY_S = 1.0  # until it is answered
+RECONNECT_MS, RECONNECT_MAX_MS = 100, 1000
+# TCP alone may take a quarter of an hour to notice a peer that vanished without a word.
+HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 5_000, 15_000
+CLOSE_WAIT_S = 2.0
+IDLE_WAIT_S = 1.0
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(eq=False)
+class _Pending:
+    """A request in flight."""
+
+    task: Task
+    request: wire.Request
+    blobs: dict[bytes, Any]
+    published: float
+    deadline: float
+    future: "Future[Execution]" = field(default_factory=Future)
+    bytes_out: int = 0
+
+
+class CloudRunner:
+    """Runs tasks on the server at `endpoint` (tcp://HOST:PORT).
+
+    The site is available for a kind once the server has answered `hello` on the present connection with
+    the same protocol version and the same source for that kind.
+    """
+
+    def __init__(self, endpoint: str, *, site: str = CLOUD) -> None:
+        check_endpoint(site, endpoint)
+        self.site = site
+        self._endpoint = endpoint
+        self._absent: str | None = f"no answer from {endpoint} yet"
+        self._remote: dict[str, str] = {}
+        self._told: set[str] = set()
+        self._pending: dict[int, _Pending] = {}
+        self._deadlines: list[tuple[float, int]] = []
+        self._inbox: deque[_Pending] = deque()
+        self._waker, self._wake = _wake_pair()
+        self._closing = False
+        self._hello_due = float("inf")
+        self._context = zmq.Context()
+        try:
+            self._socket, self._monitor = _connect(self._context, endpoint)
+        except zmq.ZMQError as error:
+            self._context.destroy(linger=0)
+            raise ConfigError(f"{site}: endpoint {endpoint!r}: {error}") from error
+        self._thread = threading.Thread(target=self._run, name=f"site-{site}", daemon=True)
+        self._thread.start()
+
+    def unavailable(self, kind: Kind) -> str | None:
+        if self._absent is not None:
+            return self._absent
+        if self._remote.get(kind.name) == kind.source_hash != "":
+            return None
+        why = (
+            f"task {kind.name} is not the same there"
+            if kind.name in self._remote
+            else f"no task {kind.name} there"
+        )
+        if kind.name not in self._told:
+            self._told.add(kind.name)
+            log.warning("%s: %s: it stays onboard", self.site, why)
+        return why
+
+    def submit(self, task: Task, budget_s: float) -> "Future[Execution]":
+        published = time.perf_counter()
+        try:
+            body = wire.encode(list(task.args), task.kind.types, blobs=True)
+        except BadValue as error:
+            return self._refused(BadValue(f"task {task.kind.name}: {error}"))
+        if len(self._pending) + len(self._inbox) >= PENDING_MAX:
+            return self._refused(CloudBusy(f"{PENDING_MAX} tasks are in flight"))
+        request = wire.Request(task.id, task.kind.name, budget_s, 1, tuple(body.blobs), body.frames)
+        pending = _Pending(task, request, body.blobs, published, published + budget_s)
+        self._inbox.append(pending)
+        self._wake_up()
+        if self._closing:
+            pending.future.cancel()
+        return pending.future
+
+    def close(self) -> None:
+        self._closing = True
+        self._wake_up()
+        self._thread.join(CLOSE_WAIT_S)
+
+    def _refused(self, failure: OffloadError) -> "Future[Execution]":
+        future: Future[Execution] = Future()
+        future.set_result(Execution(self.site, 0.0, failure=failure, started=False))
+        return future
+
+    def _wake_up(self) -> None:
+        with contextlib.suppress(OSError):  # full: it is awake already; closed: there is nobody to wake
+            self._waker.send(b"\0")
+
+    # What follows runs in the I/O thread only.
+
+    def _run(self) -> None:
+        try:
+            self._loop()
+        finally:
+            self._shut_down()
+
+    def _loop(self) -> None:
+        poller = zmq.Poller()
+        for readable in (self._socket, self._monitor, self._wake):
+            poller.register(readable, zmq.POLLIN)
+        while not self._closing:
+            ready = dict(poller.poll(math.ceil(self._wait_s() * 1e3)))
+            if self._wake.fileno() in ready:
+                self._wake.recv(4096)
+            if self._monitor in ready:
+                self._watch_connection()
+            if self._socket in ready:
+                self._receive_all()
+            while self._inbox:
+                self._send_first(self._inbox.popleft())
+            self._expire()
+
+    def _wait_s(self) -> float:
+        due = min(self._deadlines[0][0] if self._deadlines else float("inf"), self._hello_due)
+        return min(max(0.0, due - time.perf_counter()), IDLE_WAIT_S)
+
+    def _watch_connection(self) -> None:
+        while self._monitor.poll(0):
+            event = zmq.utils.monitor.recv_monitor_message(self._monitor)["event"]
+            if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+                self._say_hello()
+            elif event == zmq.EVENT_DISCONNECTED:
+                self._hello_due = float("inf")
+                if self._absent is None:
+                    log.warning("%s: connection to %s lost", self.site, self._endpoint)
+                self._absent = f"not connected to {self._endpoint}"
+                for request_id in list(self._pending):
+                    self._finish(request_id, CloudBroken("the connection was lost"))
+
+    def _say_hello(self) -> None:
+        self._hello_due = time.perf_counter() + HELLO_EVERY_S
+        self._send(wire.Hello({kind.name: kind.source_hash for kind in kinds()}, SOFTWARE))
+
+    def _send_first(self, pending: _Pending) -> None:
+        if not pending.future.set_running_or_notify_cancel():
+            return
+        self._pending[pending.task.id] = pending
+        heapq.heappush(self._deadlines, (pending.deadline, pending.task.id))
+        self._send_request(pending, pending.request)
+
+    def _send_request(self, pending: _Pending, request: wire.Request) -> None:
+        left_s = pending.deadline - time.perf_counter()
+        if left_s > 0:
+            sent = self._send(replace(request, budget_s=left_s))
+            pending.bytes_out += sent
+            if not sent:
+                self._finish(pending.task.id, CloudBroken("nothing can be sent"), started=False)
+
+    def _send(self, message: wire.Message) -> int:
+        """Bytes handed over; 0 where there is no connection or its queue is full."""
+        frames = wire.pack(message)
+        try:
+            self._socket.send_multipart(frames, zmq.DONTWAIT, copy=False)
+        except zmq.Again:
+            return 0
+        return wire.byte_count(frames)
+
+    def _receive_all(self) -> None:
+        while self._socket.poll(0):
+            frames = self._socket.recv_multipart(copy=False)
+            received = time.perf_counter()
+            buffers = [frame.buffer for frame in frames]
+            try:
+                self._take(wire.unpack(buffers), received, wire.byte_count(buffers))
+            except wire.VersionMismatch as error:
+                self._absent, self._hello_due = str(error), float("inf")
+                log.warning("%s: %s: tasks stay onboard", self.site, error)
+            except ProtocolError as error:
+                log.warning("%s: message dropped: %s", self.site, error)
+
+    def _take(self, message: wire.Message, received: float, bytes_in: int) -> None:
+        if isinstance(message, wire.Hello):
+            self._hello_due = float("inf")
+            self._remote = message.tasks
+            if self._absent is not None:
+                log.info("%s: %s is up", self.site, self._endpoint)
+            self._absent = None
+        elif isinstance(message, wire.Reply) and message.id in self._pending:
+            if message.status == "need_blob":
+                self._send_blobs(self._pending[message.id], message.missing)
+            else:
+                self._finish_reply(self._pending[message.id], message, received, bytes_in)
+
+    def _send_blobs(self, pending: _Pending, missing: Iterable[bytes]) -> None:
+        request = replace(pending.request, attempt=pending.request.attempt + 1)
+        if request.attempt > ATTEMPTS_MAX or not pending.blobs.keys() >= set(missing):
+            self._finish(pending.task.id, CloudBroken("the server keeps losing the blobs"), started=False)
+            return
+        pending.request = request
+        for digest in missing:
+            pending.bytes_out += self._send(wire.Blob(pending.blobs[digest]))
+        self._send_request(pending, request)
+
+    def _finish_reply(self, pending: _Pending, reply: wire.Reply, received: float, bytes_in: int) -> None:
+        value, failure = None, _failure(reply)
+        if failure is None:
+            try:
+                value = wire.decode(reply.body, pending.task.kind.types, {})
+            except ProtocolError as error:
+                failure = CloudBroken(f"answer cannot be read: {error}")
+        seconds = received - pending.published
+        execution = Execution(
+            self.site,
+            seconds,
+            value,
+            failure,
+            queue_s=reply.queue_s,
+            run_s=reply.run_s,
+            network_s=max(0.0, seconds - reply.queue_s - reply.run_s),
+            bytes_out=pending.bytes_out,
+            bytes_in=bytes_in,
+            started=reply.status in ("ok", "failed"),
+        )
+        del self._pending[pending.task.id]
+        pending.future.set_result(execution)
+
+    def _expire(self) -> None:
+        now = time.perf_counter()
+        while self._deadlines and self._deadlines[0][0] <= now:
+            request_id = heapq.heappop(self._deadlines)[1]
+            if request_id in self._pending:
+                self._send(wire.Cancel(request_id))
+                self._finish(request_id, CloudTimeout("no answer within the budget"), censored=True)
+
+    def _finish(
+        self, request_id: int, failure: CloudError, *, censored: bool = False, started: bool = True
+    ) -> None:
+        """Give a request up."""
+        pending = self._pending.pop(request_id)
+        pending.future.set_result(
+            Execution(
+                self.site,
+                time.perf_counter() - pending.published,
+                failure=failure,
+                censored=censored,
+                bytes_out=pending.bytes_out,
+                started=started,
+            )
+        )
+
+    def _shut_down(self) -> None:
+        self._absent = "closed"
+        for pending in self._inbox:
+            pending.future.cancel()
+        for request_id in list(self._pending):
+            self._finish(request_id, CloudBroken("closed while the task was in flight"))
+        self._socket.disable_monitor()
+        self._context.destroy(linger=0)
+        self._wake.close()
+        self._waker.close()
+
+
+_FAILURES: dict[str, Callable[[str], OffloadError]] = {
+    "failed": TaskFailed,
+    "busy": CloudBusy,
+    "expired": CloudBusy,
+    "unknown_task": CloudBroken,
+}
+
+
+def _failure(reply: wire.Reply) -> OffloadError | None:
+    return None if reply.status == "ok" else _FAILURES[reply.status](reply.error or reply.status)
+
+
+def _connect(context: "zmq.Context[Any]", endpoint: str) -> tuple["zmq.Socket[bytes]", "zmq.Socket[bytes]"]:
+    dealer = context.socket(zmq.DEALER)
+    dealer.linger = 0
+    dealer.ipv6 = "[" in endpoint
+    dealer.immediate = True  # a request never waits for a connection: it would arrive with its budget gone
+    dealer.sndhwm = dealer.rcvhwm = SEND_QUEUE_MAX
+    dealer.reconnect_ivl, dealer.reconnect_ivl_max = RECONNECT_MS, RECONNECT_MAX_MS
+    dealer.heartbeat_ivl, dealer.heartbeat_timeout = HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS
+    dealer.maxmsgsize = MESSAGE_BYTES_MAX
+    monitor = dealer.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED)
+    dealer.connect(endpoint)
+    return dealer, monitor
+
+
+def _wake_pair() -> tuple[socket.socket, socket.socket]:
+    waker, wake = socket.socketpair()
+    waker.setblocking(False)
+    wake.setblocking(False)
+    return waker, wake

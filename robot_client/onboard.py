@@ -1,0 +1,52 @@
+"""The runner of the robot's own computer."""
+
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+
+from common.errors import TaskFailed
+from common.tasks import Kind, Task
+from robot_client.runner import ONBOARD, Execution
+
+
+class OnboardRunner:
+    """Runs tasks in this process, `workers` at a time; a waiting task's seconds include its wait."""
+
+    site = ONBOARD
+
+    def __init__(self, workers: int = 1) -> None:
+        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="onboard")
+
+    def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - onboard always exists
+        return None
+
+    def submit(self, task: Task, budget_s: float) -> "Future[Execution]":  # noqa: ARG002 - a thread cannot be stopped
+        return self._pool.submit(_run, task, time.perf_counter())
+
+    def close(self) -> None:
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _run(task: Task, published: float) -> Execution:
+    started = time.perf_counter()
+    try:
+        value = task.kind.function(*task.args)
+    except Exception as error:  # noqa: BLE001 - whatever a user's function raises is the task's failure
+        failure = TaskFailed(f"{type(error).__name__}: {error}")
+        failure.__cause__ = error
+        return _execution(published, started, failure=failure)
+    return _execution(published, started, value=value)
+
+
+def _execution(
+    published: float, started: float, value: object = None, failure: TaskFailed | None = None
+) -> Execution:
+    now = time.perf_counter()
+    return Execution(
+        ONBOARD,
+        now - published,
+        value,
+        failure,
+        queue_s=started - published,
+        run_s=now - started,
+        network_s=0.0,
+    )

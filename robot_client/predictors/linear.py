@@ -1,0 +1,36 @@
+"""Least squares on the window: psi^l and psi^c of the paper."""
+
+import math
+
+from robot_client.predictors.base import Prediction, check_observation
+from robot_client.window import Window
+
+
+class LeastSquares:
+    """Ordinary least squares of seconds on size over the last `window` executions.
+
+    m = sum((d - mean d)(t - mean t)) / sum((d - mean d)^2); c = mean t - m mean d; p = m d + c.
+    Where all sizes are equal the slope is 0 and p = mean t.
+    """
+
+    def __init__(self, window: int) -> None:
+        self.window = Window(window)
+
+    @property
+    def full(self) -> bool:
+        return self.window.full
+
+    def __len__(self) -> int:
+        return len(self.window)
+
+    def learn(self, size: float, seconds: float) -> None:
+        check_observation(size, seconds)
+        self.window.append(size, seconds)
+
+    def predict(self, size: float) -> Prediction | None:
+        if not len(self.window):
+            return None
+        of = self.window.moments()
+        slope = of.sdt / of.sdd if of.sdd > 0 else 0.0
+        spread = math.sqrt(max(0.0, of.stt - slope * of.sdt) / (of.count - 2)) if of.count > 2 else None
+        return Prediction(of.mean_seconds + slope * of.deviation(size), spread)

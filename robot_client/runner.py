@@ -1,0 +1,70 @@
+"""The seam to the outside: a runner runs one task on one site and says how it went."""
+
+import re
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from common.errors import ConfigError, OffloadError
+from common.tasks import Kind, Task
+
+ONBOARD = "onboard"
+CLOUD = "cloud"
+PORT_MAX = 65_535
+
+_ENDPOINT = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5})")
+
+
+@dataclass(frozen=True, slots=True)
+class Execution:
+    """One run of a task on one site, measured on the robot's own clock.
+
+    `seconds` is from publishing the task until its answer was received, or until it was given up; then
+    `failure` says why, and `censored` that the true time is longer. `queue_s` and `run_s` are the server's
+    own; `network_s` is the rest. Bytes are those of the messages, without transport headers. `started` is
+    false where the task certainly never ran there.
+    """
+
+    site: str
+    seconds: float
+    value: Any = field(default=None, repr=False)
+    failure: OffloadError | None = None
+    censored: bool = False
+    queue_s: float | None = None
+    run_s: float | None = None
+    network_s: float | None = None
+    bytes_out: int = 0
+    bytes_in: int = 0
+    started: bool = True
+
+    @property
+    def ok(self) -> bool:
+        return self.failure is None
+
+    @property
+    def error(self) -> str | None:
+        return None if self.failure is None else f"{type(self.failure).__name__}: {self.failure}"
+
+
+class Runner(Protocol):
+    """Runs tasks on one site. All methods may be called from any thread."""
+
+    @property
+    def site(self) -> str: ...
+
+    def unavailable(self, kind: Kind) -> str | None:
+        """Why a task of this kind cannot be sent now, or None when it can. Must not block."""
+
+    def submit(self, task: Task, budget_s: float) -> "Future[Execution]":
+        """Start the task. The future always gets an Execution, never an exception; a remote runner
+        gives the task up after `budget_s` seconds."""
+
+    def close(self) -> None:
+        """Stop; tasks in flight are given up. Safe to call twice."""
+
+
+def check_endpoint(where: str, endpoint: str) -> None:
+    """ConfigError, naming `where` it stood, unless this is the endpoint of a server."""
+    match = _ENDPOINT.fullmatch(endpoint)
+    if match is None or not 0 < int(match[2]) <= PORT_MAX:
+        raise ConfigError(f"{where}: {endpoint!r} is not tcp://HOST:PORT with a port 1 to {PORT_MAX}")

@@ -1,0 +1,32 @@
+"""Stand-ins for the outside world at the runner seam, for tests of deciding and learning only."""
+
+from collections.abc import Callable
+from concurrent.futures import Future
+
+from common.tasks import Kind, Task
+from robot_client.runner import Execution
+
+
+class ScriptedRunner:
+    """Answers at once with what `script` makes of each task; remembers the tasks it was given."""
+
+    def __init__(
+        self, site: str, script: Callable[[Task], Execution], unavailable: str | None = None
+    ) -> None:
+        self.site = site
+        self.script = script
+        self.absent = unavailable
+        self.tasks: list[Task] = []
+        self.closed = False
+
+    def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - the same for every kind
+        return self.absent
+
+    def submit(self, task: Task, budget_s: float) -> "Future[Execution]":  # noqa: ARG002 - scripted
+        self.tasks.append(task)
+        future: Future[Execution] = Future()
+        future.set_result(self.script(task))
+        return future
+
+    def close(self) -> None:
+        self.closed = True

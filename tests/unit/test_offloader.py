@@ -1,0 +1,240 @@
+"""What the offloader does with good, late, failing and missing sites."""
+
+import asyncio
+import threading
+from collections.abc import Callable
+
+import pytest
+
+from common.errors import (
+    BadValue,
+    CloudBroken,
+    CloudBusy,
+    CloudError,
+    CloudTimeout,
+    ConfigError,
+    TaskFailed,
+    UnknownTask,
+)
+from common.tasks import Task, task
+from robot_client import policies, predictors
+from robot_client.offloader import Offloader
+from robot_client.onboard import OnboardRunner
+from robot_client.runner import CLOUD, ONBOARD, Execution, Runner
+from tests.fakes import ScriptedRunner
+
+
+@task("add_one", size=lambda number: abs(number))
+def add_one(number: int) -> int:
+    if number < 0:
+        raise ValueError("negative")
+    return number + 1
+
+
+@task("write_once", size=lambda: 0.0, duplicate=False)
+def write_once() -> str:
+    return "written"
+
+
+def cloud_answers(
+    seconds: float = 0.01, failure: Exception | None = None, **fields: object
+) -> ScriptedRunner:
+    def script(one: Task) -> Execution:
+        value = None if failure else one.kind.function(*one.args)
+        return Execution(CLOUD, seconds, value, failure, **fields)  # type: ignore[arg-type]
+
+    return ScriptedRunner(CLOUD, script)
+
+
+Make = Callable[..., Offloader]
+
+
+@pytest.fixture
+def make() -> Make:
+    """Makes offloaders with window 2."""
+
+    def factory(*runners: Runner, policy: str = CLOUD, **options: object) -> Offloader:
+        return Offloader(
+            list(runners),
+            policy=policies.make(policy),
+            predictor=lambda: predictors.make(predictors.LEAST_SQUARES, 2),
+            **options,  # type: ignore[arg-type]
+        )
+
+    return factory
+
+
+@pytest.mark.parametrize("failure", [CloudTimeout("late"), CloudBusy("full"), CloudBroken("gone")])
+def test_a_failed_site_is_learnt_and_the_task_runs_onboard(make: Make, failure: CloudError) -> None:
+    """No failure of the cloud reaches the caller; the lost time enters the cloud's window."""
+    with make(cloud_answers(1.5, failure), OnboardRunner()) as offload:
+        assert offload(add_one, 4) == 5
+        record = offload.last
+        assert record is not None
+        assert [(one.site, one.ok) for one in record.executions] == [(CLOUD, False), (ONBOARD, True)]
+        assert record.used == ONBOARD
+        offload(add_one, 4, where=ONBOARD)
+        assert offload.last is not None
+        cloud = offload.last.sites[CLOUD]
+        assert (cloud.predicted_s, cloud.failures) == (1.5, 1)
+
+
+def test_the_tasks_own_exception_is_raised_once_alike(make: Make) -> None:
+    """An exception of the task is TaskFailed with its type and text, from either site, tried once."""
+    cloud = cloud_answers(failure=TaskFailed("ValueError: negative"))
+    with make(cloud, OnboardRunner()) as offload:
+        for where in (ONBOARD, CLOUD):
+            with pytest.raises(TaskFailed, match=r"^ValueError: negative$"):
+                offload(add_one, -1, where=where)
+            assert offload.last is not None
+            assert len(offload.last.executions) == 1
+            assert offload.last.used is None
+
+
+def test_the_first_good_answer_of_two_is_used(make: Make) -> None:
+    """Where both sites run, the faster good answer is the result and both times are learnt."""
+    onboard = ScriptedRunner(ONBOARD, lambda one: Execution(ONBOARD, 0.5, one.args[0] + 1))
+    with make(cloud_answers(0.1), onboard, policy="paper") as offload:
+        assert offload(add_one, 1) == 2
+        assert offload.last is not None
+        assert offload.last.used == CLOUD
+        offload(add_one, 1)
+        assert {site: one.predicted_s for site, one in offload.last.sites.items()} == {
+            CLOUD: 0.1,
+            ONBOARD: 0.5,
+        }
+
+
+def test_both_sites_failing_in_one_way_or_another_still_answers(make: Make) -> None:
+    """In warm-up a broken cloud costs nothing but its entry in the window."""
+    with make(cloud_answers(0.2, CloudBroken("gone")), OnboardRunner(), policy="paper") as offload:
+        assert offload(add_one, 1) == 2
+        assert offload.last is not None
+        assert len(offload.last.executions) == 2
+
+
+def test_an_unavailable_site_is_no_candidate(make: Make) -> None:
+    """While the server is not there, tasks run onboard without waiting and without learning about it."""
+    cloud = cloud_answers()
+    cloud.absent = "not connected"
+    with make(cloud, OnboardRunner(), policy="paper") as offload:
+        assert offload(add_one, 1) == 2
+        assert offload.last is not None
+        assert offload.last.decision.reason == "cloud: not connected"
+        assert CLOUD not in offload.last.sites
+        cloud.absent = None
+        assert offload(add_one, 1) == 2
+        assert offload.last.sites[CLOUD].predicted_s is None
+    assert len(cloud.tasks) == 1
+
+
+def test_where_pins_a_call(make: Make) -> None:
+    """A pinned call goes to its site and nowhere else; an unknown site is refused by name."""
+    cloud = cloud_answers()
+    with make(cloud, OnboardRunner()) as offload:
+        offload(add_one, 1, where=ONBOARD)
+        assert cloud.tasks == []
+        offload(add_one, 1, where="both")
+        assert offload.last is not None
+        assert [one.site for one in offload.last.executions] == [CLOUD, ONBOARD]
+        with pytest.raises(ConfigError, match="'edge' is not one of cloud, onboard, both"):
+            offload(add_one, 1, where="edge")
+
+
+def test_a_task_that_must_not_run_twice_never_does(make: Make) -> None:
+    """duplicate=False: one site in warm-up, each in turn; a lost answer is an error, a refused one is not."""
+    cloud = cloud_answers(0.01)
+    with make(cloud, OnboardRunner(), policy="paper") as offload:
+        sites = []
+        for _ in range(4):
+            offload(write_once)
+            assert offload.last is not None
+            sites += [one.site for one in offload.last.executions]
+        assert sites == [ONBOARD, CLOUD, ONBOARD, CLOUD]
+        with pytest.raises(ConfigError, match="duplicate=False"):
+            offload(write_once, where="both")
+
+
+@pytest.mark.parametrize(("started", "answered"), [(True, False), (False, True)])
+def test_a_lost_answer_of_a_single_run_task_is_raised(make: Make, started: bool, answered: bool) -> None:
+    """A duplicate=False task falls back onboard only where it certainly did not start in the cloud."""
+    with make(cloud_answers(2.0, CloudTimeout("late"), started=started), OnboardRunner()) as offload:
+        if answered:
+            assert offload(write_once) == "written"
+        else:
+            with pytest.raises(CloudTimeout):
+                offload(write_once)
+
+
+def test_a_value_that_cannot_cross_the_wire_is_one_clear_error(make: Make) -> None:
+    """BadValue reaches the caller even where onboard could have answered."""
+    with (
+        make(cloud_answers(failure=BadValue("a set cannot cross the wire")), OnboardRunner()) as offload,
+        pytest.raises(BadValue, match="set"),
+    ):
+        offload(add_one, 1, where="both")
+
+
+def test_a_function_that_is_no_task_is_refused(make: Make) -> None:
+    """The message says to decorate it."""
+    with make(OnboardRunner()) as offload, pytest.raises(UnknownTask, match="decorate it with @task"):
+        offload(len, "abc")
+
+
+def test_keyword_arguments_and_wrong_calls_are_those_of_the_function(make: Make) -> None:
+    """Keywords are bound as Python binds them, a wrong call is Python's own TypeError."""
+    with make(OnboardRunner()) as offload:
+        assert offload(add_one, number=2) == 3
+        with pytest.raises(TypeError, match="missing a required argument"):
+            offload(add_one)
+
+
+def test_run_answers_in_asyncio(make: Make) -> None:
+    """`await offload.run` gives the same result without blocking the loop."""
+
+    async def together(offload: Offloader) -> list[int]:
+        return await asyncio.gather(*(offload.run(add_one, n) for n in range(20)))
+
+    with make(cloud_answers(), OnboardRunner()) as offload:
+        assert asyncio.run(together(offload)) == list(range(1, 21))
+
+
+def test_many_threads_lose_nothing(make: Make) -> None:
+    """Eight threads, 400 calls: every answer is right and every record arrives once."""
+    records: list[int] = []
+    lock = threading.Lock()
+
+    def note(record: object) -> None:
+        with lock:
+            records.append(record.i)  # type: ignore[attr-defined]
+
+    wrong: list[int] = []
+
+    def work(offload: Offloader, base: int) -> None:
+        wrong.extend(n for n in range(base, base + 50) if offload(add_one, n) != n + 1)
+
+    with make(cloud_answers(), OnboardRunner(), policy="paper", observers=[note]) as offload:
+        threads = [threading.Thread(target=work, args=(offload, 100 * i)) for i in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert not wrong
+    assert sorted(records) == list(range(400))
+
+
+def test_onboard_must_be_among_the_sites() -> None:
+    """An offloader without onboard, or with a site twice, is refused."""
+    for runners in ([cloud_answers()], [OnboardRunner(), OnboardRunner()]):
+        with pytest.raises(ConfigError, match="each once, 'onboard' among them"):
+            Offloader(
+                runners, policy=policies.make("paper"), predictor=lambda: predictors.make("least-squares", 5)
+            )  # type: ignore[arg-type]
+
+
+def test_close_closes_every_runner(make: Make) -> None:
+    """Leaving the context closes all sites."""
+    cloud = cloud_answers()
+    with make(cloud, OnboardRunner()):
+        pass
+    assert cloud.closed

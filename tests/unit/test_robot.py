@@ -1,0 +1,162 @@
+"""The simulated robot with the real planner on Willow: its world, its requests, and what it drives."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from common import maps, planner
+from common.errors import ConfigError
+from common.maps import GridMap
+from common.planner import Plan, Point, Pose, plan_path, size_of_plan
+from robot_client.robot import FAILURES_MAX, TRIES_MAX, SimulatedRobot
+
+WILLOW = maps.read_map(Path(__file__).parents[2] / "maps/willow-full-0.05.yaml")
+NO_PATH = Plan("NO_VALID_PATH", np.zeros((0, 2), np.int32), np.zeros((0, 2), np.float32), 0.0, 0)
+planner.warm()  # compiles before the clock of any test runs
+SimulatedRobot(GridMap(np.zeros((30, 30), np.int8), 0.1), seed=0, obstacles=0).request()
+
+
+@dataclass
+class Ride:
+    """One request: where from and to, the plan, and the cells driven."""
+
+    pose: Pose
+    goal: Point
+    plan: Plan
+    driven: NDArray[np.int32]
+
+
+def run(robot: SimulatedRobot, count: int) -> list[Ride]:
+    """So many requests, planned and driven."""
+    done = []
+    for _ in range(count):
+        _, _, pose, goal, _ = request = robot.request()
+        plan = plan_path(*request)
+        done.append(Ride(pose, goal, plan, robot.drive(plan)))
+    return done
+
+
+def changed(robot: SimulatedRobot, done: list[Ride]) -> int:
+    """How many plans differ from the plan on the prior map, without the scan."""
+    blind = [plan_path(WILLOW, None, one.pose, one.goal, robot.radius_m) for one in done]
+    return sum(a.cells.tolist() != one.plan.cells.tolist() for a, one in zip(blind, done, strict=True))
+
+
+def test_scans_change_plans_and_nothing_is_hit() -> None:
+    """Of 100 plans at least 10 differ from the plan on the prior map, and no driven cell is occupied."""
+    robot = SimulatedRobot(WILLOW, seed=1)
+    done = run(robot, 100)
+    assert 10 <= changed(robot, done) < 100
+    driven = np.concatenate([one.driven for one in done])
+    assert len(driven) > 10_000
+    assert (robot.truth.cells[driven[:, 0], driven[:, 1]] == 0).all()
+    assert all((np.abs(np.diff(one.driven, axis=0)).max(axis=1, initial=0) <= 1).all() for one in done)
+    assert robot.stops > 0
+    assert [one.plan.status for one in done].count("NONE") >= 95
+
+
+def test_a_world_without_obstacles_leaves_plans_alone() -> None:
+    """Walls that the prior map holds do not change a plan when the scan shows them."""
+    robot = SimulatedRobot(WILLOW, seed=1, obstacles=0)
+    done = run(robot, 40)
+    assert changed(robot, done) <= 1
+    assert robot.truth.cells.tolist() == WILLOW.cells.tolist()
+
+
+def test_the_seed_decides_everything() -> None:
+    """The same seed gives the same world and requests; another seed others."""
+
+    def story(seed: int) -> list[object]:
+        robot = SimulatedRobot(WILLOW, seed=seed)
+        done = run(robot, 12)
+        rides = [(one.pose, one.goal, one.driven.tolist()) for one in done]
+        return [maps.digest(robot.truth), rides]
+
+    first = story(5)
+    assert first == story(5)
+    assert first[0] != story(6)[0]
+
+
+def test_goals_are_near_and_far() -> None:
+    """Input sizes spread over two orders of magnitude."""
+    robot = SimulatedRobot(WILLOW, seed=2)
+    sizes = []
+    for _ in range(100):
+        sizes.append(size_of_plan(*robot.request()))
+        robot.drive(NO_PATH)
+    low, middle, high = np.quantile(sizes, [0.1, 0.5, 0.9])
+    assert low * 5 < middle < high / 2
+
+
+def test_asking_twice_changes_nothing() -> None:
+    """A request is the same until the robot drives."""
+    robot = SimulatedRobot(WILLOW, seed=3)
+    first, again = robot.request(), robot.request()
+    assert first[1].ranges.tolist() == again[1].ranges.tolist()
+    assert (first[2:], first[0]) == (again[2:], WILLOW)
+
+
+def test_obstacles_lie_in_free_space_the_robot_could_reach() -> None:
+    """The world is the prior map plus boxes of 0.3 to 1 m, and robot and goal stand clear of all."""
+    robot = SimulatedRobot(WILLOW, seed=4, obstacles=25)
+    added = (robot.truth.cells == 100) & (WILLOW.cells != 100)
+    assert 25 * 6**2 / 2 < added.sum() < 25 * 21**2
+    assert ((robot.truth.cells == WILLOW.cells) | added).all()
+    clear = maps.passable(robot.truth, robot.radius_m)
+    for place in (robot.pose, robot.goal):
+        cell = WILLOW.cell(place.x, place.y)
+        assert cell is not None
+        assert clear[cell]
+
+
+def test_a_blocked_robot_keeps_its_goal_for_a_few_tries() -> None:
+    """A path that a box blocks stops the robot before it; the goal stays, and changes after so many tries."""
+    cells = np.full((40, 100), 100, np.int8)
+    cells[1:-1, 1:-1] = 0
+    robot = SimulatedRobot(GridMap(cells, 0.1), seed=1, obstacles=0)
+    blocked = cells.copy()
+    blocked[1:-1, 50] = 100  # shut after the plans were made: no way round
+    robot.truth = GridMap(blocked, 0.1)
+    straight = np.array([[20, col] for col in range(10, 90)], np.int32)
+    plan = Plan("NONE", straight, robot.prior.metres(straight).astype(np.float32), 8.0, 1)
+    goal = robot.goal
+    for n in range(TRIES_MAX):
+        assert robot.goal == goal
+        assert max(robot.drive(plan)[:, 1], default=0) < 50 - 2
+        assert robot.stops == n + 1
+    assert robot.goal != goal
+
+
+def test_the_bumper_stops_where_no_scan_could_see() -> None:
+    """With a blind LiDAR the robot still ends before the occupied cell."""
+    cells = np.full((40, 100), 100, np.int8)
+    cells[1:-1, 1:-1] = 0
+    robot = SimulatedRobot(GridMap(cells, 0.1), seed=1, obstacles=0, range_max=0.01)
+    blocked = cells.copy()
+    blocked[1:-1, 50] = 100
+    robot.truth = GridMap(blocked, 0.1)
+    straight = np.array([[20, col] for col in range(10, 90)], np.int32)
+    driven = robot.drive(Plan("NONE", straight, robot.prior.metres(straight).astype(np.float32), 8.0, 1))
+    assert driven[-1].tolist() == [20, 49]
+
+
+def test_without_paths_another_goal_and_then_another_place() -> None:
+    """Each failure picks a new goal; a robot that finds none is set down elsewhere."""
+    robot = SimulatedRobot(WILLOW, seed=7)
+    start = robot.pose
+    for _ in range(FAILURES_MAX - 1):
+        goal = robot.goal
+        robot.drive(NO_PATH)
+        assert robot.goal != goal
+        assert robot.pose == start
+    robot.drive(NO_PATH)
+    assert robot.pose != start
+
+
+def test_a_map_without_room_is_refused() -> None:
+    """A robot that fits nowhere is a ConfigError that says so."""
+    with pytest.raises(ConfigError, match="no room for a robot"):
+        SimulatedRobot(GridMap(np.full((9, 9), 100, np.int8), 0.1), seed=0)

@@ -1,0 +1,162 @@
+"""Writing and reading the trace."""
+
+import json
+import logging
+import os
+import resource
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from common.errors import CloudTimeout, ConfigError, DataError
+from robot_client.policies import Decision, Outlook
+from robot_client.runner import CLOUD, ONBOARD, Execution
+from robot_client.trace import Record, Trace, read
+
+
+def record(i: int = 0) -> Record:
+    return Record(
+        i=i,
+        id=f"s-{i}",
+        kind="plan_path",
+        size=1.5,
+        sites={ONBOARD: Outlook(0.1, 0.01, True, 3, 0), CLOUD: Outlook(None, None, False, 0, 1)},
+        decision=Decision(CLOUD, False, "cloud 1 ms against onboard 2 ms", "paper"),
+        executions=(
+            Execution(CLOUD, 2.0, failure=CloudTimeout("late"), censored=True, bytes_out=10),
+            Execution(ONBOARD, 0.1, queue_s=0.0, run_s=0.1, network_s=0.0),
+        ),
+        used=ONBOARD,
+        waited_s=2.1,
+        started_at=datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC),
+    )
+
+
+def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
+    """One record becomes one JSON line with the fields of docs/formats.md, units in the names."""
+    trace = Trace(tmp_path / "trace.jsonl")
+    trace.write(record())
+    trace.close()
+    (line,) = (tmp_path / "trace.jsonl").read_text().splitlines()
+    assert json.loads(line) == {
+        "v": 1,
+        "i": 0,
+        "id": "s-0",
+        "kind": "plan_path",
+        "started_at": "2026-01-02T03:04:05.000+00:00",
+        "size": 1.5,
+        "features": {},
+        "sites": {
+            "onboard": {"predicted_s": 0.1, "spread_s": 0.01, "age": 3, "failures": 0},
+            "cloud": {"predicted_s": None, "spread_s": None, "age": 0, "failures": 1},
+        },
+        "decision": {
+            "site": "cloud",
+            "both": False,
+            "reason": "cloud 1 ms against onboard 2 ms",
+            "policy": "paper",
+        },
+        "executions": [
+            {
+                "site": "cloud",
+                "seconds": 2.0,
+                "ok": False,
+                "error": "CloudTimeout: late",
+                "censored": True,
+                "queue_s": None,
+                "run_s": None,
+                "network_s": None,
+                "bytes_out": 10,
+                "bytes_in": 0,
+            },
+            {
+                "site": "onboard",
+                "seconds": 0.1,
+                "ok": True,
+                "error": None,
+                "censored": False,
+                "queue_s": 0.0,
+                "run_s": 0.1,
+                "network_s": 0.0,
+                "bytes_out": 0,
+                "bytes_in": 0,
+            },
+        ],
+        "used": "onboard",
+        "waited_s": 2.1,
+    }
+
+
+def test_a_torn_last_line_is_skipped_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A line without its newline, as power loss leaves it, does not spoil the rest."""
+    path = write(tmp_path, 3)
+    with path.open("a") as file:
+        file.write('{"v": 1, "i": 3, "id"')
+    with caplog.at_level(logging.WARNING):
+        assert [fields["i"] for fields in read(path)] == [0, 1, 2]
+    assert f"{path}:4: torn last line skipped" in caplog.text
+
+
+def test_a_restarted_robot_appends_after_a_torn_line(tmp_path: Path) -> None:
+    """Opening a torn trace cuts the torn line off, so the next record is whole."""
+    path = write(tmp_path, 2)
+    os.truncate(path, path.stat().st_size - 5)
+    trace = Trace(path)
+    trace.write(record(7))
+    trace.close()
+    assert [fields["i"] for fields in read(path)] == [0, 7]
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("not json\n", ":2: not a JSON line"),
+        ("[1]\n", ":2: list where an object was expected"),
+        ('{"v": 2}\n', ":2: v = 2; this version reads 1"),
+        ('{"v": 1, "i": 0}\n', ":2: no field 'id'"),
+    ],
+)
+def test_any_other_bad_line_names_file_and_line(tmp_path: Path, line: str, message: str) -> None:
+    """A bad line in the middle is an error, not a gap."""
+    path = write(tmp_path, 1)
+    with path.open("a") as file:
+        file.write(line)
+    with pytest.raises(DataError, match=f"{path}{message}"):
+        list(read(path))
+
+
+def test_a_missing_trace_is_named(tmp_path: Path) -> None:
+    """The error names the file."""
+    with pytest.raises(DataError, match=r"none\.jsonl: No such file"):
+        list(read(tmp_path / "none.jsonl"))
+
+
+def test_a_trace_that_cannot_be_opened_is_a_config_error(tmp_path: Path) -> None:
+    """A directory in the trace's place is said at start."""
+    with pytest.raises(ConfigError, match="Is a directory"):
+        Trace(tmp_path)
+
+
+def test_a_full_disk_is_logged_and_tasks_go_on(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A record that does not fit is counted and leaves no torn line, and the next one is whole."""
+    path = write(tmp_path, 1)
+    trace = Trace(path)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 50, limits[1]))
+    try:
+        trace.write(record(1))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "task 1 lost (1 so far)" in caplog.text
+    trace.write(record(2))
+    trace.close()
+    assert [fields["i"] for fields in read(path)] == [0, 2]
+
+
+def write(folder: Path, count: int) -> Path:
+    trace = Trace(folder / "trace.jsonl")
+    for i in range(count):
+        trace.write(record(i))
+    trace.close()
+    return trace.path
