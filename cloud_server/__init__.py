@@ -1,0 +1,1 @@
+"""Runs tasks for robots and says how it is doing."""

@@ -1,0 +1,73 @@
+"""The command `cloud-server`: builds the server from its settings and runs it until it is told to stop."""
+
+import logging
+import os
+import signal
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cloud_server.config import ServerConfig
+from common.config import as_dict, load, run_command
+
+DESCRIPTION = (
+    "Runs tasks for robots over ZMQ; /health, /ready, /metrics, /config, /tasks and /docs over HTTP."
+)
+
+log = logging.getLogger("cloud_server")
+
+
+def main() -> int:
+    return run_command("cloud-server", lambda: serve(sys.argv[1:], os.environ))
+
+
+def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
+    """Serve until SIGTERM or Ctrl-C; 0 when every accepted request was answered."""
+    config = load(
+        ServerConfig, argv, prog="cloud-server", description=DESCRIPTION, environ=environ, prefix="CLOUD"
+    )
+    logging.basicConfig(level=config.log.upper(), format="%(asctime)s %(levelname)s %(message)s")
+    sys.path.insert(0, str(Path.cwd()))  # as `python -m` does, so that --tasks finds the user's modules
+    # Heavy libraries come after the settings are known to be right, and not for --help.
+    from cloud_server.executors import EXECUTORS
+    from cloud_server.metrics import Metrics
+    from cloud_server.server import Server
+    from cloud_server.web import Web, create_app
+    from common.tasks import load_modules
+
+    load_modules(config.tasks)
+    log.info("settings: %s", as_dict(config))
+    metrics = Metrics()
+    server = Server(
+        config.listen,
+        EXECUTORS[config.executor](config.workers, config.tasks, config.blob_bytes_max),
+        metrics,
+        queue_max=config.queue_max,
+        blob_bytes_max=config.blob_bytes_max,
+        message_bytes_max=config.message_bytes_max,
+        drain_s=config.drain_s,
+        on_ready=lambda: log.info("ready: listening on %s, http://%s", server.endpoint, web.address),
+    )
+    web = Web(create_app(server.status, metrics.registry, as_dict(config)), config.http_address)
+    web.start()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: _stop(server))
+    try:
+        answered = server.run()
+    finally:
+        web.close()
+    if not answered:
+        log.error("tasks still ran when the drain time of %g s was over; they are abandoned", config.drain_s)
+        logging.shutdown()
+        os._exit(1)  # an abandoned thread cannot be stopped, and exit would wait for it
+    log.info("stopped; every accepted request was answered")
+    return 0
+
+
+def _stop(server: Any) -> None:
+    server.drain()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,68 @@
+"""Settings of the server process."""
+
+import os
+import re
+from dataclasses import dataclass
+
+from common.config import check, setting
+from common.errors import ConfigError
+
+MIB = 1024 * 1024
+PORT_MAX = 65535
+
+_LISTEN = re.compile(r"tcp://(\*|\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5})")
+_HTTP = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5})")
+
+
+@dataclass(frozen=True, slots=True)
+class ServerConfig:
+    """Flag, then `CLOUD_NAME`, then TOML file, then these defaults."""
+
+    listen: str = setting("tcp://*:5555", "endpoint for robots; port 0 takes a free one", metavar="ENDPOINT")
+    http: str = setting("0.0.0.0:8000", "address of /health, /metrics, ...", metavar="HOST:PORT")
+    executor: str = setting("threads", "where tasks run", choices=("threads", "processes"))
+    workers: int = setting(
+        len(os.sched_getaffinity(0)), "tasks that run at the same time", minimum=1, maximum=1024, metavar="W"
+    )
+    tasks: tuple[str, ...] = setting(
+        ("common.planner",),
+        "modules that register tasks, comma-separated (default: common.planner)",
+        metavar="MODULE,MODULE",
+    )
+    queue_max: int = setting(64, "waiting requests; beyond it the answer is busy", minimum=1, maximum=100_000)
+    blob_mib: int = setting(
+        256, "memory for large arguments kept for later requests", minimum=1, maximum=2**20
+    )
+    message_mib: int = setting(64, "largest message taken or sent", minimum=1, maximum=2**11 - 1)
+    drain_s: float = setting(10.0, "time for accepted tasks after SIGTERM or Ctrl-C", minimum=0, maximum=3600)
+    log: str = setting("info", "log level", choices=("debug", "info", "warning", "error"))
+
+    def __post_init__(self) -> None:
+        check(self)
+        host_and_port("--listen", self.listen, _LISTEN, "tcp://HOST:PORT or tcp://*:PORT")
+        host_and_port("--http", self.http, _HTTP, "HOST:PORT")
+        if self.blob_mib < self.message_mib:
+            raise ConfigError(
+                f"--blob-mib: {self.blob_mib} is below --message-mib {self.message_mib}; "
+                "a large argument would never fit"
+            )
+
+    @property
+    def http_address(self) -> tuple[str, int]:
+        return host_and_port("--http", self.http, _HTTP, "HOST:PORT")
+
+    @property
+    def blob_bytes_max(self) -> int:
+        return self.blob_mib * MIB
+
+    @property
+    def message_bytes_max(self) -> int:
+        return self.message_mib * MIB
+
+
+def host_and_port(flag: str, text: str, pattern: re.Pattern[str], allowed: str) -> tuple[str, int]:
+    """Both parts of an address, or ConfigError naming the flag."""
+    match = pattern.fullmatch(text)
+    if match is None or int(match[2]) > PORT_MAX:
+        raise ConfigError(f"{flag}: {text!r} is not {allowed} with a port 0 to {PORT_MAX}")
+    return match[1].strip("[]"), int(match[2])

@@ -1,0 +1,43 @@
+"""What the server counts, and the state it shows; how it is shown is `web`'s business."""
+
+from dataclasses import dataclass
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+
+SECONDS_BUCKETS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30)
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """The server at one moment; ages in seconds, None where nothing happened yet."""
+
+    ready: bool
+    draining: bool
+    queue_depth: int
+    running: int
+    uptime_s: float
+    last_turn_age_s: float
+    last_task_age_s: float | None
+
+
+class Metrics:
+    """Counters of one server, in their own registry."""
+
+    def __init__(self) -> None:
+        r = self.registry = CollectorRegistry()
+        self.requests = Counter("offboard_requests", "Requests by outcome", ["kind", "status"], registry=r)
+        self.queue_depth = Gauge("offboard_queue_depth", "Requests waiting for a worker", registry=r)
+        self.running = Gauge("offboard_running", "Tasks running", registry=r)
+        self.queue_s = Histogram(
+            "offboard_queue_seconds", "Arrival to start", ["kind"], buckets=SECONDS_BUCKETS, registry=r
+        )
+        self.run_s = Histogram(
+            "offboard_run_seconds", "Time in the worker", ["kind"], buckets=SECONDS_BUCKETS, registry=r
+        )
+        self.bytes_in = Counter("offboard_bytes_in", "Bytes of messages received", registry=r)
+        self.bytes_out = Counter("offboard_bytes_out", "Bytes of messages sent", registry=r)
+        self.blob_bytes = Gauge("offboard_blob_bytes", "Bytes of large arguments kept", registry=r)
+        self.dropped = Counter(
+            "offboard_dropped", "Messages not understood, and answers nobody took", ["reason"], registry=r
+        )
+        self.restarts = Counter("offboard_executor_restarts", "Worker pools started again", registry=r)

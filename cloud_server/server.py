@@ -1,0 +1,365 @@
+"""The ROUTER loop: takes requests from robots, hands them to the executor, sends the replies.
+
+It never computes and never waits for work; what runs the tasks is `executors`.
+"""
+
+import contextlib
+import logging
+import os
+import socket
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+
+import zmq
+
+from cloud_server.executors import Executor, Outcome
+from cloud_server.metrics import Metrics, Status
+from cloud_server.waiting import Waiting, Work, held_bytes
+from common import tasks
+from common.blobs import BlobStore, Buffer
+from common.errors import ConfigError, OffloadError, ProtocolError
+from common.wire import (
+    Blob,
+    Cancel,
+    Hello,
+    Message,
+    Ping,
+    Pong,
+    Reply,
+    Request,
+    VersionMismatch,
+    byte_count,
+    pack,
+    software_version,
+    unpack,
+)
+
+POLL_S = 0.5
+COPIED_BYTES_MAX = 64 * 1024  # a larger frame is used where the transport put it
+RECEIVE_MAX = 64  # messages taken in one turn
+PEER_MESSAGES_MAX = 256  # unsent replies, and unread requests, of one robot
+SEND_LAST_S = 1.0  # time for the last replies to leave when the server stops
+RESTART_PAUSE_S = 2.0  # least time between two starts of the executor
+LOG_PAUSE_S = 10.0  # least time between two warnings about bad messages
+
+log = logging.getLogger("cloud_server")
+
+
+class Server:
+    """One socket, one thread. `drain` and `status` may be called from others."""
+
+    def __init__(
+        self,
+        listen: str,
+        executor: Executor,
+        metrics: Metrics,
+        *,
+        queue_max: int,
+        blob_bytes_max: int,
+        message_bytes_max: int,
+        drain_s: float,
+        on_ready: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.metrics = metrics
+        self._executor = executor
+        self._waiting = Waiting(queue_max)
+        self._running: set[Work] = set()
+        self._blobs = BlobStore(blob_bytes_max)
+        self._message_bytes_max = message_bytes_max
+        self._drain_s = drain_s
+        self._drain_until: float | None = None
+        self._on_ready = on_ready
+        self._done: deque[tuple[Work, Future[Outcome]]] = deque()
+        self._warming: Future[None] | None = None
+        self._ready = self._was_ready = False
+        self._started = self._last_turn = time.monotonic()
+        self._last_task: float | None = None
+        self._last_start = self._last_warning = -float("inf")
+        self._context = zmq.Context()
+        self._socket = _bind(self._context, listen, message_bytes_max)
+        self.endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        self._wake_in, self._wake_out = socket.socketpair()
+        self._wake_in.setblocking(False)
+        self._wake_out.setblocking(False)
+
+    def run(self) -> bool:
+        """Serve until drained; True when everything that was accepted has been answered."""
+        poller = zmq.Poller()
+        poller.register(self._socket, zmq.POLLIN)
+        poller.register(self._wake_out.fileno(), zmq.POLLIN)
+        try:
+            self._turn()
+            while not self._over():
+                poller.poll(int(POLL_S * 1000))
+                self._turn()
+            return self._give_up_rest() == 0
+        finally:
+            self._close()
+
+    def drain(self) -> None:
+        """Take no new requests, answer the accepted ones, then let `run` return."""
+        if self._drain_until is None:
+            self._drain_until = time.monotonic() + self._drain_s
+        self._wake()
+
+    def status(self) -> Status:
+        now = time.monotonic()
+        return Status(
+            ready=self._ready,
+            draining=self._drain_until is not None,
+            queue_depth=len(self._waiting),
+            running=len(self._running),
+            uptime_s=now - self._started,
+            last_turn_age_s=now - self._last_turn,
+            last_task_age_s=None if self._last_task is None else now - self._last_task,
+        )
+
+    def _turn(self) -> None:
+        now = self._last_turn = time.monotonic()
+        with contextlib.suppress(BlockingIOError):
+            self._wake_out.recv(4096)
+        self._tend_executor(now)
+        while self._done:
+            self._answer(*self._done.popleft())
+        for _ in range(RECEIVE_MAX):
+            if not self._receive():
+                break
+        for work in self._waiting.take(lambda work: work.expired(self._last_turn)):
+            self._refuse(work.peer, work.request, "expired", queue_s=now - work.arrived)
+        self._dispatch()
+        self.metrics.queue_depth.set(len(self._waiting))
+        self.metrics.running.set(len(self._running))
+        self.metrics.blob_bytes.set(self._blobs.byte_count)
+
+    def _tend_executor(self, now: float) -> None:
+        """Start the executor, or start it again when its workers died; notice when it is warm."""
+        if self._ready and self._executor.broken:
+            self._ready = False
+            self.metrics.restarts.inc()
+            log.warning("worker processes died; starting them again")
+        if self._warming is not None:
+            if self._warming.done():
+                self._warmed(self._warming)
+        elif not self._ready and now - self._last_start >= RESTART_PAUSE_S:
+            self._last_start = now
+            self._warming = self._executor.warm()
+            self._warming.add_done_callback(lambda _: self._wake())
+
+    def _warmed(self, warming: "Future[None]") -> None:
+        self._warming = None
+        error = warming.exception()
+        if error is None:
+            self._ready = self._was_ready = True
+            self._on_ready()
+        elif self._was_ready:
+            log.error("worker processes did not start again: %s", error)
+        else:
+            raise OffloadError(f"tasks could not be warmed up: {type(error).__name__}: {error}") from error
+
+    def _receive(self) -> bool:
+        """Take one message, if there is one."""
+        try:
+            peer, *raw = self._socket.recv_multipart(zmq.DONTWAIT, copy=False)
+        except zmq.Again:
+            return False
+        frames: list[Buffer] = [f.buffer if len(f) > COPIED_BYTES_MAX else f.bytes for f in raw]
+        size = byte_count(frames)
+        self.metrics.bytes_in.inc(size)
+        try:
+            if size > self._message_bytes_max:
+                raise ProtocolError(f"message of {size} bytes, at most {self._message_bytes_max} are allowed")
+            self._take(peer.bytes, unpack(frames))
+        except VersionMismatch as error:
+            self._drop("version", error)
+            self._send(peer.bytes, self._hello())
+        except ProtocolError as error:
+            self._drop("malformed", error)
+        return True
+
+    def _take(self, peer: bytes, message: Message) -> None:
+        match message:
+            case Request():
+                self._request(peer, message)
+            case Blob(data):
+                self._blobs.add(data)
+            case Ping(id):
+                self._send(peer, Pong(id, len(self._waiting)))
+            case Hello():
+                # Robots ask again until they are answered, and send no task before that.
+                if self._ready and self._drain_until is None:
+                    self._send(peer, self._hello())
+            case Cancel(id):
+                self._cancel(peer, id)
+            case _:
+                raise ProtocolError(f"a server takes no {type(message).__name__.lower()}")
+
+    def _request(self, peer: bytes, request: Request) -> None:
+        """Put the request in line, or say why not."""
+        work = Work(peer, request, {}, time.monotonic())
+        if request.kind not in (kind.name for kind in tasks.kinds()):
+            self._refuse(peer, request, "unknown_task", f"no task named {request.kind!r} on this server")
+        elif self._drain_until is not None:
+            self._refuse(peer, request, "busy", "the server is stopping")
+        elif not self._ready:
+            self._refuse(peer, request, "busy", "the server is warming up")
+        elif self._waiting.full:
+            self._refuse(peer, request, "busy", f"{len(self._waiting)} requests are waiting")
+        elif missing := self._pin(work):
+            self._refuse(peer, request, "need_blob", missing=missing)
+        elif held_bytes([*self._waiting, *self._running, work]) > self._held_bytes_max:
+            self._refuse(peer, request, "busy", "waiting requests hold all the memory allowed")
+        else:
+            self._waiting.add(work)
+            self._dispatch()
+
+    @property
+    def _held_bytes_max(self) -> int:
+        return self._blobs.bytes_max + self._message_bytes_max
+
+    def _pin(self, work: Work) -> tuple[bytes, ...]:
+        """Give the work its blobs; the digests of those not here."""
+        for digest in work.request.blobs:
+            blob = self._blobs.get(digest)
+            if blob is not None:
+                work.blobs[digest] = blob
+        return tuple(digest for digest in work.request.blobs if digest not in work.blobs)
+
+    def _dispatch(self) -> None:
+        """Start waiting work while workers are free."""
+        while self._ready and not self._executor.broken and len(self._running) < self._executor.workers:
+            work = self._waiting.next()
+            if work is None:
+                return
+            now = time.monotonic()
+            work.queue_s = now - work.arrived
+            if work.expired(now):
+                self._refuse(work.peer, work.request, "expired", queue_s=work.queue_s)
+                continue
+            self._running.add(work)
+            future = self._executor.submit(work.request.kind, work.request.body, work.blobs)
+            future.add_done_callback(lambda done, work=work: self._finished(work, done))  # type: ignore[misc]
+
+    def _finished(self, work: Work, future: "Future[Outcome]") -> None:
+        """Called in a worker's thread."""
+        self._done.append((work, future))
+        self._wake()
+
+    def _answer(self, work: Work, future: "Future[Outcome]") -> None:
+        self._running.discard(work)
+        self._last_task = time.monotonic()
+        outcome, request = future.result(), work.request
+        size = byte_count(outcome.frames)
+        if size > self._message_bytes_max:
+            error = f"BadValue: the result takes {size} bytes, at most {self._message_bytes_max} are allowed"
+            outcome = Outcome("failed", error, outcome.run_s)
+        self.metrics.queue_s.labels(request.kind).observe(work.queue_s)
+        self.metrics.run_s.labels(request.kind).observe(outcome.run_s)
+        self._count(request, outcome.status)
+        if work.wanted:
+            self._send(
+                work.peer,
+                Reply(
+                    request.id,
+                    outcome.status,
+                    outcome.error,
+                    work.queue_s,
+                    outcome.run_s,
+                    len(self._waiting),
+                    body=outcome.frames,
+                ),
+            )
+
+    def _cancel(self, peer: bytes, id: int) -> None:
+        for work in self._waiting.take(lambda work: work.peer == peer and work.request.id == id):
+            self._count(work.request, "cancelled")
+        for work in self._running:
+            if work.peer == peer and work.request.id == id:
+                work.wanted = False
+
+    def _refuse(
+        self,
+        peer: bytes,
+        request: Request,
+        status: str,
+        error: str = "",
+        *,
+        queue_s: float = 0.0,
+        missing: tuple[bytes, ...] = (),
+    ) -> None:
+        self._count(request, status)
+        depth = len(self._waiting)
+        self._send(
+            peer, Reply(request.id, status, error, queue_s=queue_s, queue_depth=depth, missing=missing)
+        )
+
+    def _count(self, request: Request, status: str) -> None:
+        # A robot can send any name; a label for each would grow without bound.
+        kind = "unknown" if status == "unknown_task" else request.kind
+        self.metrics.requests.labels(kind, status).inc()
+
+    def _hello(self) -> Hello:
+        return Hello({kind.name: kind.source_hash for kind in tasks.kinds()}, software_version())
+
+    def _send(self, peer: bytes, message: Message) -> None:
+        """Send or drop, never wait: the robot may be gone, or not reading."""
+        frames = pack(message)
+        try:
+            self._socket.send_multipart([peer, *frames], zmq.DONTWAIT, copy=False)
+            self.metrics.bytes_out.inc(byte_count(frames))
+        except zmq.Again:
+            self.metrics.dropped.labels("not reading").inc()
+        except zmq.ZMQError as error:
+            if error.errno != zmq.EHOSTUNREACH:
+                raise
+            self.metrics.dropped.labels("gone").inc()
+
+    def _drop(self, reason: str, error: ProtocolError) -> None:
+        self.metrics.dropped.labels(reason).inc()
+        if self._last_turn - self._last_warning >= LOG_PAUSE_S:
+            self._last_warning = self._last_turn
+            log.warning("dropped a message: %s (more within %g s are only counted)", error, LOG_PAUSE_S)
+
+    def _wake(self) -> None:
+        with contextlib.suppress(OSError):  # full: a wake is due already; closed: nobody waits
+            self._wake_in.send(b"\0")
+
+    def _over(self) -> bool:
+        if self._drain_until is None:
+            return False
+        idle = not self._waiting and not self._running and not self._done
+        return idle or time.monotonic() >= self._drain_until
+
+    def _give_up_rest(self) -> int:
+        """Tell whoever still waits; how many they are."""
+        rest = [*self._waiting.take(lambda _: True), *self._running]
+        for work in rest:
+            self._refuse(work.peer, work.request, "busy", "the server stopped")
+        return len(rest)
+
+    def _close(self) -> None:
+        self._executor.close()
+        self._socket.close(linger=int(SEND_LAST_S * 1000))
+        self._context.term()
+        self._wake_in.close()
+        self._wake_out.close()
+
+
+def _bind(
+    context: "zmq.Context[zmq.Socket[bytes]]", listen: str, message_bytes_max: int
+) -> "zmq.Socket[bytes]":
+    router = context.socket(zmq.ROUTER)
+    router.setsockopt(zmq.LINGER, 0)
+    router.setsockopt(zmq.ROUTER_MANDATORY, 1)  # a reply that cannot go is an error here, so it is counted
+    router.setsockopt(zmq.MAXMSGSIZE, message_bytes_max)
+    router.setsockopt(zmq.SNDHWM, PEER_MESSAGES_MAX)
+    router.setsockopt(zmq.RCVHWM, PEER_MESSAGES_MAX)
+    router.setsockopt(zmq.IPV6, int("[" in listen))
+    try:
+        router.bind(listen)
+    except zmq.ZMQError as error:
+        router.close()
+        context.term()
+        raise ConfigError(f"--listen: {listen!r} cannot be bound: {os.strerror(error.errno or 0)}") from error
+    return router

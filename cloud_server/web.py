@@ -1,0 +1,95 @@
+"""HTTP beside the socket: health, readiness, metrics, settings and tasks, from a thread of its own."""
+
+import dataclasses
+import socket
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import uvicorn
+from fastapi import FastAPI, Response
+from fastapi.responses import JSONResponse
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
+
+from cloud_server.metrics import Status
+from common import tasks
+from common.errors import ConfigError
+from common.wire import software_version
+
+STALL_S = 2.0  # the loop turns at least every 0.5 s
+STOP_S = 2.0
+
+
+def create_app(
+    status: Callable[[], Status], registry: CollectorRegistry, settings: dict[str, Any]
+) -> FastAPI:
+    """The routes; `status` is called once a request, from the web thread."""
+    app = FastAPI(title="Offboard cloud server", version=software_version())
+
+    @app.get("/health", summary="200 while the loop turns")
+    async def health() -> JSONResponse:
+        now = status()
+        turning = now.last_turn_age_s < STALL_S
+        content = {"healthy": turning, "version": software_version(), **dataclasses.asdict(now)}
+        return JSONResponse(content, 200 if turning else 503)
+
+    @app.get("/ready", summary="200 once every kind is warm in every worker")
+    async def ready() -> JSONResponse:
+        now = status()
+        taking = now.ready and not now.draining
+        return JSONResponse({"ready": taking}, 200 if taking else 503)
+
+    @app.get("/metrics", summary="Prometheus text")
+    async def metrics() -> Response:
+        return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)
+
+    @app.get("/config", summary="The resolved settings")
+    async def config() -> dict[str, Any]:
+        return settings
+
+    @app.get("/tasks", summary="What can be run here")
+    async def known_tasks() -> list[dict[str, Any]]:
+        return [
+            {"name": k.name, "source_hash": k.source_hash, "duplicate": k.duplicate} for k in tasks.kinds()
+        ]
+
+    return app
+
+
+class Web:
+    """Serves an app in a daemon thread, from `start` until `close`."""
+
+    def __init__(self, app: FastAPI, address: tuple[str, int]) -> None:
+        self._socket = _listen(address)
+        host, port = self._socket.getsockname()[:2]
+        self.address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        config = uvicorn.Config(
+            app,
+            log_level="warning",
+            log_config=None,
+            access_log=False,
+            lifespan="off",
+            timeout_graceful_shutdown=int(STOP_S),
+        )
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(
+            target=self._server.run, kwargs={"sockets": [self._socket]}, name="web", daemon=True
+        )
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def close(self) -> None:
+        self._server.should_exit = True
+        if self._thread.is_alive():
+            self._thread.join(2 * STOP_S)
+        self._socket.close()
+
+
+def _listen(address: tuple[str, int]) -> socket.socket:
+    family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+    try:
+        return socket.create_server(address, family=family, backlog=128)
+    except OSError as error:
+        host, port = address
+        raise ConfigError(f"--http: {host}:{port} cannot be bound: {error.strerror}") from error

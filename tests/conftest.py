@@ -1,0 +1,53 @@
+"""Fixtures that make real parts and end them."""
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from loadgen.testbed import LocalTestbed
+from robot_client.offloader import Offloader
+
+ROOT = Path(__file__).parents[1]
+# The compiled planner is kept beside the checkout, as `make` does it.
+os.environ.setdefault("NUMBA_CACHE_DIR", str(ROOT / ".cache" / "numba"))
+
+PROBES = ("--tasks", "tests.probes", "--workers", "1")
+
+
+@pytest.fixture
+def testbed(tmp_path: Path) -> Iterator[Callable[..., LocalTestbed]]:
+    """Makes started testbeds: a real server and a real relay on loopback, without delay unless asked for."""
+    made: list[LocalTestbed] = []
+
+    def factory(*cloud_args: str, **link: Any) -> LocalTestbed:
+        conditions = {"delay_ms": 0.0, "bandwidth_mbps": 0.0} | link
+        bed = LocalTestbed(tmp_path, link=conditions, cloud_args=[*PROBES, *cloud_args])
+        bed.__enter__()
+        made.append(bed)
+        bed.start()
+        return bed
+
+    yield factory
+    for bed in made:
+        bed.__exit__(None, None, None)
+
+
+@pytest.fixture
+def connect() -> Iterator[Callable[..., Offloader]]:
+    """Makes offloaders that are connected to a testbed's relay."""
+    made: list[Offloader] = []
+
+    def factory(bed: LocalTestbed, **options: Any) -> Offloader:
+        from tests.probes import echo
+
+        endpoint = bed.robot_command[bed.robot_command.index("--cloud") + 1]
+        made.append(Offloader.connect(endpoint, **options))
+        assert made[-1].wait_for_sites(echo, 10.0) == {}
+        return made[-1]
+
+    yield factory
+    for offload in made:
+        offload.close()

@@ -1,0 +1,38 @@
+"""Small tasks for tests of the way a task takes; loaded on both sides as `tests.probes`."""
+
+import os
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.tasks import task
+
+
+@task("echo", size=lambda value=None: 0.0)  # noqa: ARG005 - an empty task has no size
+def echo(value: object = None) -> object:
+    return value
+
+
+@task("nap", size=lambda seconds: seconds)
+def nap(seconds: float) -> float:
+    time.sleep(seconds)
+    return seconds
+
+
+@task("total", size=lambda numbers: float(len(numbers)))
+def total(numbers: NDArray[np.float64]) -> float:
+    return float(numbers.sum())
+
+
+@task("process_id", size=lambda: 0.0)
+def process_id() -> int:
+    return os.getpid()
+
+
+@task("mark_once", size=lambda path: 0.0, duplicate=False)  # noqa: ARG005 - no size
+def mark_once(path: str) -> int:
+    """Appends the process id to a file, so that a second run shows."""
+    with open(path, "a") as file:  # noqa: PTH123 - a path from the wire is text
+        file.write(f"{os.getpid()}\n")
+    return os.getpid()

@@ -1,0 +1,287 @@
+"""The executor contract, for every executor, and what is particular to worker processes."""
+
+import hashlib
+import importlib
+import os
+import select
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import wait
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cloud_server.executors import EXECUTORS, Executor, Outcome, Processes
+from common.wire import StoredBlob, decode, encode
+
+WAIT_S = 8
+ROOT = Path(__file__).parents[2]
+MODULE = '''
+import os, signal, threading
+from common.tasks import task
+
+warmed = []
+
+@task("exec_sum", size=lambda array: array.size, warm=lambda: warmed.append(1))
+def exec_sum(array):
+    return float(array.sum())
+
+@task("exec_where", size=lambda array: 0)
+def exec_where(array):
+    """Process, times warmed, identity of the array."""
+    return [os.getpid(), len(warmed), id(array)]
+
+@task("exec_raise", size=lambda text: 0)
+def exec_raise(text):
+    raise ValueError(text)
+
+@task("exec_exit", size=lambda: 0)
+def exec_exit():
+    raise SystemExit(3)
+
+@task("exec_object", size=lambda: 0)
+def exec_object():
+    return threading.Lock
+
+@task("exec_echo", size=lambda value: 0)
+def exec_echo(value):
+    return value
+
+@task("exec_wait_for_file", size=lambda path: 0)
+def exec_wait_for_file(path):
+    with open(path) as pipe:  # a named pipe: opening waits for the writer
+        return pipe.read()
+
+@task("exec_die", size=lambda: 0)
+def exec_die():
+    os.kill(os.getpid(), signal.SIGKILL)
+'''
+
+
+@pytest.fixture(scope="module")
+def module(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    folder = tmp_path_factory.mktemp("tasks")
+    (folder / "executor_tasks.py").write_text(MODULE)
+    patch = pytest.MonkeyPatch()
+    patch.syspath_prepend(folder)
+    importlib.import_module("executor_tasks")
+    yield "executor_tasks"
+    patch.undo()
+
+
+@pytest.fixture
+def make(module: str) -> Iterator[Callable[..., Executor]]:
+    made: list[Executor] = []
+
+    def start(name: str, workers: int = 1, blob_bytes_max: int = 1_000_000) -> Executor:
+        executor = EXECUTORS[name](workers, [module], blob_bytes_max)
+        made.append(executor)
+        executor.warm().result(WAIT_S)
+        return executor
+
+    yield start
+    for executor in made:
+        executor.close()
+
+
+@pytest.fixture(scope="module", params=sorted(EXECUTORS))
+def executor(request: pytest.FixtureRequest, module: str) -> Iterator[Executor]:
+    """One warm executor of each name, two workers."""
+    executor = EXECUTORS[request.param](2, [module], 1_000_000)
+    executor.warm().result(WAIT_S)
+    yield executor
+    executor.close()
+
+
+def run(executor: Executor, kind: str, *args: Any) -> Outcome:
+    body = encode(args, blobs=True)
+    blobs = {digest: StoredBlob(data) for digest, data in body.blobs.items()}
+    return executor.submit(kind, body.frames, blobs).result(WAIT_S)
+
+
+def value(outcome: Outcome) -> Any:
+    assert outcome.status == "ok", outcome.error
+    return decode(outcome.frames, [], {})
+
+
+def test_a_task_runs_and_its_result_comes_back(executor: Executor) -> None:
+    """Arrays in frames and in blobs reach the task; the outcome says how long it took."""
+    for n in (10, 100_000):
+        outcome = run(executor, "exec_sum", np.ones(n))
+        assert value(outcome) == n
+        assert outcome.run_s > 0
+    echoed = value(run(executor, "exec_echo", {"a": [np.eye(3), b"raw", None]}))
+    np.testing.assert_array_equal(echoed["a"][0], np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("kind", "args", "error"),
+    [
+        ("exec_raise", ["no such place"], "ValueError: no such place"),
+        ("exec_exit", [], "SystemExit: 3"),
+        (
+            "exec_object",
+            [],
+            "BadValue: a value of type builtins.builtin_function_or_method cannot cross the wire",
+        ),
+        ("exec_echo", [1, 2], "TypeError: exec_echo() takes 1 positional argument but 2 were given"),
+        ("exec_unheard_of", [], "UnknownTask: no task named 'exec_unheard_of'; known:"),
+    ],
+)
+def test_what_a_task_raises_is_its_outcome(
+    executor: Executor, kind: str, args: list[Any], error: str
+) -> None:
+    """Failed, with the type and text of what was raised; the worker lives on."""
+    outcome = run(executor, kind, *args)
+    assert outcome.status == "failed"
+    assert outcome.error.startswith(error)
+    assert value(run(executor, "exec_echo", 1)) == 1
+
+
+@pytest.mark.parametrize("frames", [[b"\xc1"], [b"\x01"], [b"\x91\xd7\x01\x93\x01\xa3<i2\x91\x02"], []])
+def test_an_unsound_body_fails_alone(executor: Executor, frames: list[bytes]) -> None:
+    """Bytes that are no list of arguments give failed, and nothing else."""
+    outcome = executor.submit("exec_echo", frames, {}).result(WAIT_S)
+    assert (outcome.status, outcome.error.split(":")[0]) == ("failed", "ProtocolError")
+    assert not executor.broken
+
+
+def test_every_worker_is_warm_and_tasks_run_side_by_side(executor: Executor, tmp_path: Path) -> None:
+    """Two tasks that wait do so at once, and `warm` ran before the first task."""
+    pipes = [tmp_path / "a", tmp_path / "b"]
+    futures = []
+    for pipe in pipes:
+        os.mkfifo(pipe)
+        futures.append(executor.submit("exec_wait_for_file", encode([str(pipe)]).frames, {}))
+    for pipe in reversed(pipes):  # the later one first: neither waits for the other
+        pipe.write_text(pipe.name)
+    assert [value(future.result(WAIT_S)) for future in futures] == ["a", "b"]
+    assert value(run(executor, "exec_where", 0))[1] == 1
+
+
+def test_a_blob_is_the_same_array_each_time(make: Callable[..., Executor]) -> None:
+    """A task that prepares a map once finds it again by identity, in every executor."""
+    for name in sorted(EXECUTORS):
+        executor = make(name)
+        body = encode([np.ones(100_000)], blobs=True)
+        blobs = {digest: StoredBlob(data) for digest, data in body.blobs.items()}
+        seen = {value(executor.submit("exec_where", body.frames, blobs).result(WAIT_S))[2] for _ in range(3)}
+        assert len(seen) == 1
+
+
+def test_processes_are_others_and_threads_are_not(make: Callable[..., Executor]) -> None:
+    """`threads` runs in the server's process, `processes` does not."""
+    assert value(run(make("threads"), "exec_where", 0))[0] == os.getpid()
+    assert value(run(make("processes"), "exec_where", 0))[0] != os.getpid()
+
+
+def test_a_dead_worker_fails_what_ran_and_a_new_pool_works(
+    make: Callable[..., Executor], tmp_path: Path
+) -> None:
+    """What was in flight fails with the reason; after `warm` the executor is whole again."""
+    executor = make("processes", workers=2)
+    pipe = tmp_path / "never"
+    os.mkfifo(pipe)
+    beside = executor.submit("exec_wait_for_file", encode([str(pipe)]).frames, {})
+    for outcome in (run(executor, "exec_die"), beside.result(WAIT_S)):
+        assert (outcome.status, outcome.error) == ("failed", "a worker process died while this task ran")
+    assert executor.broken
+    assert run(executor, "exec_echo", 1).status == "busy"
+    executor.warm().result(WAIT_S)
+    assert value(run(executor, "exec_sum", np.ones(50_000))) == 50_000
+
+
+def test_the_spool_is_bounded_and_private_and_goes_away(make: Callable[..., Executor]) -> None:
+    """Blob files are private, stay within the bound, and end with the executor."""
+    executor = make("processes", blob_bytes_max=2_000_000)
+    assert isinstance(executor, Processes)
+    folder = executor._spool.folder
+    assert folder.stat().st_mode & 0o077 == 0
+    arrays = [np.full(100_000, n, float) for n in range(4)]
+    for array in [*arrays, arrays[-1]]:
+        assert value(run(executor, "exec_sum", array)) == array.sum()
+        assert sum(file.stat().st_size for file in folder.iterdir()) <= 2_000_000
+    kept = {file.name for file in folder.iterdir()}
+    assert kept == {hashlib.sha256(array.tobytes()).hexdigest() for array in arrays[-2:]}
+    executor.close()
+    assert not folder.exists()
+
+
+def test_no_room_for_a_blob_is_busy_not_the_end(make: Callable[..., Executor]) -> None:
+    """When the blob cannot be written the task does not run here, and the next one does."""
+    executor = make("processes")
+    assert isinstance(executor, Processes)
+    real, executor._spool.folder = executor._spool.folder, Path("/proc/nowhere")
+    assert run(executor, "exec_sum", np.ones(100_000)).status == "busy"
+    executor._spool.folder = real
+    assert value(run(executor, "exec_sum", np.ones(100_000))) == 100_000
+    assert executor._spool._pins == {}
+
+
+def test_closing_does_not_wait_for_a_task_that_hangs(make: Callable[..., Executor], tmp_path: Path) -> None:
+    """A hanging task is abandoned: its worker process is gone when `close` returns."""
+    executor = make("processes")
+    pid = value(run(executor, "exec_where", 0))[0]
+    pipe = tmp_path / "never"
+    os.mkfifo(pipe)
+    hanging = executor.submit("exec_wait_for_file", encode([str(pipe)]).frames, {})
+    executor.close()
+    executor.close()
+    assert hanging.result(WAIT_S).status != "ok"
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+
+
+def test_closing_while_workers_start_ends_them(module: str) -> None:
+    """A server told to stop before it was ready stops."""
+    executor = EXECUTORS["processes"](2, [module], 1000)
+    starting = executor.warm()
+    executor.close()
+    wait([starting], WAIT_S)
+    assert starting.done()
+
+
+def test_workers_that_cannot_start_are_reported(module: str) -> None:
+    """A task module that breaks in the worker gives one clear error, not a wait."""
+    executor = EXECUTORS["processes"](2, [module, "no_such_module"], 1000)
+    with pytest.raises(Exception, match="worker processes did not start"):
+        executor.warm().result(WAIT_S)
+    executor.close()
+
+
+SERVER = """
+import sys
+from cloud_server.executors import Processes
+
+if __name__ == "__main__":
+    sys.path.insert(0, sys.argv[1])
+    executor = Processes(2, [sys.argv[2]], 1000)
+    executor.warm().result(8)
+    print(*executor._pids, flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_workers_die_with_the_server(module: str, tmp_path: Path) -> None:
+    """kill -9 of the server leaves no worker process behind."""
+    script = tmp_path / "little_server.py"
+    script.write_text(SERVER)
+    folder = str(Path(importlib.import_module(module).__file__ or "").parent)
+    with subprocess.Popen(
+        [sys.executable, str(script), folder, module],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path)},
+    ) as server:
+        assert server.stdout is not None
+        exits = [os.pidfd_open(int(pid)) for pid in server.stdout.readline().split()]
+        server.kill()
+        server.wait(WAIT_S)
+        gone = [select.select([fd], [], [], WAIT_S)[0] == [fd] for fd in exits]
+    for fd in exits:
+        os.close(fd)
+    assert gone == [True, True]
