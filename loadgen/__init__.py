@@ -1,0 +1,1 @@
+"""The test bench: load, network, faults, measurement. Never needed in the field."""

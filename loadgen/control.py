@@ -1,0 +1,118 @@
+"""The relay's HTTP side: read the link, change it, start and end an outage.
+
+What a change does to bytes under way is the business of `wan.py`.
+"""
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import Any, Protocol
+
+import uvicorn
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ConfigDict, Field
+
+from common.errors import ConfigError
+from loadgen.link import DISTRIBUTIONS, Link
+
+STOP_S = 1  # how long a reply in progress may take when the relay stops
+
+
+class Linked(Protocol):
+    """Has a link that can be read and replaced at any time."""
+
+    @property
+    def link(self) -> Link: ...
+
+    def set_link(self, link: Link) -> None: ...
+
+    def status(self) -> dict[str, Any]:
+        """What else there is to show."""
+
+
+class Change(BaseModel):
+    """New conditions; what is left out stays as it is."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    delay_ms: float | None = Field(None, description="delay one way")
+    jitter_ms: float | None = Field(None, description="spread of the delay")
+    distribution: str | None = Field(None, description=f"one of {', '.join(DISTRIBUTIONS)}")
+    bandwidth_mbps: float | None = Field(None, description="0 is unlimited")
+    outage: bool | None = Field(None, description="silence until it is set to false again; not a reset")
+
+
+class LinkChange(Change):
+    """Conditions for both directions, or under `up` and `down` for one."""
+
+    up: Change | None = Field(None, description="robot to cloud alone")
+    down: Change | None = Field(None, description="cloud to robot alone")
+
+
+class ControlServer(uvicorn.Server):
+    """Serves the API in the relay's own event loop; signals are left to the relay."""
+
+    def __init__(self, relay: Linked) -> None:
+        app = control_app(relay)
+        options: dict[str, Any] = {"lifespan": "off", "log_level": "warning", "access_log": False}
+        super().__init__(uvicorn.Config(app, timeout_graceful_shutdown=STOP_S, **options))
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+    def stop(self) -> None:
+        """Let `serve` return soon."""
+        self.should_exit = True
+
+
+def control_app(relay: Linked) -> FastAPI:
+    """The API over one relay."""
+    app = FastAPI(
+        title="Offboard relay", description="The link between robot and cloud, read and changed live."
+    )
+
+    @app.get("/health")
+    async def health() -> dict[str, str]:
+        """The relay's loop turns."""
+        return {"status": "ok"}
+
+    @app.get("/link")
+    async def read_link() -> dict[str, Any]:
+        """Conditions of both directions, connections, bytes delivered."""
+        return _shown(relay)
+
+    @app.put("/link")
+    async def change_link(change: LinkChange) -> dict[str, Any]:
+        """Change some conditions for the bytes that arrive from now on; answers the whole link."""
+        relay.set_link(relay.link.changed(change.model_dump(exclude_none=True)))
+        return _shown(relay)
+
+    @app.exception_handler(ConfigError)
+    async def bad_value(_request: Request, error: ConfigError) -> JSONResponse:
+        return JSONResponse({"detail": str(error)}, 422)
+
+    @app.exception_handler(RequestValidationError)
+    async def bad_request(_request: Request, error: RequestValidationError) -> JSONResponse:
+        return JSONResponse({"detail": "; ".join(map(_sentence, error.errors()))}, 422)
+
+    return app
+
+
+def _shown(relay: Linked) -> dict[str, Any]:
+    link = relay.link
+    outage = link.up.outage and link.down.outage
+    return {"up": asdict(link.up), "down": asdict(link.down), "outage": outage, **relay.status()}
+
+
+def _sentence(error: dict[str, Any]) -> str:
+    """One pydantic error as `field: what is wrong; what is allowed`."""
+    name = ".".join(str(part) for part in error["loc"][1:]) or "body"
+    if error["type"] == "extra_forbidden":
+        known = Change.model_fields if len(error["loc"]) > 2 else LinkChange.model_fields
+        return f"{name}: unknown condition; known: {', '.join(known)}"
+    if error["type"] == "json_invalid":
+        return f"body: not JSON: {error['ctx']['error']}"
+    return f"{name}: {error['input']!r}: {error['msg']}"

@@ -1,0 +1,199 @@
+"""What a caller sees when the cloud or the link fails in the middle of a run: answers, in bounded time."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from common.errors import CloudTimeout
+from loadgen.testbed import LocalTestbed
+from robot_client.offloader import Offloader
+from robot_client.runner import CLOUD, ONBOARD
+from robot_client.trace import Record
+from tests.probes import echo, mark_once, nap, total
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
+
+TIMEOUT_S = 0.5
+ONBOARD_S = 0.02  # what the task takes
+SLACK_S = 0.5  # two noisy cores
+
+Beds = Callable[..., LocalTestbed]
+Connect = Callable[..., Offloader]
+
+
+class Stream:
+    """A caller that asks for one task after the other until told to stop."""
+
+    def __init__(self, offload: Offloader) -> None:
+        self.records: list[Record] = []
+        self.lost = 0
+        self._offload = offload
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    @contextmanager
+    def running(self) -> Iterator["Stream"]:
+        self._thread.start()
+        try:
+            yield self
+        finally:
+            self._stop.set()
+            self._thread.join(TIMEOUT_S + ONBOARD_S + 10 * SLACK_S)
+            assert not self._thread.is_alive(), "a task hangs"
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            self.lost += self._offload(nap, ONBOARD_S) != ONBOARD_S
+            assert self._offload.last is not None
+            self.records.append(self._offload.last)
+
+    def wait_for(self, what: Callable[[Record], bool], timeout_s: float = 20.0) -> Record:
+        """The first record from now on of which `what` holds."""
+        seen, until = len(self.records), time.monotonic() + timeout_s
+        while time.monotonic() < until:
+            for record in self.records[seen:]:
+                if what(record):
+                    return record
+            time.sleep(0.01)
+        pytest.fail(f"not seen in {timeout_s} s; last: {self.records[-1:]}")
+
+    def check(self) -> None:
+        """Every task was answered, with the right answer, within timeout + onboard time."""
+        assert self.lost == 0
+        worst = max(record.waited_s for record in self.records)
+        bound = TIMEOUT_S + ONBOARD_S + SLACK_S
+        assert worst <= bound, f"waited {worst:.3f} s, at most {bound:.3f} s expected"
+
+
+def in_the_cloud(record: Record) -> bool:
+    return record.used == CLOUD
+
+
+def onboard(record: Record) -> bool:
+    return record.used == ONBOARD
+
+
+def test_a_killed_server_costs_no_task_and_is_used_again(testbed: Beds, connect: Connect) -> None:
+    """Kill -9, five seconds of nothing, a new server: 0 lost, 0 hung, then the cloud again, blobs re-sent."""
+    bed = testbed()
+    offload = connect(bed, policy=CLOUD, timeout_s=TIMEOUT_S)
+    numbers = np.arange(100_000, dtype=np.float64)
+    numbers.flags.writeable = False
+    assert offload(total, numbers) == numbers.sum()
+    stream = Stream(offload)
+    with stream.running():
+        stream.wait_for(in_the_cloud)
+        bed.kill("cloud")
+        stream.wait_for(onboard)
+        time.sleep(5)
+        bed.start("cloud")
+        stream.wait_for(in_the_cloud)
+        assert offload(total, numbers) == numbers.sum()  # the new server asks for the blob by itself
+        assert offload.last is not None
+    stream.check()
+    offload(total, numbers)
+    assert offload.last.used == CLOUD
+    assert offload.last.executions[0].bytes_out < numbers.nbytes
+
+
+def test_an_outage_costs_no_task_and_the_cloud_is_used_again(testbed: Beds, connect: Connect) -> None:
+    """Silence for two seconds: each task waits, then runs onboard; afterwards the cloud answers."""
+    bed = testbed()
+    offload = connect(bed, policy=CLOUD, timeout_s=TIMEOUT_S)
+    stream = Stream(offload)
+    with stream.running():
+        stream.wait_for(in_the_cloud)
+        bed.set_link(outage=True)
+        late = stream.wait_for(onboard)
+        time.sleep(2)
+        bed.set_link(outage=False)
+        stream.wait_for(in_the_cloud)
+    stream.check()
+    assert [type(one.failure).__name__ for one in late.executions] == ["CloudTimeout", "NoneType"]
+    assert late.executions[0].censored
+
+
+def test_the_published_rule_stays_onboard_after_an_outage(testbed: Beds, connect: Connect) -> None:
+    """Algorithm 1 learns the lost times and has no way back: the failure that later policies mend."""
+    bed = testbed()
+    offload = connect(bed, policy="paper", window=5, timeout_s=TIMEOUT_S)
+    for _ in range(10):
+        offload(nap, ONBOARD_S)
+    bed.set_link(outage=True)
+    for _ in range(6):
+        assert offload(nap, ONBOARD_S, where=CLOUD) == ONBOARD_S
+    bed.set_link(outage=False)
+    for _ in range(10):
+        offload(nap, ONBOARD_S)
+        assert offload.last is not None
+        assert offload.last.decision.site == ONBOARD
+        assert offload.last.sites[CLOUD].predicted_s == pytest.approx(TIMEOUT_S, abs=0.2)
+
+
+def test_a_hanging_server_is_given_up(testbed: Beds, connect: Connect) -> None:
+    """A stopped server (SIGSTOP) accepts and says nothing: the timeout holds, and it is used again."""
+    bed = testbed()
+    stream = Stream(connect(bed, policy=CLOUD, timeout_s=TIMEOUT_S))
+    with stream.running():
+        stream.wait_for(in_the_cloud)
+        bed.pause("cloud")
+        stream.wait_for(onboard)
+        bed.resume("cloud")
+        stream.wait_for(in_the_cloud)
+    stream.check()
+
+
+def test_a_killed_relay_is_a_lost_connection(testbed: Beds, connect: Connect) -> None:
+    """Without the link the robot goes on alone; with a new relay on the same port it comes back."""
+    bed = testbed()
+    stream = Stream(connect(bed, policy=CLOUD, timeout_s=TIMEOUT_S))
+    with stream.running():
+        stream.wait_for(in_the_cloud)
+        bed.kill("wan")
+        record = stream.wait_for(lambda record: "not connected" in record.decision.reason or onboard(record))
+        assert record.used == ONBOARD
+        bed.start("wan")
+        stream.wait_for(in_the_cloud)
+    stream.check()
+
+
+def test_late_answers_are_dropped(testbed: Beds, connect: Connect) -> None:
+    """An answer that comes after its task was given up never becomes the answer of another task."""
+    offload = connect(testbed(), policy=CLOUD, timeout_s=0.1)
+    assert offload(nap, 0.3) == 0.3  # given up after 0.1 s, run onboard, the server's answer comes late
+    assert [offload(echo, n, timeout_s=2.0) for n in range(20)] == list(range(20))
+
+
+def test_a_task_that_must_not_run_twice_did_not(
+    testbed: Beds, connect: Connect, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """duplicate=False over a dead link: one error, and the file it writes has one line at most."""
+    bed = testbed()
+    offload = connect(bed, policy=CLOUD, timeout_s=TIMEOUT_S)
+    mark = tmp_path_factory.mktemp("mark") / "once"
+    offload(mark_once, str(mark))
+    bed.pause("cloud")
+    with pytest.raises(CloudTimeout):
+        offload(mark_once, str(mark))
+    bed.resume("cloud")
+    offload(echo, timeout_s=5.0)
+    assert len(mark.read_text().splitlines()) <= 2
+
+
+def test_a_full_queue_is_answered_onboard(testbed: Beds, connect: Connect) -> None:
+    """`busy` is an answer at once, not a wait for the timeout."""
+    bed = testbed("--queue-max", "1")
+    offload = connect(bed, policy=CLOUD, timeout_s=10.0)
+    threads = [threading.Thread(target=offload, args=(nap, 1.0), kwargs={"where": CLOUD}) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+        time.sleep(0.1)
+    assert offload(echo, 1) == 1
+    assert offload.last is not None
+    assert [type(one.failure).__name__ for one in offload.last.executions] == ["CloudBusy", "NoneType"]
+    for thread in threads:
+        thread.join()

@@ -1,0 +1,396 @@
+"""The relay as a process of its own: what its link does to real sockets, and how it is changed live."""
+
+import contextlib
+import http.client
+import json
+import re
+import signal
+import socket
+import statistics
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+
+from loadgen.wan import WanConfig
+
+pytestmark = pytest.mark.integration
+
+WAN = """
+import sys
+from common.config import load, run_command
+from loadgen.wan import WanConfig, run_wan
+settings = dict(prog="wan", description="", environ={}, prefix="WAN")
+sys.exit(run_command("wan", lambda: run_wan(load(WanConfig, sys.argv[1:], **settings))))
+"""
+WAIT_S = 5.0
+PINGS = 50
+BATCHES = 3
+QUIET_S = 0.15
+
+
+@dataclass
+class Wan:
+    """A running relay."""
+
+    process: subprocess.Popen[str]
+    port: int
+    http_port: int
+
+    def connect(self) -> socket.socket:
+        client = socket.create_connection(("127.0.0.1", self.port), timeout=WAIT_S)
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return client
+
+    def ask(self, method: str, path: str, body: Any = None) -> tuple[int, Any]:
+        connection = http.client.HTTPConnection("127.0.0.1", self.http_port, timeout=WAIT_S)
+        with contextlib.closing(connection):
+            text = body if isinstance(body, str) else json.dumps(body)
+            connection.request(
+                method, path, None if body is None else text, {"Content-Type": "application/json"}
+            )
+            reply = connection.getresponse()
+            return reply.status, json.loads(reply.read())
+
+    def change(self, **changes: Any) -> Any:
+        status, link = self.ask("PUT", "/link", changes)
+        assert status == 200, link
+        return link
+
+
+@pytest.fixture
+def cloud() -> Iterator[Callable[[Callable[[socket.socket], None]], int]]:
+    """Factory: a TCP server whose connections are given to a function, each in a thread; returns the port."""
+    listeners = []
+    threads = []
+
+    def serve(talk: Callable[[socket.socket], None]) -> int:
+        listener = socket.create_server(("127.0.0.1", 0))
+        listeners.append(listener)
+
+        def run(connection: socket.socket) -> None:
+            with connection, contextlib.suppress(OSError):
+                connection.settimeout(WAIT_S)
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                talk(connection)
+
+        def accept() -> None:
+            with contextlib.suppress(OSError):
+                while True:
+                    threads.append(threading.Thread(target=run, args=(listener.accept()[0],)))
+                    threads[-1].start()
+
+        threads.append(threading.Thread(target=accept))
+        threads[-1].start()
+        return int(listener.getsockname()[1])
+
+    yield serve
+    for listener in listeners:
+        listener.shutdown(socket.SHUT_RDWR)
+        listener.close()
+    for thread in threads:
+        thread.join(WAIT_S)
+        assert not thread.is_alive()
+
+
+@pytest.fixture
+def wan() -> Iterator[Callable[..., Wan]]:
+    """Factory: a relay process to a port, with more flags."""
+    with contextlib.ExitStack() as stack:
+
+        def start(to: int, *flags: str) -> Wan:
+            command = [sys.executable, "-c", WAN, "--to", f"127.0.0.1:{to}", "--listen", "127.0.0.1:0"]
+            command += ["--http", "127.0.0.1:0", *flags]
+            process = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+            stack.callback(process.kill)
+            assert process.stdout is not None
+            ports = re.findall(r":(\d+)", process.stdout.readline())
+            return Wan(process, int(ports[0]), int(ports[-1]))
+
+        yield start
+
+
+def echo(connection: socket.socket) -> None:
+    while data := connection.recv(65536):
+        connection.sendall(data)
+
+
+def round_trip_s(client: socket.socket) -> float:
+    start = time.perf_counter()
+    client.sendall(b"ping")
+    assert receive(client, 4) == b"ping"
+    return time.perf_counter() - start
+
+
+def quietest(measure: Callable[[], float]) -> float:
+    """The least of three medians: other load on the machine only ever adds."""
+    return min(statistics.median(measure() for _ in range(PINGS)) for _ in range(BATCHES))
+
+
+def receive(client: socket.socket, size: int) -> bytes:
+    data = b""
+    while len(data) < size and (part := client.recv(size - len(data))):
+        data += part
+    return data
+
+
+def silent(client: socket.socket) -> bool:
+    """Nothing comes, not even an end, for a while."""
+    client.settimeout(QUIET_S)
+    try:
+        return client.recv(1) is None
+    except TimeoutError:
+        return True
+    finally:
+        client.settimeout(WAIT_S)
+
+
+def test_delay_is_added_to_each_direction(cloud: Any, wan: Any) -> None:
+    """15 ms each way make a round trip of 30 ms, at most 1.5 ms more at the median."""
+    with wan(cloud(echo), "--delay-ms", "15").connect() as client:
+        median_ms = 1e3 * quietest(lambda: round_trip_s(client))
+    print(f"round trip {median_ms:.3f} ms")
+    assert 30.0 <= median_ms <= 31.5
+
+
+def test_no_conditions_add_next_to_nothing(cloud: Any, wan: Any) -> None:
+    """Without conditions the relay itself adds less than 0.25 ms to the median round trip."""
+    port = cloud(echo)
+    relay = wan(port, "--delay-ms", "0", "--bandwidth-mbps", "0")
+    with relay.connect() as relayed, socket.create_connection(("127.0.0.1", port)) as direct:
+        added_ms = 1e3 * quietest(lambda: -round_trip_s(direct) + round_trip_s(relayed))
+    print(f"added {added_ms:.3f} ms")
+    assert 0 < added_ms < 0.25
+
+
+def test_bandwidth_is_kept(cloud: Any, wan: Any) -> None:
+    """5 MB at 20 Mbps take 2.0 s, plus or minus 5 %."""
+    size = 5_000_000
+    taken_s: list[float] = []
+
+    def sink(connection: socket.socket) -> None:
+        assert len(receive(connection, size)) == size
+        connection.sendall(b"k")
+
+    with wan(cloud(sink), "--delay-ms", "0", "--bandwidth-mbps", "20").connect() as client:
+        start = time.perf_counter()
+        client.sendall(bytes(size))
+        assert client.recv(1) == b"k"
+        taken_s.append(time.perf_counter() - start)
+    print(f"taken {taken_s[0]:.3f} s")
+    assert taken_s[0] == pytest.approx(2.0, rel=0.05)
+
+
+def test_large_streams_cross_whole_with_bounded_buffers(cloud: Any, wan: Any) -> None:
+    """20 MB through buffers of 64 KiB come back byte for byte, and in order, with jitter on."""
+    relay = wan(
+        cloud(echo), "--delay-ms", "1", "--jitter-ms", "1", "--buffer-bytes", "65536", "--bandwidth-mbps", "0"
+    )
+    data = b"".join(n.to_bytes(4, "big") for n in range(500_000))
+    with relay.connect() as client:
+        sender = threading.Thread(target=client.sendall, args=(data,))
+        sender.start()
+        assert receive(client, len(data)) == data
+        sender.join()
+
+
+def test_a_reader_that_stops_makes_the_sender_wait(cloud: Any, wan: Any) -> None:
+    """With a cloud that does not read, a sender is stopped after the buffers, not taken in without bound."""
+    go_on = threading.Event()
+    relay = wan(cloud(lambda _: go_on.wait(WAIT_S)), "--delay-ms", "0", "--buffer-bytes", "65536")
+    with relay.connect() as client:
+        client.settimeout(QUIET_S)
+        sent = 0
+        with contextlib.suppress(TimeoutError):
+            while sent < 100_000_000:
+                sent += client.send(bytes(65536))
+        go_on.set()
+    assert 65536 <= sent < 50_000_000  # kernel buffers of four sockets, and ours
+
+
+def test_what_a_closing_side_had_sent_is_delivered(cloud: Any, wan: Any) -> None:
+    """A cloud that answers and closes at once: the answer arrives after its delay, then the end."""
+    relay = wan(cloud(lambda connection: connection.sendall(b"bye")), "--delay-ms", "40")
+    with relay.connect() as client:
+        start = time.perf_counter()
+        assert receive(client, 3) == b"bye"
+        assert client.recv(1) == b""
+        assert time.perf_counter() - start >= 0.04
+    wait_until(lambda: relay.ask("GET", "/link")[1]["connections"] == 0)
+
+
+def test_a_client_that_closes_ends_the_cloud_side(cloud: Any, wan: Any) -> None:
+    """The cloud gets all bytes of a client that sent and closed, then the end."""
+    got: list[bytes] = []
+    relay = wan(cloud(lambda connection: got.append(receive(connection, 1 << 30))), "--delay-ms", "20")
+    with relay.connect() as client:
+        client.sendall(b"x" * 100_000)
+    wait_until(lambda: got)
+    assert got == [b"x" * 100_000]
+    wait_until(lambda: relay.ask("GET", "/link")[1]["connections"] == 0)
+
+
+def test_a_refusing_cloud_closes_the_client_at_once(wan: Any) -> None:
+    """When nobody listens in the cloud the client's connection ends, so that it connects again."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        nobody = taken.getsockname()[1]
+    with wan(nobody).connect() as client, contextlib.suppress(ConnectionResetError):
+        assert client.recv(1) == b""
+
+
+def test_one_connection_too_many_is_closed(cloud: Any, wan: Any) -> None:
+    """Beyond the limit a new client is closed, the ones before go on."""
+    relay = wan(cloud(echo), "--connections-max", "1", "--delay-ms", "0")
+    with relay.connect() as first, relay.connect() as second:
+        assert second.recv(1) == b""
+        round_trip_s(first)
+        assert relay.ask("GET", "/link")[1]["refused"] == 1
+
+
+def test_an_outage_is_silence(cloud: Any, wan: Any) -> None:
+    """In an outage open and new connections hear nothing; what was sent is delivered afterwards."""
+    relay = wan(cloud(echo), "--delay-ms", "5")
+    with relay.connect() as old:
+        round_trip_s(old)
+        assert relay.change(outage=True)["outage"] is True
+        with relay.connect() as new:
+            old.sendall(b"old!")
+            new.sendall(b"new!")
+            assert silent(old)
+            assert silent(new)
+            assert relay.change(outage=False)["outage"] is False
+            assert receive(old, 4) == b"old!"
+            assert receive(new, 4) == b"new!"
+
+
+def test_an_outage_can_be_one_way(cloud: Any, wan: Any) -> None:
+    """With only the way down out, the cloud still hears the robot, which hears nothing."""
+    got: list[bytes] = []
+
+    def answer(connection: socket.socket) -> None:
+        for _ in range(2):
+            got.append(receive(connection, 4))
+            connection.sendall(got[-1])
+
+    relay = wan(cloud(answer), "--delay-ms", "0")
+    with relay.connect() as client:
+        round_trip_s(client)
+        relay.change(down={"outage": True})
+        client.sendall(b"more")
+        wait_until(lambda: got == [b"ping", b"more"])
+        assert silent(client)
+        relay.change(outage=False)
+        assert receive(client, 4) == b"more"
+
+
+def test_a_changed_delay_holds_at_once(cloud: Any, wan: Any) -> None:
+    """A delay changed while a connection is open shows in its next round trips."""
+    relay = wan(cloud(echo), "--delay-ms", "0")
+    with relay.connect() as client:
+        assert statistics.median(round_trip_s(client) for _ in range(9)) == pytest.approx(0, abs=0.01)
+        link = relay.change(up={"delay_ms": 30})
+        assert (link["up"]["delay_ms"], link["down"]["delay_ms"]) == (30, 0)
+        assert statistics.median(round_trip_s(client) for _ in range(9)) == pytest.approx(0.0305, abs=0.003)
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ({"delay": 3}, "delay: unknown condition; known: delay_ms"),
+        ({"up": {"up": {}}}, "up.up: unknown condition; known: delay_ms"),
+        ({"down": {"delay_ms": -3}}, "down.delay_ms: -3.0 is not a number from 0 to 60000"),
+        ({"distribution": "gamma"}, "up.distribution: 'gamma' is not one of constant, uniform"),
+        ({"outage": "yes"}, "outage: 'yes': Input should be a valid boolean"),
+        ('{"delay_ms": NaN}', "up.delay_ms: nan is not a number"),
+        ("{", "body: not JSON"),
+    ],
+)
+def test_a_bad_change_is_refused(wan: Any, body: Any, message: str) -> None:
+    """An unknown condition or a bad value is a 422 that says which and why, and changes nothing."""
+    relay = wan(1)
+    before = relay.ask("GET", "/link")
+    status, reply = relay.ask("PUT", "/link", body)
+    assert status == 422
+    assert reply["detail"].startswith(message)
+    assert relay.ask("GET", "/link") == before
+
+
+def test_the_api_describes_itself(wan: Any) -> None:
+    """/health answers, and OpenAPI knows /link and its conditions."""
+    relay = wan(1)
+    assert relay.ask("GET", "/health") == (200, {"status": "ok"})
+    schema = relay.ask("GET", "/openapi.json")[1]
+    assert set(schema["paths"]["/link"]) == {"get", "put"}
+    assert "bandwidth_mbps" in json.dumps(schema["components"])
+
+
+@pytest.mark.parametrize("stop", [signal.SIGTERM, signal.SIGINT])
+def test_signals_end_the_relay(cloud: Any, wan: Any, stop: signal.Signals) -> None:
+    """SIGTERM and Ctrl-C end it with exit code 0, with a connection open too."""
+    relay = wan(cloud(echo))
+    with relay.connect() as client:
+        round_trip_s(client)
+        relay.process.send_signal(stop)
+        assert relay.process.wait(WAIT_S) == 0
+
+
+@pytest.mark.parametrize("flag", ["--listen", "--http"])
+def test_a_port_in_use_is_a_mistake_of_the_user(flag: str) -> None:
+    """A port that is taken: one line that names the flag and the port, exit code 2."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        endpoint = f"127.0.0.1:{taken.getsockname()[1]}"
+        command = [
+            sys.executable,
+            "-c",
+            WAN,
+            "--listen",
+            "127.0.0.1:0",
+            "--http",
+            "127.0.0.1:0",
+            flag,
+            endpoint,
+        ]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S)
+    assert done.returncode == 2
+    assert done.stderr == f"wan: {flag}: cannot listen on {endpoint}: Address already in use\n"
+
+
+def test_a_host_that_does_not_exist_is_a_mistake_of_the_user() -> None:
+    """A host name nobody knows: one line with the flag and the reason, exit code 2."""
+    command = [sys.executable, "-c", WAN, "--listen", "no-such-host.invalid:1"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S)
+    assert done.returncode == 2
+    assert done.stderr.startswith("wan: --listen: cannot listen on no-such-host.invalid:1: ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_idle_relay_is_idle(cloud: Any, wan: Any) -> None:
+    """With an open, quiet connection the relay takes at most 3 % of a CPU."""
+    relay = wan(cloud(echo))
+    with relay.connect() as client:
+        round_trip_s(client)
+        clock = (~relay.process.pid << 3) | 2
+        before = time.clock_gettime(clock)
+        time.sleep(1)
+        used = time.clock_gettime(clock) - before
+    print(f"idle {used:.4f} CPU")
+    assert used == pytest.approx(0, abs=0.03)
+
+
+def test_defaults_are_those_of_the_paper() -> None:
+    """15 ms each way and 400 Mbps, both directions."""
+    link = WanConfig().link
+    assert link.up == link.down
+    assert (link.up.delay_ms, link.up.jitter_ms, link.up.bandwidth_mbps) == (15, 0, 400)
+
+
+def wait_until(fact: Callable[[], Any]) -> None:
+    end = time.monotonic() + WAIT_S
+    while not fact():
+        assert time.monotonic() < end, "not within the wait"
+        time.sleep(0.01)

@@ -1,0 +1,132 @@
+"""What a stranger gets from the wheel, in an environment of its own outside the repository."""
+
+import os
+import subprocess
+import sys
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(300)]
+
+ROOT = Path(__file__).parents[2]
+
+TASKS = '''
+"""A user's own tasks."""
+import os
+from common.tasks import task
+
+@task("count_primes", size=lambda limit: limit)
+def count_primes(limit: int) -> int:
+    return sum(all(n % k for k in range(2, int(n**0.5) + 1)) for n in range(2, limit))
+
+@task("where_am_i", size=lambda: 0.0, duplicate=False)
+def where_am_i() -> int:
+    return os.getpid()
+'''
+
+PROGRAM = """
+import asyncio, os, sys
+from robot_client import Offloader
+from mytasks import count_primes, where_am_i
+
+with Offloader.connect(sys.argv[1], window=5) as offload:
+    assert offload.wait_for_sites(count_primes, 20.0) == {}
+    print([offload(count_primes, 1000) for _ in range(8)][-1], offload.last.decision.reason)
+    print(*[offload(where_am_i, where=site) == os.getpid() for site in ("onboard", "cloud")])
+    print(asyncio.run(offload.run(count_primes, 100)))
+"""
+
+CHANGED = """
+import logging, sys
+logging.basicConfig(format="%(message)s")
+from robot_client import Offloader
+from mytasks import count_primes
+with Offloader.connect(sys.argv[1]) as offload:
+    print(offload.wait_for_sites(count_primes, 3.0))
+    print([offload(count_primes, 100) for _ in range(3)], offload.last.used)
+"""
+
+
+def run(*command: str | Path, cwd: Path, **env: str) -> str:
+    done = subprocess.run(
+        list(map(str, command)), cwd=cwd, env=os.environ | env, capture_output=True, text=True, timeout=240
+    )
+    assert done.returncode == 0, f"{command}:\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
+    return done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("dist")
+    run(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", out, ROOT, cwd=out)
+    return next(out.glob("*.whl"))
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The bin folder of an environment with the wheel and what the cloud needs."""
+    home = tmp_path_factory.mktemp("stranger")
+    run(sys.executable, "-m", "venv", home / "venv", cwd=home)
+    python = home / "venv/bin/python"
+    requirements = ROOT / "requirements/cloud.txt"
+    run(python, "-m", "pip", "install", "-q", "--require-hashes", "-r", requirements, cwd=home)
+    run(python, "-m", "pip", "install", "-q", "--no-deps", wheel, cwd=home)
+    return python.parent
+
+
+@pytest.fixture
+def server(installed: Path, tmp_path: Path) -> Iterator[str]:
+    """A server started from the wheel, with the user's own tasks; its endpoint."""
+    (tmp_path / "mytasks.py").write_text(TASKS)
+    command = [installed / "cloud-server", "--listen", "tcp://127.0.0.1:0", "--http", "127.0.0.1:0"]
+    process = subprocess.Popen(
+        [*map(str, command), "--tasks", "mytasks"], cwd=tmp_path, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stderr is not None
+    for line in process.stderr:
+        if "listening on " in line:
+            yield line.partition("listening on ")[2].partition(",")[0].strip()
+            break
+    process.terminate()
+    assert process.wait(20) == 0
+    process.stderr.close()
+
+
+def test_the_wheel_holds_the_four_packages_and_no_maps(wheel: Path) -> None:
+    """Code, types and scenarios; neither maps nor tests."""
+    names = zipfile.ZipFile(wheel).namelist()
+    tops = {name.partition("/")[0] for name in names if ".dist-info" not in name}
+    assert tops == {"common", "robot_client", "cloud_server", "loadgen"}
+    assert not [name for name in names if name.endswith((".pgm", ".map", ".png"))]
+    assert all(f"{top}/py.typed" in names for top in tops)
+
+
+@pytest.mark.parametrize("command", ["robot-client", "cloud-server", "loadgen"])
+def test_the_console_scripts_start(installed: Path, tmp_path: Path, command: str) -> None:
+    """--help of every console script answers outside the repository."""
+    assert "usage:" in run(installed / command, "--help", cwd=tmp_path)
+
+
+def test_a_ten_line_program_offloads_its_own_task(installed: Path, server: str, tmp_path: Path) -> None:
+    """A user's module on both sides: warm-up, decision, pinned calls, a single-run task, asyncio."""
+    (tmp_path / "program.py").write_text(PROGRAM)
+    first, second, third = run(installed / "python", "program.py", server, cwd=tmp_path).splitlines()
+    assert first.startswith("168 ")
+    assert " ms against " in first
+    assert second == "True False"
+    assert third == "25"
+
+
+def test_a_task_whose_source_differs_stays_onboard(installed: Path, server: str, tmp_path: Path) -> None:
+    """`hello` compares source: the changed task runs onboard, and the log says so once."""
+    other = tmp_path / "robot"
+    other.mkdir()
+    (other / "mytasks.py").write_text(TASKS.replace("range(2, limit)", "range(2, limit + 1)"))
+    (other / "program.py").write_text(CHANGED)
+    output = run(installed / "python", "program.py", server, cwd=other)
+    assert "{'cloud': 'task count_primes is not the same there'}" in output
+    assert "[25, 25, 25] onboard" in output
+    assert output.count("it stays onboard") == 1

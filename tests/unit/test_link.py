@@ -1,0 +1,148 @@
+"""The link model: delay, jitter, bandwidth and order, all on given times."""
+
+import itertools
+import math
+import statistics
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common.errors import ConfigError
+from loadgen.link import DISTRIBUTIONS, SEGMENT_BYTES, Link, LinkConditions, Pipe
+
+SEEDS = st.integers(0, 2**32)
+CUTS = st.lists(st.integers(1, 5 * SEGMENT_BYTES), min_size=1, max_size=20)
+DEVIATION = {"constant": 0, "uniform": 1 / math.sqrt(3), "normal": 1, "pareto": 1, "lognormal": 1}
+MEAN = {
+    "constant": 1,
+    "uniform": 0,
+    "normal": 0,
+    "pareto": 1 / math.sqrt(3),
+    "lognormal": 1 / math.sqrt(math.e - 1),
+}
+
+
+def test_delay_without_jitter_is_exact() -> None:
+    """A chunk comes out the delay after it arrived."""
+    assert Pipe(LinkConditions(delay_ms=15), 0, 0, "up").due(100.0, 5000) == 100.015
+
+
+@given(bandwidth_mbps=st.floats(0.1, 1000), sizes=CUTS)
+def test_bandwidth_is_exact(bandwidth_mbps: float, sizes: list[int]) -> None:
+    """Chunks sent at once come out when all bits up to their last have been serialised, then delayed."""
+    pipe = Pipe(LinkConditions(delay_ms=10, bandwidth_mbps=bandwidth_mbps), 0, 0, "up")
+    for size, total in zip(sizes, itertools.accumulate(sizes), strict=True):
+        due_s = pipe.due(0.0, size)
+        assert due_s == pytest.approx(0.010 + total * 8 / (bandwidth_mbps * 1e6), rel=1e-9)
+
+
+def test_an_idle_link_saves_up_no_bandwidth() -> None:
+    """A chunk after a pause takes its own serialisation time, no less."""
+    pipe = Pipe(LinkConditions(bandwidth_mbps=8), 0, 0, "up")
+    assert pipe.due(0.0, 1000) == pytest.approx(0.001)
+    assert pipe.due(5.0, 1000) == pytest.approx(5.001)
+    assert pipe.due(5.0, 1000) == pytest.approx(5.002)
+
+
+@given(seed=SEEDS, distribution=st.sampled_from(list(DISTRIBUTIONS)), sizes=CUTS)
+def test_how_bytes_are_cut_changes_no_draw(seed: int, distribution: str, sizes: list[int]) -> None:
+    """The same bytes at the same time, cut in chunks or in segments, end at the same time."""
+    conditions = LinkConditions(50, 5, distribution, 100)
+    whole, cut = (Pipe(conditions, seed, 3, "down") for _ in range(2))
+    assert [cut.due(1.0, size) for size in sizes][-1] == pytest.approx(whole.due(1.0, sum(sizes)), abs=1e-9)
+    assert cut.due(9.0, SEGMENT_BYTES) == pytest.approx(whole.due(9.0, SEGMENT_BYTES), abs=1e-9)
+
+
+@given(seed=SEEDS, sizes=CUTS)
+def test_draws_do_not_depend_on_conditions_before(seed: int, sizes: list[int]) -> None:
+    """A segment's draw is the same whatever the link was like for the segments before it."""
+    calm, rough = (Pipe(LinkConditions(50, 5, name), seed, 0, "up") for name in ("constant", "lognormal"))
+    calm.conditions = LinkConditions()
+    for size in sizes:
+        calm.due(0.0, size)
+        rough.due(0.0, size)
+    calm.conditions = rough.conditions = LinkConditions(50, 5, "normal")
+    assert calm.due(1e6, SEGMENT_BYTES) == rough.due(1e6, SEGMENT_BYTES)
+
+
+@given(seed=SEEDS, distribution=st.sampled_from(list(DISTRIBUTIONS)), sizes=CUTS, gap_s=st.floats(0, 0.01))
+def test_order_is_kept(seed: int, distribution: str, sizes: list[int], gap_s: float) -> None:
+    """No chunk comes out before the one before it, nor before it arrived."""
+    pipe = Pipe(LinkConditions(5, 20, distribution), seed, 0, "up")
+    arrived = [n * gap_s for n in range(len(sizes))]
+    due = [pipe.due(arrived_s, size) for arrived_s, size in zip(arrived, sizes, strict=True)]
+    assert due == sorted(due)
+    assert all(due_s >= arrived_s for due_s, arrived_s in zip(due, arrived, strict=True))
+
+
+def test_seed_connection_and_direction_each_matter() -> None:
+    """Equal seed, connection and direction draw equally; a change of any one draws differently."""
+
+    def draws(*origin: Any) -> tuple[float, ...]:
+        pipe = Pipe(LinkConditions(50, 5), *origin)
+        return tuple(pipe.due(float(n), SEGMENT_BYTES) for n in range(5))
+
+    assert draws(1, 2, "up") == draws(1, 2, "up")
+    assert len({draws(1, 2, "up"), draws(0, 2, "up"), draws(1, 1, "up"), draws(1, 2, "down")}) == 4
+
+
+@pytest.mark.parametrize("distribution", DISTRIBUTIONS)
+def test_distributions_have_the_stated_mean_and_deviation(distribution: str) -> None:
+    """50,000 far-apart segments: mean and standard deviation of the jitter are the distribution's own."""
+    pipe = Pipe(LinkConditions(1000, 10, distribution), 1, 0, "up")
+    jitter = [(pipe.due(n * 1e4, SEGMENT_BYTES) - n * 1e4 - 1.0) / 0.010 for n in range(50_000)]
+    assert statistics.mean(jitter) == pytest.approx(MEAN[distribution], abs=0.03)
+    assert statistics.pstdev(jitter) == pytest.approx(DEVIATION[distribution], rel=0.15, abs=1e-6)
+
+
+def test_conditions_change_for_later_chunks() -> None:
+    """New conditions hold for the next chunk; the one under way is not overtaken."""
+    pipe = Pipe(LinkConditions(delay_ms=100), 0, 0, "up")
+    assert pipe.due(0.0, 10) == 0.1
+    pipe.conditions = LinkConditions(delay_ms=1)
+    assert pipe.due(0.0, 10) == 0.1
+    assert pipe.due(0.5, 10) == 0.501
+
+
+def test_the_end_of_a_stream_is_delayed_and_draws_nothing() -> None:
+    """A chunk of no bytes comes out after what was before it, and takes no segment's draw."""
+    pipe, other = (Pipe(LinkConditions(50, 5), 0, 0, "up") for _ in range(2))
+    last_s = pipe.due(0.0, 10)
+    assert pipe.due(0.0, 0) == last_s == other.due(0.0, 10)
+    assert pipe.due(9.0, SEGMENT_BYTES) == other.due(9.0, SEGMENT_BYTES)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"delay_ms": -1}, "delay_ms: -1 is not a number from 0 to 60000"),
+        ({"delay_ms": math.nan}, "delay_ms: nan is not a number from 0 to 60000"),
+        ({"jitter_ms": "5"}, "jitter_ms: '5' is not a number from 0 to 60000"),
+        ({"bandwidth_mbps": math.inf}, "bandwidth_mbps: inf is not a number from 0 to 100000"),
+        ({"bandwidth_mbps": True}, "bandwidth_mbps: True is not a number from 0 to 100000"),
+        (
+            {"distribution": "gamma"},
+            "distribution: 'gamma' is not one of constant, uniform, normal, pareto, lognormal",
+        ),
+        ({"outage": 1}, "outage: 1 is neither true nor false"),
+    ],
+)
+def test_a_bad_condition_is_named(values: dict[str, Any], message: str) -> None:
+    """A condition that cannot be is refused, with field, value and what is allowed."""
+    with pytest.raises(ConfigError) as caught:
+        LinkConditions(**values)
+    assert str(caught.value) == message
+
+
+def test_a_link_changes_in_both_directions_or_one() -> None:
+    """Plain names change both directions, `up` and `down` one, which wins; the rest stays."""
+    link = Link().changed({"delay_ms": 5, "down": {"delay_ms": 7, "outage": True}})
+    assert link == Link(up=LinkConditions(delay_ms=5), down=LinkConditions(delay_ms=7, outage=True))
+
+
+def test_an_unknown_condition_is_named() -> None:
+    """A name that no link has is refused, with those it has."""
+    with pytest.raises(ConfigError, match="delay: unknown condition; known: delay_ms, jitter_ms"):
+        Link().changed({"delay": 5})
