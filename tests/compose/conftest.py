@@ -1,0 +1,85 @@
+"""The compose project of the tests: built once, started once, taken away at the end."""
+
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PROJECT = "offboard-test"
+HTTP_PORT, WAN_HTTP_PORT = "18000", "18001"
+SETTINGS = {
+    "TASKS": "80",
+    "MEASURE": "60",
+    "WINDOW": "20",
+    "WINDOWS": "5,10,20",
+    "CLOUD_HTTP_PORT": HTTP_PORT,
+    "WAN_HTTP_PORT": WAN_HTTP_PORT,
+}
+COMMAND_S = 600
+
+
+class Compose:
+    """`docker compose` on the project of the tests."""
+
+    url = f"http://127.0.0.1:{HTTP_PORT}"
+    wan_url = f"http://127.0.0.1:{WAN_HTTP_PORT}"
+
+    def __call__(self, *args: str, check: bool = True) -> str:
+        files = ("-f", "docker-compose.yml", "-f", "tests/compose/overlay.yml")
+        done = subprocess.run(
+            ["docker", "compose", "-p", PROJECT, "--project-directory", str(ROOT), *files, *args],
+            cwd=ROOT,
+            env=os.environ | SETTINGS,
+            capture_output=True,
+            text=True,
+            timeout=COMMAND_S,
+        )
+        assert done.returncode == 0 or not check, f"docker compose {' '.join(args)}:\n{done.stderr[-3000:]}"
+        return done.stdout
+
+    def exit_code(self, service: str) -> int:
+        """Wait until a service has ended."""
+        container = self("ps", "-aq", service).strip()
+        return int(docker("wait", container))
+
+
+def docker(*args: str) -> str:
+    done = subprocess.run(["docker", *args], cwd=ROOT, capture_output=True, text=True, timeout=COMMAND_S)
+    assert done.returncode == 0, f"docker {' '.join(args)}:\n{done.stderr[-3000:]}"
+    return done.stdout.strip()
+
+
+def engine_problem() -> str | None:
+    """Why there is no Docker engine with Compose v2 here, or None."""
+    for command in (["docker", "info"], ["docker", "compose", "version"]):
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=30)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            return f"{' '.join(command)}: {error}"
+        if done.returncode != 0:
+            return f"{' '.join(command)}: {(done.stderr.strip() or 'failed').splitlines()[-1]}"
+    return None
+
+
+@pytest.fixture(scope="session")
+def engine() -> None:
+    """A Docker engine that answers; without one the test is skipped, in CI it fails."""
+    problem = engine_problem()
+    if problem and os.environ.get("CI") == "true":
+        pytest.fail(f"CI has no Docker engine: {problem}")
+    if problem:
+        pytest.skip(f"no Docker engine: {problem}")
+
+
+@pytest.fixture(scope="session")
+def up(engine: None) -> Iterator[Compose]:  # noqa: ARG001 - it skips
+    """The project, up; the robot may still be at work."""
+    compose = Compose()
+    compose("down", "--volumes", "--remove-orphans")
+    compose("build")
+    compose("up", "--detach", "--no-build")
+    yield compose
+    compose("down", "--volumes", "--remove-orphans")

@@ -1,0 +1,120 @@
+"""The testbed in real containers."""
+
+import json
+import statistics
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from robot_client.trace import read
+from tests.compose.conftest import Compose, docker
+
+pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
+
+DELAY_S = 0.030  # round trip of the relay
+RELAY_S_MAX = 0.003  # what everything else may add to an empty task
+ROBOT_CPUS = 0.2
+SHARE_TOLERANCE = 0.15
+
+
+def get(url: str) -> tuple[int, str]:
+    with urllib.request.urlopen(url, timeout=5) as answer:
+        return answer.status, answer.read().decode()
+
+
+def test_the_robot_finishes_and_its_table_is_printed(up: Compose, tmp_path: Path) -> None:
+    """`docker compose up` ends with the robot's summary and table, both exit 0; the trace is readable."""
+    assert up.exit_code("robot") == 0, up("logs", "robot")
+    assert up.exit_code("table") == 0, up("logs", "table")
+    assert "80 tasks answered" in up("logs", "robot")
+    assert "feedback chosen" in up("logs", "table")
+    docker("cp", f"{up('ps', '-aq', 'robot').strip()}:/out/trace.jsonl", str(tmp_path))
+    records = list(read(tmp_path / "trace.jsonl"))
+    assert len(records) == 80
+    assert all(record["used"] for record in records)
+    assert sum(record["decision"]["both"] for record in records) == 60
+
+
+def test_the_server_stays_up_for_curl(up: Compose) -> None:
+    """/health, /ready, /metrics and /tasks answer on the host after the robot has ended."""
+    up.exit_code("robot")
+    assert json.loads(get(f"{up.url}/health")[1])["version"]
+    assert get(f"{up.url}/ready")[0] == 200
+    assert 'offboard_requests_total{kind="plan_path",status="ok"}' in get(f"{up.url}/metrics")[1]
+    assert "plan_path" in [one["name"] for one in json.loads(get(f"{up.url}/tasks")[1])]
+
+
+def test_the_robot_has_no_way_to_the_cloud_but_the_relay(up: Compose) -> None:
+    """From the robot's network the cloud has no name and its address cannot be reached."""
+    containers = {service: up("ps", "-aq", service).strip() for service in ("cloud", "wan")}
+    networks = {
+        service: json.loads(docker("inspect", "-f", "{{json .NetworkSettings.Networks}}", container))
+        for service, container in containers.items()
+    }
+    (address,) = (network["IPAddress"] for network in networks["cloud"].values())
+    assert len(networks["wan"]) == 2
+    reach = (
+        "import socket, sys\n"
+        "socket.create_connection(('wan', 5555), 3).close()\n"
+        f"for host in ('cloud', '{address}'):\n"
+        "    try:\n"
+        "        socket.create_connection((host, 5555), 3)\n"
+        "        sys.exit(f'{host} can be reached')\n"
+        "    except OSError as error:\n"
+        "        print(host, error)\n"
+    )
+    lines = up("run", "--rm", "--no-deps", "--entrypoint", "python3", "probe", "-c", reach).splitlines()
+    assert len(lines) == 2
+
+
+def test_an_empty_task_takes_the_links_round_trip(up: Compose) -> None:
+    """Without a quota on the robot the median empty task takes 30 ms and at most 3 ms more."""
+    up.exit_code("robot")
+    free = json.loads(up("run", "--rm", "--no-deps", "probe"))
+    held = json.loads(up("run", "--rm", "--no-deps", "held-probe"))
+    median, median_held = statistics.median(free), statistics.median(held)
+    print(f"median of an empty task: {median * 1e3:.2f} ms; under the quota {median_held * 1e3:.2f} ms")
+    assert DELAY_S <= median <= DELAY_S + RELAY_S_MAX, f"{median * 1e3:.2f} ms"
+
+
+def test_the_quota_slows_long_plans_by_its_share(up: Compose) -> None:
+    """The quota is the one asked for, and a long plan takes its unthrottled time over the share, +-15 %."""
+    up.exit_code("robot")
+    free, held = (
+        json.loads(up("run", "--rm", "--no-deps", service, "tests.compose.long_plans"))
+        for service in ("probe", "held-probe")
+    )
+    assert free["quota_us"][0] == -1
+    assert held["quota_us"] == [ROBOT_CPUS * 10_000, 10_000]
+    assert statistics.median(held["cpu_s"]) >= 10 * held["quota_us"][0] / 1e6, "the plans are too short"
+    ratio = statistics.median(held["seconds"]) / statistics.median(free["seconds"])
+    print(
+        f"long plan: {statistics.median(free['seconds']) * 1e3:.1f} ms free, "
+        f"{statistics.median(held['seconds']) * 1e3:.1f} ms at {ROBOT_CPUS} CPU, ratio {ratio:.2f}"
+    )
+    assert ratio == pytest.approx(1 / ROBOT_CPUS, rel=SHARE_TOLERANCE)
+
+
+def test_the_cloud_has_its_own_quota(up: Compose) -> None:
+    """The server's container is held to one CPU over 10 ms."""
+    container = up("ps", "-q", "cloud").strip()
+    limits = json.loads(docker("inspect", "-f", "{{json .HostConfig}}", container))
+    assert (limits["CpuQuota"], limits["CpuPeriod"], limits["NanoCpus"]) == (10_000, 10_000, 0)
+    user = docker("exec", container, "id", "-u")
+    assert user != "0"
+
+
+def test_the_relay_can_be_read_and_changed_from_the_host(up: Compose) -> None:
+    """GET /link says what the link does."""
+    link = json.loads(get(f"{up.wan_url}/link")[1])
+    assert link["up"]["delay_ms"] == link["down"]["delay_ms"] == 15.0
+
+
+def test_unit_tests_pass_in_the_image(engine: None) -> None:  # noqa: ARG001 - it skips
+    """The unit tests pass on the image's Python, as the image's user."""
+    docker("build", "--target", "test", "--tag", "offboard-unit", ".")
+    version = docker("run", "--rm", "--entrypoint", "python3", "offboard-unit", "--version")
+    output = docker("run", "--rm", "offboard-unit")
+    print(f"{version}: {output.splitlines()[-1]}")
+    assert " passed" in output.splitlines()[-1]
