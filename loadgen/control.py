@@ -1,6 +1,6 @@
 """The relay's HTTP side: read the link, change it, start and end an outage.
 
-What a change does to bytes under way is the business of `wan.py`.
+What a change does to bytes under way is the business of `relay.py`.
 """
 
 import contextlib

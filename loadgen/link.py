@@ -1,6 +1,6 @@
 """The model of a network link: when bytes that arrive now come out at the other end.
 
-Pure: time comes in as an argument, randomness from a seed. The sockets are in `wan.py`.
+Pure: time comes in as an argument, randomness from a seed. The sockets are in `relay.py`.
 """
 
 import math

@@ -1,9 +1,12 @@
 """The compose project of the tests: built once, started once, taken away at the end."""
 
+import json
 import os
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -27,10 +30,12 @@ class Compose:
     url = f"http://127.0.0.1:{HTTP_PORT}"
     wan_url = f"http://127.0.0.1:{WAN_HTTP_PORT}"
 
+    command = ("docker", "compose", "-p", PROJECT, "--project-directory", str(ROOT))
+    files = ("-f", "docker-compose.yml", "-f", "tests/compose/overlay.yml")
+
     def __call__(self, *args: str, check: bool = True) -> str:
-        files = ("-f", "docker-compose.yml", "-f", "tests/compose/overlay.yml")
         done = subprocess.run(
-            ["docker", "compose", "-p", PROJECT, "--project-directory", str(ROOT), *files, *args],
+            [*self.command, *self.files, *args],
             cwd=ROOT,
             env=os.environ | SETTINGS,
             capture_output=True,
@@ -39,6 +44,33 @@ class Compose:
         )
         assert done.returncode == 0 or not check, f"docker compose {' '.join(args)}:\n{done.stderr[-3000:]}"
         return done.stdout
+
+    @contextmanager
+    def running(self, service: str, module: str) -> Iterator[tuple[str, Callable[[], Any]]]:
+        """A container that answers a line of JSON for each line; its name, and the call that asks."""
+        name = f"{PROJECT}-{service}-asked"
+        process = subprocess.Popen(
+            [*self.command, *self.files, "run", "--rm", "-T", "--no-deps", "--name", name, service, module],
+            cwd=ROOT,
+            env=os.environ | SETTINGS,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stdin is not None
+        assert process.stdout is not None
+
+        def ask() -> Any:
+            process.stdin.write("\n")
+            process.stdin.flush()
+            return json.loads(process.stdout.readline())
+
+        try:
+            yield name, ask
+        finally:
+            process.stdin.close()
+            process.wait(COMMAND_S)
+            process.stdout.close()
 
     def exit_code(self, service: str) -> int:
         """Wait until a service has ended."""

@@ -13,8 +13,9 @@ from typing import Any
 import pytest
 
 from common.errors import ConfigError, OffloadError
+from loadgen.part import Part
 from loadgen.quota import SignalQuota
-from loadgen.testbed import LocalTestbed, Part, Testbed
+from loadgen.testbed import LocalTestbed, Testbed
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
 
@@ -249,7 +250,7 @@ def test_a_command_that_does_not_exist_says_so(tmp_path: Path) -> None:
 
 def test_a_part_that_ignores_sigterm_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A part and a worker of its own that ignore SIGTERM are gone after close."""
-    monkeypatch.setattr("loadgen.testbed.TERMINATE_S", 0.2)
+    monkeypatch.setattr("loadgen.part.TERMINATE_S", 0.2)
     code = (
         "import os, signal, time; signal.signal(15, signal.SIG_IGN); os.fork(); print('up'); time.sleep(99)"
     )

@@ -44,7 +44,7 @@ def exec_exit():
 
 @task("exec_object", size=lambda: 0)
 def exec_object():
-    return threading.Lock
+    return object()
 
 @task("exec_echo", size=lambda value: 0)
 def exec_echo(value):
@@ -125,7 +125,7 @@ def test_a_task_runs_and_its_result_comes_back(executor: Executor) -> None:
         (
             "exec_object",
             [],
-            "BadValue: a value of type builtins.builtin_function_or_method cannot cross the wire",
+            "BadValue: a value of type builtins.object cannot cross the wire",
         ),
         ("exec_echo", [1, 2], "TypeError: exec_echo() takes 1 positional argument but 2 were given"),
         ("exec_unheard_of", [], "UnknownTask: no task named 'exec_unheard_of'; known:"),
