@@ -19,6 +19,7 @@ from common.errors import ConfigError, DataError, OffloadError
 C = TypeVar("C")
 
 REQUIRED: Any = dataclasses.MISSING
+INTERRUPTED_EXIT = 130  # as a shell counts it: 128 + SIGINT
 
 
 def setting(
@@ -155,7 +156,8 @@ def run_command(prog: str, command: Callable[[], int]) -> int:
         print(f"{prog}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        return 130
+        print(f"{prog}: interrupted", file=sys.stderr)
+        return INTERRUPTED_EXIT
 
 
 def _settings(cls: type) -> list[dataclasses.Field[Any]]:

@@ -131,26 +131,57 @@ def test_errors_become_one_line_and_a_code(
     assert capsys.readouterr().err == f"tool: {error}\n"
 
 
+YAML = "origin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
+FILES = {
+    "no-resolution.yaml": "image: map.pgm\n" + YAML,
+    "text-image.yaml": "image: words.txt\nresolution: 0.1\n" + YAML,
+    "words.txt": "not an image",
+    "bad.jsonl": '{"v": 1}\nnonsense\n',
+    "text.csv": "size,onboard_s,cloud_s\n1,2,3\n1,two,3\n",
+    "empty.csv": "",
+    "odd.toml": 'name = "odd"\n[workload]\nmap = "m.yaml"\ntask = 3\n',
+}
+
+
 @pytest.mark.parametrize(
     ("command", "message"),
     [
         (["robot_client"], "--map is missing"),
         (["robot_client", "--map", "none.yaml"], "none.yaml"),
+        (["robot_client", "--map", "no-resolution.yaml"], "no-resolution.yaml: resolution"),
+        (["robot_client", "--map", "text-image.yaml"], "words.txt"),
         (["robot_client", "--map", "m.yaml", "--window", "0"], "--window: 0 is below 2"),
         (["robot_client", "--map", "m.yaml", "--policy", "x"], "'x' is not one of paper, onboard, cloud"),
         (
-            ["robot_client", "--map", "maps/depot.yaml", "--cloud", "tcp:/x"],
-            "'tcp:/x' is not tcp://HOST:PORT",
+            ["robot_client", "--map", "m.yaml", "--cloud", "tcp:/x"],
+            "--cloud: 'tcp:/x' is not tcp://HOST:PORT",
         ),
+        (["robot_client", "--map", "m.yaml", "--site", "edge"], "--site: 'edge' is not NAME=tcp://HOST:PORT"),
         (["cloud_server", "--listen", "localhost"], "--listen: 'localhost'"),
         (["cloud_server", "--tasks", "no.such.module"], "'no.such.module' cannot be imported"),
+        (["loadgen"], "COMMAND"),
         (["loadgen", "tabel"], "tabel"),
         (["loadgen", "table", "none.csv"], "none.csv"),
+        (["loadgen", "table", "text.csv"], "text.csv:3: onboard_s"),
+        (["loadgen", "table", "empty.csv"], "empty.csv"),
+        (["loadgen", "table", "bad.jsonl"], "bad.jsonl:1: no field"),
+        (["loadgen", "table", "text.csv", "--windows", "0"], "--windows: '0'"),
+        (["loadgen", "run", "odd.toml"], "odd.toml:4: unknown key 'task'; did you mean 'tasks'?"),
+        (["loadgen", "run", "none"], "scenario 'none' is neither a file nor one of demo"),
+        (["loadgen", "wan", "--delay-ms", "-1"], "--delay-ms: -1"),
+        (["loadgen", "wan", "--to", "nowhere"], "--to: 'nowhere' is not HOST:PORT"),
     ],
 )
-def test_a_users_mistake_is_one_line_and_exit_code_2(command: list[str], message: str) -> None:
+def test_a_users_mistake_is_one_line_and_exit_code_2(
+    command: list[str], message: str, tmp_path: Path
+) -> None:
     """Every command says what is wrong in one line on stderr, without a traceback."""
-    done = subprocess.run([sys.executable, "-m", *command], capture_output=True, text=True, timeout=30)
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text)
+    done = subprocess.run(
+        [sys.executable, "-m", *command], capture_output=True, text=True, timeout=30, cwd=tmp_path
+    )
     assert done.returncode == 2, done.stderr
     assert message in done.stderr
     assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert done.stdout == ""

@@ -1,0 +1,92 @@
+"""The main job on the local testbed, shortened: a real map, three processes, a held robot."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from robot_client.trace import read
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
+
+ROOT = Path(__file__).parents[2]
+
+
+def loadgen(*args: str | Path) -> list[str]:
+    return [sys.executable, "-m", "loadgen", *map(str, args)]
+
+
+def session_processes(session: int) -> list[str]:
+    """Command lines of what still runs with this session's mark in its environment."""
+    mark = f"OFFBOARD_TEST_MARK={session}".encode()
+    left = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            if mark in (process / "environ").read_bytes():
+                left.append((process / "cmdline").read_bytes().replace(b"\0", b" ").decode())
+        except OSError:
+            continue
+    return left
+
+
+def test_a_scenario_is_played_to_its_end(tmp_path: Path) -> None:
+    """`loadgen run`: every plan answered, the first ones on both sites, the quota in force, exit 0."""
+    done = subprocess.run(
+        loadgen("run", "demo", "--tasks", "24", "--measure", "both", "--out", tmp_path),
+        capture_output=True,
+        text=True,
+        timeout=150,
+        cwd=ROOT,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "quota: 0.2 CPU over " in done.stdout
+    assert "24 tasks answered" in done.stdout
+    records = list(read(tmp_path / "trace.jsonl"))
+    assert [record["i"] for record in records] == list(range(24))
+    assert all(record["decision"]["both"] for record in records)
+    assert all(one["ok"] for record in records for one in record["executions"])
+    assert sum(one["bytes_out"] > 4_000_000 for record in records for one in record["executions"]) == 1
+
+
+def test_the_same_seed_plays_the_same_tasks(tmp_path: Path) -> None:
+    """Two runs of one seed ask for plans of the same sizes, whatever their times were."""
+    sizes = []
+    for name in ("a", "b"):
+        out = tmp_path / name
+        command = loadgen("run", "demo", "--tasks", "6", "--seed", "7", "--out", out)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=150, cwd=ROOT)
+        assert done.returncode == 0, done.stdout + done.stderr
+        sizes.append([record["size"] for record in read(out / "trace.jsonl")])
+    assert sizes[0] == sizes[1]
+    assert len(set(sizes[0])) > 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_leaves_nothing_behind(tmp_path: Path, number: signal.Signals) -> None:
+    """Ctrl-C or SIGTERM half-way: exit code 130 or 143, no process left, every line of the trace whole."""
+    trace = tmp_path / "trace.jsonl"
+    host = subprocess.Popen(
+        loadgen("run", "demo", "--out", tmp_path),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        cwd=ROOT,
+        env=os.environ | {"OFFBOARD_TEST_MARK": str(os.getpid())},
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    try:
+        until = time.monotonic() + 90
+        while not trace.exists() or trace.read_bytes().count(b"\n") < 5:
+            assert host.poll() is None
+            assert time.monotonic() < until, "no task was answered"
+            time.sleep(0.1)
+        host.send_signal(number)
+        assert host.wait(30) == 128 + number
+    finally:
+        host.kill()
+    assert session_processes(os.getpid()) == []
+    assert len(list(read(trace))) >= 5
