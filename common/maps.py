@@ -3,7 +3,6 @@
 Where a robot may go on a grid, and how, is the business of `common.planner`.
 """
 
-import hashlib
 import logging
 import math
 import warnings
@@ -138,12 +137,6 @@ def resampled(grid: GridMap, resolution: float) -> GridMap:
     if factor == 1:
         return grid
     return GridMap(grid.cells.repeat(factor, axis=0).repeat(factor, axis=1), resolution, grid.origin)
-
-
-def digest(grid: GridMap) -> str:
-    """SHA-256 that names the map by its content."""
-    header = f"{grid.cells.shape} {float(grid.resolution)!r} {grid.origin!r}\n"
-    return hashlib.sha256(header.encode() + grid.cells.tobytes()).hexdigest()
 
 
 def _read_ros(path: Path) -> GridMap:

@@ -123,6 +123,8 @@ class Testbed:
 class LocalTestbed(Testbed):
     """The three processes of a run: robot --> relay --> cloud, on free ports of loopback.
 
+    `endpoint` is where a robot finds the cloud, through the relay.
+
     `link` holds flags of `loadgen wan` by name (`delay_ms`, `up_delay_ms`, `seed`, ...), `commands` how each
     part is started: anything that takes the same flags.
     """
@@ -140,7 +142,8 @@ class LocalTestbed(Testbed):
         super().__init__(out, ready_s=ready_s)
         cloud, self.cloud_http, relay, self.wan_http = (f"127.0.0.1:{port}" for port in _free_ports(4))
         self.robot_cpus = robot_cpus
-        self.robot_command = (*commands["robot"], "--cloud", f"tcp://{relay}")
+        self.endpoint = f"tcp://{relay}"
+        self.robot_command = (*commands["robot"], "--cloud", self.endpoint)
         conditions = [f"--{name.replace('_', '-')}={value}" for name, value in (link or {}).items()]
         cloud_flags = ("--listen", f"tcp://{cloud}", "--http", self.cloud_http, *cloud_args)
         wan_flags = ("--listen", relay, "--to", cloud, "--http", self.wan_http, *conditions)

@@ -265,7 +265,10 @@ class CloudRunner:
         pending.future.set_result(execution)
 
     def _expire(self) -> None:
+        """Give up what is overdue; say hello again where it was not answered."""
         now = time.perf_counter()
+        if self._hello_due <= now:
+            self._say_hello()
         while self._deadlines and self._deadlines[0][0] <= now:
             request_id = heapq.heappop(self._deadlines)[1]
             if request_id in self._pending:

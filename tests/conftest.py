@@ -43,8 +43,7 @@ def connect() -> Iterator[Callable[..., Offloader]]:
     def factory(bed: LocalTestbed, **options: Any) -> Offloader:
         from tests.probes import echo
 
-        endpoint = bed.robot_command[bed.robot_command.index("--cloud") + 1]
-        made.append(Offloader.connect(endpoint, **options))
+        made.append(Offloader.connect(bed.endpoint, **options))
         assert made[-1].wait_for_sites(echo, 10.0) == {}
         return made[-1]
 

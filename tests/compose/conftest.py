@@ -106,7 +106,7 @@ def engine() -> None:
         pytest.skip(f"no Docker engine: {problem}")
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def up(engine: None) -> Iterator[Compose]:  # noqa: ARG001 - it skips
     """The project, up; the robot may still be at work."""
     compose = Compose()

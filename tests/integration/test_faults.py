@@ -4,6 +4,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -159,6 +161,20 @@ def test_a_killed_relay_is_a_lost_connection(testbed: Beds, connect: Connect) ->
         bed.start("wan")
         stream.wait_for(in_the_cloud)
     stream.check()
+
+
+def test_a_robot_that_comes_before_the_server_is_warm_is_let_in_later(tmp_path: Path) -> None:
+    """hello is answered once every kind is warm, and said again until it is answered."""
+    args = ["--tasks", "tests.slow_probe,tests.probes"]
+    with LocalTestbed(tmp_path, link={"delay_ms": 0.0}, cloud_args=args) as bed:
+        bed.start("wan")
+        bed.start_part(replace(bed.parts["cloud"], ready="/health"))
+        with Offloader.connect(bed.endpoint, policy=CLOUD) as offload:
+            assert offload.wait_for_sites(echo, 0.5).keys() == {CLOUD}
+            assert offload.wait_for_sites(echo, 20.0) == {}
+            offload(echo)
+            assert offload.last is not None
+            assert offload.last.used == CLOUD
 
 
 def test_late_answers_are_dropped(testbed: Beds, connect: Connect) -> None:

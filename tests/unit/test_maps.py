@@ -270,22 +270,6 @@ def test_resampling_repeats_cells_exactly() -> None:
         maps.resampled(grid, 0.05 / 8000)
 
 
-def test_the_digest_names_the_content() -> None:
-    """Equal maps have one digest; a cell, the shape, the resolution or the origin changes it."""
-    cells = np.zeros((2, 3), np.int8)
-    changed = cells.copy()
-    changed[1, 1] = 100
-    grids = [
-        GridMap(cells, 0.05),
-        GridMap(changed, 0.05),
-        GridMap(cells.reshape(3, 2), 0.05),
-        GridMap(cells, 0.1),
-        GridMap(cells, 0.05, (0.0, 0.0, 0.1)),
-    ]
-    assert len({maps.digest(grid) for grid in grids}) == len(grids)
-    assert maps.digest(grids[0]) == maps.digest(GridMap(cells.copy(), 0.05))
-
-
 def test_the_largest_component_does_not_cut_corners() -> None:
     """Two free areas that touch at a corner only are two components."""
     free = np.array([[1, 1, 0, 0], [1, 1, 0, 1], [0, 0, 1, 1]], np.bool_)
