@@ -1,6 +1,7 @@
 """HTTP beside the socket: health, readiness, metrics, settings and tasks, from a thread of its own."""
 
 import dataclasses
+import os
 import socket
 import threading
 from collections.abc import Callable
@@ -92,4 +93,5 @@ def _listen(address: tuple[str, int]) -> socket.socket:
         return socket.create_server(address, family=family, backlog=128)
     except OSError as error:
         host, port = address
-        raise ConfigError(f"--http: {host}:{port} cannot be bound: {error.strerror}") from error
+        reason = os.strerror(error.errno or 0)  # Python adds the address to its own text
+        raise ConfigError(f"--http: {host}:{port} cannot be bound: {reason}") from error

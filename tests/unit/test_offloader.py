@@ -129,7 +129,7 @@ def test_an_unavailable_site_is_no_candidate(make: Make) -> None:
 
 
 def test_where_pins_a_call(make: Make) -> None:
-    """A pinned call goes to its site and nowhere else; an unknown site is refused by name."""
+    """A call pinned onboard never leaves the robot, `both` runs on every site, an unknown site is refused."""
     cloud = cloud_answers()
     with make(cloud, OnboardRunner()) as offload:
         offload(add_one, 1, where=ONBOARD)
