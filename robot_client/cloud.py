@@ -4,7 +4,6 @@ Answers are matched by id; whatever arrives late is dropped. What a message look
 """
 
 import contextlib
-import heapq
 import logging
 import math
 import socket
@@ -77,7 +76,6 @@ class CloudRunner:
         self._remote: dict[str, str] = {}
         self._told: set[str] = set()
         self._pending: dict[int, _Pending] = {}
-        self._deadlines: list[tuple[float, int]] = []
         self._inbox: deque[_Pending] = deque()
         self._waker, self._wake = _wake_pair()
         self._closing = False
@@ -161,7 +159,7 @@ class CloudRunner:
             self._expire()
 
     def _wait_s(self) -> float:
-        due = min(self._deadlines[0][0] if self._deadlines else float("inf"), self._hello_due)
+        due = min([self._hello_due, *(pending.deadline for pending in self._pending.values())])
         return min(max(0.0, due - time.perf_counter()), IDLE_WAIT_S)
 
     def _watch_connection(self) -> None:
@@ -185,7 +183,6 @@ class CloudRunner:
         if not pending.future.set_running_or_notify_cancel():
             return
         self._pending[pending.task.id] = pending
-        heapq.heappush(self._deadlines, (pending.deadline, pending.task.id))
         self._send_request(pending, pending.request)
 
     def _send_request(self, pending: _Pending, request: wire.Request) -> None:
@@ -269,11 +266,9 @@ class CloudRunner:
         now = time.perf_counter()
         if self._hello_due <= now:
             self._say_hello()
-        while self._deadlines and self._deadlines[0][0] <= now:
-            request_id = heapq.heappop(self._deadlines)[1]
-            if request_id in self._pending:
-                self._send(wire.Cancel(request_id))
-                self._finish(request_id, CloudTimeout("no answer within the budget"), censored=True)
+        for request_id in [id for id, pending in self._pending.items() if pending.deadline <= now]:
+            self._send(wire.Cancel(request_id))
+            self._finish(request_id, CloudTimeout("no answer within the budget"), censored=True)
 
     def _finish(
         self, request_id: int, failure: CloudError, *, censored: bool = False, started: bool = True

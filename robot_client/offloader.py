@@ -22,6 +22,7 @@ from robot_client.trace import Record
 
 BOTH = "both"
 TIMEOUT_S = 2.0
+TIMEOUT_MAX_S = 24 * 3600.0
 WINDOW = 50
 POLL_S = 0.01
 
@@ -48,7 +49,7 @@ class Offloader:
             raise ConfigError(f"sites {[r.site for r in runners]}: each once, {ONBOARD!r} among them")
         self._policy = policy
         self._make_predictor = predictor
-        self._timeout_s = timeout_s
+        self._timeout_s = _checked_timeout(timeout_s)
         self._observers = tuple(observers)
         self._memories: dict[str, dict[str, _Memory]] = {}
         self._lock = threading.Lock()
@@ -100,13 +101,14 @@ class Offloader:
         `where` pins the call to a site, or to `both` for measuring; `timeout_s` bounds the wait for a
         remote site, after which the task runs onboard.
         """
+        budget_s = self._timeout_s if timeout_s is None else _checked_timeout(timeout_s)
         kind = kind_of(function)
         args = kind.bind(args, kwargs)
         task = Task(kind, args, kind.size_of(args))
         started_at, started = datetime.now(UTC), time.perf_counter()
         forecast, absent = self._predict(kind, task.size)
         decision = self._decide(kind, forecast, absent, where)
-        executions = self._execute(task, decision, forecast, timeout_s or self._timeout_s)
+        executions = self._execute(task, decision, forecast, budget_s)
         answer = _answer(executions)
         self._learn(task, executions)
         number = next(self._numbers)
@@ -241,6 +243,12 @@ class _Memory:
         self.predictor.learn(size, execution.seconds)
         self._failures = 0 if execution.ok else self._failures + 1
         self.age = 0
+
+
+def _checked_timeout(timeout_s: float) -> float:
+    if not 0 < timeout_s <= TIMEOUT_MAX_S:
+        raise ConfigError(f"timeout_s {timeout_s}: must be above 0 and at most {TIMEOUT_MAX_S:g}")
+    return timeout_s
 
 
 def _finished(site: str, future: "Future[Execution]") -> Execution:

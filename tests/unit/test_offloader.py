@@ -232,6 +232,15 @@ def test_onboard_must_be_among_the_sites() -> None:
             )  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("timeout_s", [0.0, -1.0, float("nan"), float("inf"), 1e9])
+def test_a_timeout_is_above_zero_and_bounded(make: Make, timeout_s: float) -> None:
+    """No wait is endless, neither by the offloader's own timeout nor by that of a call."""
+    with pytest.raises(ConfigError, match="must be above 0 and at most"):
+        make(OnboardRunner(), timeout_s=timeout_s)
+    with make(OnboardRunner()) as offload, pytest.raises(ConfigError, match="must be above 0"):
+        offload(add_one, 1, timeout_s=timeout_s)
+
+
 def test_close_closes_every_runner(make: Make) -> None:
     """Leaving the context closes all sites."""
     cloud = cloud_answers()
