@@ -18,7 +18,7 @@ from typing import Any, Protocol
 
 from common import tasks
 from common.blobs import BlobStore, Buffer, StoredBlob
-from common.errors import CloudBroken, ProtocolError
+from common.errors import CloudBroken, ProtocolError, describe
 from common.values import decode, encode
 
 START_S_MAX = 300.0  # the slowest worker's start, compilation included
@@ -29,12 +29,16 @@ Blobs = Mapping[bytes, StoredBlob]
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How a task went: ok, failed, or busy where it could not start; `run_s` is the time in the worker."""
+    """How a task went: ok, failed, or busy where it could not start; `run_s` is the time in the worker.
+
+    `server_fault`: it failed, but not by its own doing.
+    """
 
     status: str
     error: str = ""
     run_s: float = 0.0
     frames: list[Buffer] = field(default_factory=list)
+    server_fault: bool = False
 
 
 class Executor(Protocol):
@@ -144,9 +148,11 @@ class Processes:
             answer.set_result(running.result())
         elif isinstance(error, BrokenProcessPool):
             self.broken = True
-            answer.set_result(Outcome("failed", "a worker process died while this task ran"))
+            answer.set_result(
+                Outcome("failed", "a worker process died while this task ran", server_fault=True)
+            )
         else:
-            answer.set_result(Outcome("failed", f"{type(error).__name__}: {error}"))
+            answer.set_result(Outcome("failed", describe(error), server_fault=True))
 
 
 EXECUTORS: dict[str, Callable[[int, Sequence[str], int], Executor]] = {
@@ -164,8 +170,8 @@ def run_task(kind_name: str, frames: Sequence[Buffer], blobs: Blobs) -> Outcome:
         if not isinstance(args, list):
             raise ProtocolError("the body is not a list of arguments")
         body = encode(kind.function(*args), kind.types)
-    except (Exception, SystemExit) as error:  # noqa: BLE001 - a task may raise anything
-        return Outcome("failed", f"{type(error).__name__}: {error}", time.perf_counter() - started)
+    except BaseException as error:  # noqa: BLE001 - a task may raise anything
+        return Outcome("failed", describe(error), time.perf_counter() - started)
     return Outcome("ok", "", time.perf_counter() - started, body.frames)
 
 

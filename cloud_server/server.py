@@ -17,7 +17,7 @@ import zmq
 from cloud_server.executors import Executor, Outcome
 from cloud_server.metrics import Metrics, Status
 from cloud_server.waiting import Waiting, Work, held_bytes
-from common import tasks
+from common import VERSION, tasks
 from common.blobs import BlobStore, Buffer
 from common.errors import ConfigError, OffloadError, ProtocolError
 from common.wire import (
@@ -32,7 +32,6 @@ from common.wire import (
     VersionMismatch,
     byte_count,
     pack,
-    software_version,
     unpack,
 )
 
@@ -253,7 +252,7 @@ class Server:
         size = byte_count(outcome.frames)
         if size > self._message_bytes_max:
             error = f"BadValue: the result takes {size} bytes, at most {self._message_bytes_max} are allowed"
-            outcome = Outcome("failed", error, outcome.run_s)
+            outcome = Outcome("failed", error, outcome.run_s, server_fault=True)
         self.metrics.queue_s.labels(request.kind).observe(work.queue_s)
         self.metrics.run_s.labels(request.kind).observe(outcome.run_s)
         self._count(request, outcome.status)
@@ -267,6 +266,7 @@ class Server:
                     work.queue_s,
                     outcome.run_s,
                     len(self._waiting),
+                    server_fault=outcome.server_fault,
                     body=outcome.frames,
                 ),
             )
@@ -300,7 +300,8 @@ class Server:
         self.metrics.requests.labels(kind, status).inc()
 
     def _hello(self) -> Hello:
-        return Hello({kind.name: kind.source_hash for kind in tasks.kinds()}, software_version())
+        known = {kind.name: kind.source_hash for kind in tasks.kinds()}
+        return Hello(known, VERSION, self._message_bytes_max)
 
     def _send(self, peer: bytes, message: Message) -> None:
         """Send or drop, never wait: the robot may be gone, or not reading."""
@@ -332,11 +333,12 @@ class Server:
         return idle or time.monotonic() >= self._drain_until
 
     def _give_up_rest(self) -> int:
-        """Tell whoever still waits; how many they are."""
-        rest = [*self._waiting.take(lambda _: True), *self._running]
-        for work in rest:
+        """Tell whoever still waits, and how many are left. What runs hears the connection break instead:
+        `busy` would say that it never ran."""
+        waiting = self._waiting.take(lambda _: True)
+        for work in waiting:
             self._refuse(work.peer, work.request, "busy", "the server stopped")
-        return len(rest)
+        return len(waiting) + len(self._running)
 
     def _close(self) -> None:
         self._executor.close()

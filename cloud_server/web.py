@@ -1,7 +1,6 @@
 """HTTP beside the socket: health, readiness, metrics, settings and tasks, from a thread of its own."""
 
 import dataclasses
-import os
 import socket
 import threading
 from collections.abc import Callable
@@ -13,9 +12,8 @@ from fastapi.responses import JSONResponse
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
 
 from cloud_server.metrics import Status
-from common import tasks
+from common import VERSION, tasks
 from common.errors import ConfigError
-from common.wire import software_version
 
 STALL_S = 2.0  # the loop turns at least every 0.5 s
 STOP_S = 2.0
@@ -25,13 +23,13 @@ def create_app(
     status: Callable[[], Status], registry: CollectorRegistry, settings: dict[str, Any]
 ) -> FastAPI:
     """The routes; `status` is called once a request, from the web thread."""
-    app = FastAPI(title="Offboard cloud server", version=software_version())
+    app = FastAPI(title="Offboard cloud server", version=VERSION)
 
     @app.get("/health", summary="200 while the loop turns")
     async def health() -> JSONResponse:
         now = status()
         turning = now.last_turn_age_s < STALL_S
-        content = {"healthy": turning, "version": software_version(), **dataclasses.asdict(now)}
+        content = {"healthy": turning, "version": VERSION, **dataclasses.asdict(now)}
         return JSONResponse(content, 200 if turning else 503)
 
     @app.get("/ready", summary="200 once every kind is warm in every worker")
@@ -93,5 +91,5 @@ def _listen(address: tuple[str, int]) -> socket.socket:
         return socket.create_server(address, family=family, backlog=128)
     except OSError as error:
         host, port = address
-        reason = os.strerror(error.errno or 0)  # Python adds the address to its own text
+        reason = (error.strerror or str(error)).partition(" (")[0]  # Python adds the address again
         raise ConfigError(f"--http: {host}:{port} cannot be bound: {reason}") from error

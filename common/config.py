@@ -87,15 +87,16 @@ def from_table(cls: type[C], table: Mapping[str, Any], path: Path, section: str)
         if key not in fields:
             raise unknown_key(path, key, list(fields))
     try:
-        return cls(
-            **{
-                field.name: _convert(f"{path}: {section}.{name}", field, cls, table[name])
-                for name, field in fields.items()
-                if name in table or (field.default is REQUIRED and _missing(path, section, name))
-            }
-        )
+        values = {
+            field.name: _convert(f"{section}.{name}", field, cls, table[name])
+            for name, field in fields.items()
+            if name in table or field.default is REQUIRED
+        }
+        return cls(**values)
+    except KeyError as missing:
+        raise DataError(f"{path}: {section}.{missing.args[0]} is missing") from None
     except ConfigError as error:
-        raise DataError(str(error)) from error
+        raise DataError(f"{path}: {error}") from error
 
 
 def add_flags(parser: argparse.ArgumentParser, cls: type) -> None:
@@ -244,10 +245,6 @@ def _read_toml(path: Path | None, cls: type) -> dict[str, Any]:
         if key not in known:
             raise unknown_key(path, key, known)
     return table
-
-
-def _missing(path: Path, section: str, name: str) -> NoReturn:
-    raise DataError(f"{path}: {section}.{name} is missing")
 
 
 def _shown(value: Any) -> str:

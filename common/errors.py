@@ -5,6 +5,14 @@ class OffloadError(Exception):
     """Base of all errors raised by Offboard."""
 
 
+def describe(error: BaseException) -> str:
+    """`Type: text` of any exception, also of one that cannot say its own text."""
+    try:
+        return f"{type(error).__name__}: {error}"
+    except Exception:  # noqa: BLE001 - a user's __str__ may raise anything
+        return f"{type(error).__name__}: (its text cannot be had)"
+
+
 class ConfigError(OffloadError):
     """A setting, flag or input file is wrong; the process ends with exit code 2."""
 

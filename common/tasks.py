@@ -13,11 +13,12 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from common.errors import BadValue, ConfigError, UnknownTask
+from common.errors import BadValue, ConfigError, UnknownTask, describe
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 NAME_LENGTH_MAX = 64
+KINDS_MAX = 256  # `hello` names them all
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,8 +79,13 @@ def task(
     """
     if not name or len(name) > NAME_LENGTH_MAX or not name.isidentifier():
         raise ConfigError(f"task name {name!r} is not an identifier of at most {NAME_LENGTH_MAX} characters")
+    if len(_kinds) >= KINDS_MAX:
+        raise ConfigError(f"task {name}: {KINDS_MAX} tasks are registered already")
 
     def register(function: F) -> F:
+        for parameter in inspect.signature(function).parameters.values():
+            if parameter.kind in (parameter.KEYWORD_ONLY, parameter.VAR_KEYWORD):
+                raise ConfigError(f"task {name}: parameter {parameter.name!r} can only be given by keyword")
         kind = Kind(name, function, size, duplicate, types, warm, _source_hash(function))
         known = _kinds.get(name)
         if known is not None and known.source_hash != kind.source_hash:
@@ -115,8 +121,8 @@ def load_modules(names: Iterable[str]) -> None:
     for name in names:
         try:
             importlib.import_module(name)
-        except ImportError as error:
-            raise ConfigError(f"task module {name!r} cannot be imported: {error}") from error
+        except Exception as error:
+            raise ConfigError(f"task module {name!r} cannot be imported: {describe(error)}") from error
 
 
 def _source_hash(function: Callable[..., Any]) -> str:

@@ -5,7 +5,6 @@ Arguments and results are `common.values`, whose names can be had from here too.
 """
 
 import dataclasses
-import importlib.metadata
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +14,7 @@ import msgpack
 
 from common.blobs import BlobStore, Buffer, StoredBlob
 from common.errors import BadValue, ProtocolError
-from common.tasks import NAME_LENGTH_MAX
+from common.tasks import KINDS_MAX, NAME_LENGTH_MAX
 from common.values import (
     ARRAYS_MAX,
     BLOB_BYTES_MIN,
@@ -46,14 +45,12 @@ __all__ = [
     "decode",
     "encode",
     "pack",
-    "software_version",
     "unpack",
 ]
 
 VERSION = 1
 HEADER_BYTES_MAX = 64 * 1024
 FRAMES_MAX = 2 + ARRAYS_MAX  # header, value, its arrays
-TASKS_MAX = 256
 TEXT_LENGTH_MAX = 128  # software version, source hash
 ERROR_LENGTH_MAX = 2000
 ID_MAX = 2**63 - 1
@@ -69,10 +66,14 @@ class VersionMismatch(ProtocolError):
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """First message each way: the task names known, with the hash of each one's source."""
+    """First message each way: the task names known, with the hash of each one's source.
+
+    `message_bytes_max` is the largest message that the sender takes.
+    """
 
     tasks: dict[str, str]
     software: str
+    message_bytes_max: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +94,10 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """How a request went; `body` is the encoded result, empty unless `status` is ok."""
+    """How a request went; `body` is the encoded result, empty unless `status` is ok.
+
+    `server_fault`: it failed, but not by the task's own doing, so another site may well answer.
+    """
 
     id: int
     status: str
@@ -102,6 +106,7 @@ class Reply:
     run_s: float = 0.0
     queue_depth: int = 0
     missing: tuple[bytes, ...] = ()
+    server_fault: bool = False
     body: list[Buffer] = field(default_factory=list)
 
 
@@ -172,14 +177,6 @@ def byte_count(frames: Iterable[Buffer]) -> int:
     return sum(f.nbytes if isinstance(f, memoryview) else len(f) for f in frames)
 
 
-def software_version() -> str:
-    """Version of the installed package, as `hello` and `/health` say it."""
-    try:
-        return importlib.metadata.version("offboard")
-    except importlib.metadata.PackageNotFoundError:
-        return "uninstalled"
-
-
 class _Fields:
     """Takes checked values out of a header's map."""
 
@@ -205,6 +202,12 @@ class _Fields:
             raise self.wrong(name, f"a text of at most {length_max} characters")
         return value
 
+    def flag(self, name: str) -> bool:
+        value = self.values.get(name)
+        if type(value) is not bool:
+            raise self.wrong(name, "true or false")
+        return value
+
     def digests(self, name: str) -> tuple[bytes, ...]:
         value = self.values.get(name)
         if not isinstance(value, list) or len(value) > BLOBS_MAX:
@@ -215,8 +218,8 @@ class _Fields:
 
     def tasks(self, name: str) -> dict[str, str]:
         value = self.values.get(name)
-        if not isinstance(value, dict) or len(value) > TASKS_MAX:
-            raise self.wrong(name, f"a map of at most {TASKS_MAX} tasks")
+        if not isinstance(value, dict) or len(value) > KINDS_MAX:
+            raise self.wrong(name, f"a map of at most {KINDS_MAX} tasks")
         for key, text in value.items():
             if not (isinstance(key, str) and 0 < len(key) <= NAME_LENGTH_MAX):
                 raise self.wrong(name, f"a map of names of 1 to {NAME_LENGTH_MAX} characters")
@@ -230,7 +233,11 @@ class _Fields:
 
 def _hello(fields: _Fields, rest: list[Buffer]) -> Hello:
     _frame_count("hello", rest, 0)
-    return Hello(fields.tasks("tasks"), fields.text("software", TEXT_LENGTH_MAX))
+    return Hello(
+        fields.tasks("tasks"),
+        fields.text("software", TEXT_LENGTH_MAX),
+        fields.whole("message_bytes_max", 1, COUNT_MAX),
+    )
 
 
 def _request(fields: _Fields, rest: list[Buffer]) -> Request:
@@ -257,6 +264,7 @@ def _reply(fields: _Fields, rest: list[Buffer]) -> Reply:
         run_s=fields.seconds("run_s"),
         queue_depth=fields.whole("queue_depth", 0, COUNT_MAX),
         missing=fields.digests("missing"),
+        server_fault=fields.flag("server_fault"),
         body=rest,
     )
 

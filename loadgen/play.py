@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from common.errors import OffloadError
+from common.errors import ConfigError, OffloadError
 from loadgen.evaluate import TableConfig, table_text
 from loadgen.scenario import Scenario, find_scenario, read_scenario
 from loadgen.testbed import LocalTestbed
@@ -18,7 +18,11 @@ ROBOT_S_AT_LEAST = 300.0
 def play(scenario: Scenario, out: Path) -> int:
     """Play to the end; the robot's exit code. The trace is OUT/trace.jsonl, an earlier one is replaced."""
     trace = out / TRACE
-    trace.unlink(missing_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        trace.unlink(missing_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out: {out} cannot be written to: {error.strerror}") from error
     quota = f"{scenario.robot.cpus:g} CPU"
     with LocalTestbed(
         out,
@@ -33,7 +37,10 @@ def play(scenario: Scenario, out: Path) -> int:
         held = testbed.quota("robot")
         if held is not None:
             print(f"quota: {held.cpus:g} CPU over {held.period_s * 1e3:g} ms by {held.kind}", flush=True)
-        return testbed.wait("robot", max(ROBOT_S_AT_LEAST, ROBOT_S_A_TASK * scenario.workload.tasks))
+        code = testbed.wait("robot", max(ROBOT_S_AT_LEAST, ROBOT_S_A_TASK * scenario.workload.tasks))
+        if code < 0:
+            raise OffloadError(f"the robot was ended by signal {-code}")
+        return code
 
 
 def play_demo(out: Path) -> int:

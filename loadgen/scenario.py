@@ -10,6 +10,7 @@ from typing import Any
 
 from common.config import REQUIRED, check, from_table, read_toml, setting, unknown_key
 from common.errors import ConfigError, DataError
+from loadgen.quota import CPUS_MAX, CPUS_MIN
 from loadgen.wan import WanConfig
 from robot_client import policies, predictors
 
@@ -41,7 +42,7 @@ class Workload:
 class RobotPart:
     """`[robot]`: how it decides, and the CPU it has."""
 
-    cpus: float = setting(0.2, "CPU quota", minimum=0.01, maximum=1024)
+    cpus: float = setting(0.2, "CPU quota", minimum=CPUS_MIN, maximum=CPUS_MAX)
     policy: str = setting("paper", "where to run", choices=policies.names())
     predictor: str = setting(predictors.LEAST_SQUARES, "how times are predicted", choices=predictors.names())
     window: int = setting(50, "executions remembered for each site", minimum=2)
@@ -129,8 +130,5 @@ def _link(table: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
     for key in table:
         if key not in LINK_KEYS:
             raise unknown_key(path, key, LINK_KEYS)
-    try:
-        WanConfig(**table)
-    except (ConfigError, TypeError) as error:
-        raise DataError(f"{path}: link: {error}") from error
+    from_table(WanConfig, {key.replace("_", "-"): value for key, value in table.items()}, path, "link")
     return table

@@ -10,7 +10,7 @@ from typing import NoReturn
 from common.config import as_dict, load, run_command
 from common.errors import ConfigError
 from robot_client.config import RobotConfig
-from robot_client.runner import ONBOARD
+from robot_client.runner import ONBOARD, PORT_MAX
 from robot_client.trace import Record
 
 log = logging.getLogger("robot_client")
@@ -74,13 +74,13 @@ def _metrics(config: RobotConfig) -> list[Callable[[Record], None]]:
     from robot_client.metrics import Metrics
 
     host, _, port = config.metrics.rpartition(":")
-    if not host or not port.isdigit():
-        raise ConfigError(f"--metrics: {config.metrics!r} is not HOST:PORT")
+    if not host or not port.isdecimal() or int(port) > PORT_MAX:
+        raise ConfigError(f"--metrics: {config.metrics!r} is not HOST:PORT with a port 0 to {PORT_MAX}")
     metrics = Metrics(CollectorRegistry())
     try:
         metrics.serve(host, int(port))
-    except OSError as error:
-        raise ConfigError(f"--metrics: {config.metrics}: {error.strerror}") from error
+    except (OSError, UnicodeError) as error:
+        raise ConfigError(f"--metrics: {config.metrics} cannot be served: {error}") from error
     return [metrics]
 
 

@@ -40,8 +40,11 @@ MESSAGE_BYTES_MAX = 256 * 1024 * 1024
 SEND_QUEUE_MAX = 1000  # messages, per socket
 HELLO_EVERY_S = 1.0  # until it is answered
 RECONNECT_MS, RECONNECT_MAX_MS = 100, 1000
-# TCP alone may take a quarter of an hour to notice a peer that vanished without a word.
-HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 5_000, 15_000
+# TCP alone may take a quarter of an hour to notice a peer that vanished without a word. ZMQ's own
+# heartbeats would wait behind a large argument and break a slow link that works.
+UNACKNOWLEDGED_MS = 15_000
+KEEPALIVE_IDLE_S, KEEPALIVE_EVERY_S, KEEPALIVE_PROBES = 10, 5, 2
+UPLOADS_KEPT = 1024  # digests remembered of one connection
 CLOSE_WAIT_S = 2.0
 IDLE_WAIT_S = 1.0
 
@@ -59,6 +62,7 @@ class _Pending:
     deadline: float
     future: "Future[Execution]" = field(default_factory=Future)
     bytes_out: int = 0
+    sent_as: int = 0  # number of the last message it was sent in
 
 
 class CloudRunner:
@@ -74,12 +78,15 @@ class CloudRunner:
         self._endpoint = endpoint
         self._absent: str | None = f"no answer from {endpoint} yet"
         self._remote: dict[str, str] = {}
+        self._message_bytes_max = MESSAGE_BYTES_MAX  # what the server takes, once it said so
         self._told: set[str] = set()
         self._pending: dict[int, _Pending] = {}
         self._inbox: deque[_Pending] = deque()
         self._waker, self._wake = _wake_pair()
         self._closing = False
         self._hello_due = float("inf")
+        self._messages = 0
+        self._uploads: dict[bytes, int] = {}  # number of the message that last carried the blob
         self._context = zmq.Context()
         try:
             self._socket, self._monitor = _connect(self._context, endpoint)
@@ -110,6 +117,10 @@ class CloudRunner:
             body = wire.encode(list(task.args), task.kind.types, blobs=True)
         except BadValue as error:
             return self._refused(BadValue(f"task {task.kind.name}: {error}"))
+        largest = max([wire.byte_count(body.frames), *(raw.nbytes for raw in body.blobs.values())])
+        if largest > self._message_bytes_max - wire.HEADER_BYTES_MAX:
+            failure = f"{largest} bytes of arguments; the server takes messages of {self._message_bytes_max}"
+            return self._refused(CloudBroken(failure))
         if len(self._pending) + len(self._inbox) >= PENDING_MAX:
             return self._refused(CloudBusy(f"{PENDING_MAX} tasks are in flight"))
         request = wire.Request(task.id, task.kind.name, budget_s, 1, tuple(body.blobs), body.frames)
@@ -172,12 +183,14 @@ class CloudRunner:
                 if self._absent is None:
                     log.warning("%s: connection to %s lost", self.site, self._endpoint)
                 self._absent = f"not connected to {self._endpoint}"
+                self._uploads.clear()
                 for request_id in list(self._pending):
                     self._finish(request_id, CloudBroken("the connection was lost"))
 
     def _say_hello(self) -> None:
         self._hello_due = time.perf_counter() + HELLO_EVERY_S
-        self._send(wire.Hello({kind.name: kind.source_hash for kind in kinds()}, SOFTWARE))
+        known = {kind.name: kind.source_hash for kind in kinds()}
+        self._send(wire.Hello(known, SOFTWARE, MESSAGE_BYTES_MAX))
 
     def _send_first(self, pending: _Pending) -> None:
         if not pending.future.set_running_or_notify_cancel():
@@ -190,6 +203,7 @@ class CloudRunner:
         if left_s > 0:
             sent = self._send(replace(request, budget_s=left_s))
             pending.bytes_out += sent
+            pending.sent_as = self._messages
             if not sent:
                 self._finish(pending.task.id, CloudBroken("nothing can be sent"), started=False)
 
@@ -200,6 +214,7 @@ class CloudRunner:
             self._socket.send_multipart(frames, zmq.DONTWAIT, copy=False)
         except zmq.Again:
             return 0
+        self._messages += 1
         return wire.byte_count(frames)
 
     def _receive_all(self) -> None:
@@ -218,7 +233,7 @@ class CloudRunner:
     def _take(self, message: wire.Message, received: float, bytes_in: int) -> None:
         if isinstance(message, wire.Hello):
             self._hello_due = float("inf")
-            self._remote = message.tasks
+            self._remote, self._message_bytes_max = message.tasks, message.message_bytes_max
             if self._absent is not None:
                 log.info("%s: %s is up", self.site, self._endpoint)
             self._absent = None
@@ -235,7 +250,12 @@ class CloudRunner:
             return
         pending.request = request
         for digest in missing:
-            pending.bytes_out += self._send(wire.Blob(pending.blobs[digest]))
+            # Another task may have brought it since this one was sent; messages keep their order.
+            if self._uploads.get(digest, 0) <= pending.sent_as:
+                pending.bytes_out += self._send(wire.Blob(pending.blobs[digest]))
+                self._uploads[digest] = self._messages
+                if len(self._uploads) > UPLOADS_KEPT:
+                    del self._uploads[next(iter(self._uploads))]
         self._send_request(pending, request)
 
     def _finish_reply(self, pending: _Pending, reply: wire.Reply, received: float, bytes_in: int) -> None:
@@ -288,8 +308,8 @@ class CloudRunner:
 
     def _shut_down(self) -> None:
         self._absent = "closed"
-        for pending in self._inbox:
-            pending.future.cancel()
+        while self._inbox:
+            self._inbox.popleft().future.cancel()
         for request_id in list(self._pending):
             self._finish(request_id, CloudBroken("closed while the task was in flight"))
         self._socket.disable_monitor()
@@ -307,7 +327,10 @@ _FAILURES: dict[str, Callable[[str], OffloadError]] = {
 
 
 def _failure(reply: wire.Reply) -> OffloadError | None:
-    return None if reply.status == "ok" else _FAILURES[reply.status](reply.error or reply.status)
+    if reply.status == "ok":
+        return None
+    failure = CloudBroken if reply.server_fault else _FAILURES[reply.status]
+    return failure(reply.error or reply.status)
 
 
 def _connect(context: "zmq.Context[Any]", endpoint: str) -> tuple["zmq.Socket[bytes]", "zmq.Socket[bytes]"]:
@@ -317,7 +340,11 @@ def _connect(context: "zmq.Context[Any]", endpoint: str) -> tuple["zmq.Socket[by
     dealer.immediate = True  # a request never waits for a connection: it would arrive with its budget gone
     dealer.sndhwm = dealer.rcvhwm = SEND_QUEUE_MAX
     dealer.reconnect_ivl, dealer.reconnect_ivl_max = RECONNECT_MS, RECONNECT_MAX_MS
-    dealer.heartbeat_ivl, dealer.heartbeat_timeout = HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS
+    dealer.setsockopt(zmq.TCP_MAXRT, UNACKNOWLEDGED_MS)
+    dealer.setsockopt(zmq.TCP_KEEPALIVE, 1)
+    dealer.setsockopt(zmq.TCP_KEEPALIVE_IDLE, KEEPALIVE_IDLE_S)
+    dealer.setsockopt(zmq.TCP_KEEPALIVE_INTVL, KEEPALIVE_EVERY_S)
+    dealer.setsockopt(zmq.TCP_KEEPALIVE_CNT, KEEPALIVE_PROBES)
     dealer.maxmsgsize = MESSAGE_BYTES_MAX
     monitor = dealer.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED)
     dealer.connect(endpoint)

@@ -7,7 +7,7 @@ from common.config import REQUIRED, check, setting
 from common.errors import ConfigError
 from robot_client import policies, predictors
 from robot_client.offloader import TIMEOUT_S, WINDOW
-from robot_client.runner import check_endpoint
+from robot_client.runner import CLOUD, ONBOARD, check_endpoint
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class RobotConfig:
     policy: str = setting("paper", "where to run", choices=policies.names())
     predictor: str = setting(predictors.LEAST_SQUARES, "how times are predicted", choices=predictors.names())
     window: int = setting(WINDOW, "executions remembered for each site", minimum=2, maximum=1_000_000)
-    tasks: int = setting(200, "plans to make", minimum=1)
+    tasks: int = setting(200, "plans to make", minimum=1, maximum=1_000_000)
     measure: int = setting(0, "run the first K of them on both sites", minimum=0)
     timeout_s: float = setting(
         TIMEOUT_S,
@@ -55,7 +55,7 @@ class RobotConfig:
         found: dict[str, str] = {}
         for entry in self.site:
             name, equals, endpoint = entry.partition("=")
-            if not (equals and name.isidentifier()) or name in found:
+            if not (equals and name.isidentifier()) or name in (ONBOARD, CLOUD, *found):
                 raise ConfigError(f"--site: {entry!r} is not NAME=tcp://HOST:PORT with a name of its own")
             check_endpoint(f"--site {name}", endpoint)
             found[name] = endpoint

@@ -73,47 +73,49 @@ def describe(record: Record) -> str:
 
 
 class Summary:
-    """What the robot says at the end."""
+    """What the robot says at the end; keeps a few numbers a task."""
 
     def __init__(self) -> None:
-        self._records: list[Record] = []
         self._planned = 0
+        self._both: list[tuple[float | None, float | None]] = []  # seconds onboard, and of the fastest other
+        self._waited: dict[str, list[float]] = {}  # by the chosen site
+        self._fallbacks = 0
 
     def add(self, record: Record, *, planned: bool) -> None:
-        self._records.append(record)
         self._planned += planned
+        if record.decision.both:
+            good = {one.site: one.seconds for one in record.executions if one.ok}
+            onboard = good.pop(ONBOARD, None)
+            self._both.append((onboard, min(good.values(), default=None)))
+        else:
+            self._waited.setdefault(record.decision.site, []).append(record.waited_s)
+            self._fallbacks += len(record.executions) > 1
 
     def lines(self) -> list[str]:
-        both = [r for r in self._records if r.decision.both]
-        chosen = [r for r in self._records if not r.decision.both]
-        lines = [f"{len(self._records)} tasks answered; a path was found for {self._planned}"]
-        if both:
-            lines.append(f"run on both sites: {len(both)}; {_times(both)}")
+        chosen = sum(map(len, self._waited.values()))
+        lines = [f"{len(self._both) + chosen} tasks answered; a path was found for {self._planned}"]
+        if self._both:
+            lines.append(f"run on both sites: {len(self._both)}; {_both_times(self._both)}")
         if chosen:
-            lines.append(_chosen_line(chosen))
+            lines.append(f"run on the chosen site: {chosen} ({self._shares(chosen)}); {self._times()}")
         return lines
 
+    def _shares(self, chosen: int) -> str:
+        return ", ".join(f"{site} {len(self._waited[site]) / chosen:.0%}" for site in sorted(self._waited))
 
-def _chosen_line(records: list[Record]) -> str:
-    waited = sorted(record.waited_s * 1e3 for record in records)
-    sites = sorted({record.decision.site for record in records})
-    shares = ", ".join(
-        f"{site} {sum(r.decision.site == site for r in records) / len(records):.0%}" for site in sites
-    )
-    fallbacks = sum(len(r.executions) > 1 for r in records)
-    p95 = waited[min(len(waited) - 1, int(0.95 * len(waited)))]
+    def _times(self) -> str:
+        waited = sorted(1e3 * seconds for times in self._waited.values() for seconds in times)
+        p95 = waited[min(len(waited) - 1, int(0.95 * len(waited)))]
+        mean = statistics.fmean(waited)
+        return f"mean {mean:.1f} ms, P95 {p95:.1f} ms; {self._fallbacks} fell back {ONBOARD}"
+
+
+def _both_times(times: list[tuple[float | None, float | None]]) -> str:
+    pairs = [(onboard, other) for onboard, other in times if onboard is not None and other is not None]
+    if not pairs:
+        return "no answer from another site"
+    onboard_ms, other_ms = (1e3 * statistics.fmean(column) for column in zip(*pairs, strict=True))
+    share = sum(onboard > other for onboard, other in pairs) / len(pairs)
     return (
-        f"run on the chosen site: {len(records)} ({shares}); mean {statistics.fmean(waited):.1f} ms, "
-        f"P95 {p95:.1f} ms; {fallbacks} fell back {ONBOARD}"
+        f"cloud mean {other_ms:.1f} ms, onboard mean {onboard_ms:.1f} ms; the cloud was faster in {share:.0%}"
     )
-
-
-def _times(records: list[Record]) -> str:
-    by_site: dict[str, list[float]] = {}
-    for record in records:
-        for one in record.executions:
-            if one.ok:
-                by_site.setdefault(one.site, []).append(one.seconds * 1e3)
-    means = ", ".join(f"{site} mean {statistics.fmean(times):.1f} ms" for site, times in by_site.items())
-    faster = sum(1 for r in records if r.used != ONBOARD)
-    return f"{means}; onboard was slower in {faster / len(records):.0%}"

@@ -2,6 +2,7 @@
 
 import asyncio
 import itertools
+import logging
 import secrets
 import threading
 import time
@@ -25,6 +26,8 @@ TIMEOUT_S = 2.0
 TIMEOUT_MAX_S = 24 * 3600.0
 WINDOW = 50
 POLL_S = 0.01
+
+log = logging.getLogger(__name__)
 
 
 class Offloader:
@@ -79,14 +82,16 @@ class Offloader:
 
         chosen = policies.make(policy)
         remember()  # a wrong name or window is said now, not at the first task
-        runners: list[Runner] = [CloudRunner(where, site=site) for site, where in servers.items()]
-        return cls(
-            [*runners, OnboardRunner()],
-            policy=chosen,
-            predictor=remember,
-            timeout_s=timeout_s,
-            observers=observers,
-        )
+        runners: list[Runner] = []
+        try:
+            for site, where in servers.items():
+                runners.append(CloudRunner(where, site=site))
+            runners.append(OnboardRunner())
+            return cls(runners, policy=chosen, predictor=remember, timeout_s=timeout_s, observers=observers)
+        except ConfigError:
+            for runner in runners:
+                runner.close()
+            raise
 
     def __call__(
         self,
@@ -126,7 +131,10 @@ class Offloader:
         )
         self.last = record
         for observe in self._observers:
-            observe(record)
+            try:
+                observe(record)
+            except Exception:
+                log.exception("observer %r failed on task %d", observe, number)
         if answer.failure is not None:
             raise answer.failure
         return answer.value

@@ -3,7 +3,7 @@
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 
-from common.errors import TaskFailed
+from common.errors import OffloadError, TaskFailed, describe
 from common.tasks import Kind, Task
 from robot_client.runner import ONBOARD, Execution
 
@@ -20,7 +20,10 @@ class OnboardRunner:
         return None
 
     def submit(self, task: Task, budget_s: float) -> "Future[Execution]":  # noqa: ARG002 - a thread cannot be stopped
-        return self._pool.submit(_run, task, time.perf_counter())
+        try:
+            return self._pool.submit(_run, task, time.perf_counter())
+        except RuntimeError as error:
+            raise OffloadError("the onboard runner is closed") from error
 
     def close(self) -> None:
         self._pool.shutdown(wait=False, cancel_futures=True)
@@ -30,8 +33,8 @@ def _run(task: Task, published: float) -> Execution:
     started = time.perf_counter()
     try:
         value = task.kind.function(*task.args)
-    except Exception as error:  # noqa: BLE001 - whatever a user's function raises is the task's failure
-        failure = TaskFailed(f"{type(error).__name__}: {error}")
+    except BaseException as error:  # noqa: BLE001 - whatever a user's function raises is the task's failure
+        failure = TaskFailed(describe(error))
         failure.__cause__ = error
         return _execution(published, started, failure=failure)
     return _execution(published, started, value=value)

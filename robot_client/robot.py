@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from common.errors import ConfigError
 from common.flood import covered
 from common.maps import OCCUPIED, GridMap, largest_component, passable
-from common.planner import RADIUS_M, Plan, Point, Pose, Scan, scan_hits
+from common.planner import RADIUS_CELLS_MAX, RADIUS_M, Plan, Point, Pose, Scan, scan_hits
 from robot_client.lidar import BEAMS, RANGE_MAX_M, cast_scan
 
 OBSTACLE_SIDE_M = (0.3, 1.0)
@@ -39,6 +39,9 @@ class SimulatedRobot:
         beams: int = BEAMS,
         range_max: float = RANGE_MAX_M,
     ) -> None:
+        if radius_m > RADIUS_CELLS_MAX * prior.resolution:
+            allowed = f"at most {RADIUS_CELLS_MAX} cells of {prior.resolution:g} m"
+            raise ConfigError(f"a radius of {radius_m:g} m is not allowed, {allowed}")
         self.prior, self.radius_m = prior, radius_m
         self._beams, self._range_max = beams, range_max
         self._random = np.random.default_rng(seed)

@@ -16,6 +16,7 @@ from robot_client.policies import Decision, Outlook
 from robot_client.runner import Execution
 
 VERSION = 1
+LINE_START = b'{"v":'
 
 _FIELDS = (
     "v",
@@ -71,11 +72,12 @@ class Trace:
         self.path = path
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+            if path.is_file():
+                self._cut_torn_line()
             self._file = path.open("ab", buffering=0)
         except OSError as error:
             raise ConfigError(f"trace {path}: {error.strerror}") from error
         self._lost = 0
-        self._cut_torn_line()
 
     def write(self, record: Record) -> None:
         line = json.dumps(as_dict(record), separators=(",", ":")).encode() + b"\n"
@@ -96,7 +98,11 @@ class Trace:
             self._file.close()
 
     def _cut_torn_line(self) -> None:
-        """A crash may have left half a line, which would spoil the next one."""
+        """A crash may have left half a line, which would spoil the next one. No other file is touched."""
+        with self.path.open("rb") as file:
+            start = file.read(len(LINE_START))
+        if not LINE_START.startswith(start):
+            raise ConfigError(f"trace {self.path}: the file is there and is no trace")
         kept = _end_of_last_line(self.path)
         if kept < self.path.stat().st_size:
             log.warning("trace %s: cut off a torn last line", self.path)

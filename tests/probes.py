@@ -25,6 +25,11 @@ def total(numbers: NDArray[np.float64]) -> float:
     return float(numbers.sum())
 
 
+@task("zeros", size=lambda count: count)
+def zeros(count: int) -> NDArray[np.uint8]:
+    return np.zeros(count, np.uint8)
+
+
 @task("process_id", size=lambda: 0.0)
 def process_id() -> int:
     return os.getpid()

@@ -1,5 +1,7 @@
 """What a caller sees when the cloud or the link fails in the middle of a run: answers, in bounded time."""
 
+import os
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -15,7 +17,7 @@ from loadgen.testbed import LocalTestbed
 from robot_client.offloader import Offloader
 from robot_client.runner import CLOUD, ONBOARD
 from robot_client.trace import Record
-from tests.probes import echo, mark_once, nap, total
+from tests.probes import echo, mark_once, nap, process_id, total, zeros
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
 
@@ -198,6 +200,46 @@ def test_a_task_that_must_not_run_twice_did_not(
     bed.resume("cloud")
     offload(echo, timeout_s=5.0)
     assert len(mark.read_text().splitlines()) <= 2
+
+
+def test_a_worker_that_dies_costs_no_answer(testbed: Beds, connect: Connect) -> None:
+    """A killed worker process is the server's fault: its task is answered onboard, the pool comes back."""
+    offload = connect(testbed("--executor", "processes"), policy=CLOUD, timeout_s=10.0)
+    worker = offload(process_id)
+    threading.Timer(0.3, os.kill, (worker, signal.SIGKILL)).start()
+    assert offload(nap, 1.0) == 1.0
+    assert offload.last is not None
+    assert [type(one.failure).__name__ for one in offload.last.executions] == ["CloudBroken", "NoneType"]
+    until = time.monotonic() + 20
+    while offload(process_id) in (worker, os.getpid()):
+        assert time.monotonic() < until, "no new worker"
+        time.sleep(0.1)
+
+
+def test_a_value_too_large_for_the_server_stays_onboard(testbed: Beds, connect: Connect) -> None:
+    """An argument or result over its limit is answered onboard, and the connection lives on."""
+    offload = connect(testbed("--message-mib", "1", "--blob-mib", "8"), policy=CLOUD, timeout_s=5.0)
+    assert len(offload(zeros, 3_000_000)) == 3_000_000
+    assert offload(total, np.ones(500_000)) == 500_000
+    assert offload.last is not None
+    assert "takes messages of 1048576" in str(offload.last.executions[0].failure)
+    assert offload.last.used == ONBOARD
+    offload(echo)
+    assert offload.last.used == CLOUD
+
+
+def test_a_blob_that_many_tasks_need_is_uploaded_once(testbed: Beds, connect: Connect) -> None:
+    """Eight tasks at once with one new array of 2 MB send it once."""
+    offload = connect(testbed(delay_ms=20.0), policy=CLOUD, timeout_s=5.0, observers=[(sent := []).append])
+    numbers = np.ones(250_000)
+    numbers.flags.writeable = False
+    threads = [threading.Thread(target=offload, args=(total, numbers)) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [record.used for record in sent] == [CLOUD] * 8
+    assert numbers.nbytes < sum(record.executions[0].bytes_out for record in sent) < 1.1 * numbers.nbytes
 
 
 def test_a_full_queue_is_answered_onboard(testbed: Beds, connect: Connect) -> None:

@@ -22,7 +22,7 @@ from cloud_server.executors import EXECUTORS
 from cloud_server.metrics import Metrics
 from cloud_server.server import Server
 from cloud_server.web import Web, create_app
-from common import wire
+from common import VERSION, wire
 from common.errors import ConfigError
 from common.wire import Blob, Cancel, Hello, Ping, Pong, Reply, Request
 
@@ -223,11 +223,11 @@ def test_faults_of_the_task_are_told(serve: Serve, join: Join, executor: str) ->
 def test_hello_and_ping_are_answered(serve: Serve, join: Join) -> None:
     """Hello gives tasks with their source hashes, ping the queue depth; another version gets hello too."""
     peer = join(serve().server.endpoint)
-    peer.send(Hello({}, "test"))
+    peer.send(Hello({}, "test", 1024))
     hello = peer.receive()
     assert isinstance(hello, Hello)
     assert len(hello.tasks["served_sum"]) == 64
-    assert hello.software == wire.software_version()
+    assert hello.software == VERSION
     peer.send(Ping(5))
     assert peer.receive() == Pong(5, 0)
     peer.socket.send_multipart([bytes.fromhex("9202a568656c6c6f")])
@@ -374,7 +374,7 @@ def test_random_and_mutated_frames_do_no_harm(serve: Serve, join: Join) -> None:
         Request(2, "served_sum", 5.0, 1, (bytes(32),), body.frames),
         Reply(3, "ok", body=body.frames),
         Blob(bytes(1000)),
-        Hello({"a": "b"}, "1"),
+        Hello({"a": "b"}, "1", 1024),
         Ping(4),
         Pong(4),
         Cancel(1),
@@ -471,14 +471,18 @@ def test_draining_answers_what_was_accepted(serve: Serve, join: Join, pipe: Path
 
 
 def test_draining_is_bounded(serve: Serve, join: Join, pipe: Path) -> None:
-    """A task that outlives the drain time is given up: its robot is told, run says not all was answered."""
+    """A task that outlives the drain time is given up: who waits is told, who runs hears a break.
+
+    `busy` would say that it never ran, and a task that must not run twice would run again.
+    """
     running = serve(drain_s=0.1)
     peer = join(running.server.endpoint)
     peer.request(1, "served_pipe", str(pipe))
-    until(lambda: running.server.status().running == 1)
+    peer.request(2, "served_count")
+    until(lambda: running.server.status().queue_depth == 1)
     running.server.drain()
     reply = peer.reply()
-    assert (reply.id, reply.status, reply.error) == (1, "busy", "the server stopped")
+    assert (reply.id, reply.status, reply.error) == (2, "busy", "the server stopped")
     until(lambda: running.answered is False)
 
 
@@ -495,7 +499,7 @@ def test_the_web_shows_the_server(serve: Serve, join: Join) -> None:
         assert shown["healthy"] is True
         assert shown["queue_depth"] == 0
         assert 0 <= shown["last_task_age_s"] <= shown["uptime_s"]
-        assert shown["version"] == wire.software_version()
+        assert shown["version"] == VERSION
         assert http.get("/ready").status_code == 200
         metrics = http.get("/metrics").text
         assert 'offboard_requests_total{kind="served_sum",status="ok"} 1.0' in metrics

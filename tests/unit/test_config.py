@@ -139,6 +139,8 @@ FILES = {
     "bad.jsonl": '{"v": 1}\nnonsense\n',
     "text.csv": "size,onboard_s,cloud_s\n1,2,3\n1,two,3\n",
     "empty.csv": "",
+    "open.map": "type octile\nheight 3\nwidth 3\nmap\n...\n...\n...\n",
+    "text-link.toml": 'name = "odd"\n[workload]\nmap = "m.yaml"\n[link]\ndelay_ms = "slow"\n',
     "odd.toml": 'name = "odd"\n[workload]\nmap = "m.yaml"\ntask = 3\n',
 }
 
@@ -150,6 +152,15 @@ FILES = {
         (["robot_client", "--map", "none.yaml"], "none.yaml"),
         (["robot_client", "--map", "no-resolution.yaml"], "no-resolution.yaml: resolution"),
         (["robot_client", "--map", "text-image.yaml"], "words.txt"),
+        (["robot_client", "--map", "open.map", "--radius", "9"], "no room for a robot of radius 9.0 m"),
+        (
+            ["robot_client", "--map", "open.map", "--metrics", "127.0.0.1:99999"],
+            "--metrics: '127.0.0.1:99999'",
+        ),
+        (
+            ["robot_client", "--map", "open.map", "--trace", "words.txt"],
+            "words.txt: the file is there and is no",
+        ),
         (["robot_client", "--map", "m.yaml", "--window", "0"], "--window: 0 is below 2"),
         (["robot_client", "--map", "m.yaml", "--policy", "x"], "'x' is not one of paper, onboard, cloud"),
         (
@@ -168,6 +179,8 @@ FILES = {
         (["loadgen", "table", "text.csv", "--windows", "0"], "--windows: '0'"),
         (["loadgen", "run", "odd.toml"], "odd.toml:4: unknown key 'task'; did you mean 'tasks'?"),
         (["loadgen", "run", "none"], "scenario 'none' is neither a file nor one of demo"),
+        (["loadgen", "run", "text-link.toml"], "text-link.toml: link.delay-ms: 'slow' is not a number"),
+        (["loadgen", "run", "demo", "--out", "words.txt"], "--out: words.txt cannot be written to"),
         (["loadgen", "wan", "--delay-ms", "-1"], "--delay-ms: -1"),
         (["loadgen", "wan", "--to", "nowhere"], "--to: 'nowhere' is not HOST:PORT"),
     ],

@@ -20,7 +20,7 @@ from common.wire import StoredBlob, decode, encode
 WAIT_S = 8
 ROOT = Path(__file__).parents[2]
 MODULE = '''
-import os, signal, threading
+import asyncio, os, signal, threading
 from common.tasks import task
 
 warmed = []
@@ -41,6 +41,18 @@ def exec_raise(text):
 @task("exec_exit", size=lambda: 0)
 def exec_exit():
     raise SystemExit(3)
+
+@task("exec_cancel", size=lambda: 0)
+def exec_cancel():
+    raise asyncio.CancelledError("late")
+
+class Mute(Exception):
+    def __str__(self):
+        raise RuntimeError
+
+@task("exec_mute", size=lambda: 0)
+def exec_mute():
+    raise Mute
 
 @task("exec_object", size=lambda: 0)
 def exec_object():
@@ -122,6 +134,8 @@ def test_a_task_runs_and_its_result_comes_back(executor: Executor) -> None:
     [
         ("exec_raise", ["no such place"], "ValueError: no such place"),
         ("exec_exit", [], "SystemExit: 3"),
+        ("exec_cancel", [], "CancelledError: late"),
+        ("exec_mute", [], "Mute: (its text cannot be had)"),
         (
             "exec_object",
             [],

@@ -13,6 +13,7 @@ from common.errors import (
     CloudError,
     CloudTimeout,
     ConfigError,
+    OffloadError,
     TaskFailed,
     UnknownTask,
 )
@@ -239,6 +240,40 @@ def test_a_timeout_is_above_zero_and_bounded(make: Make, timeout_s: float) -> No
         make(OnboardRunner(), timeout_s=timeout_s)
     with make(OnboardRunner()) as offload, pytest.raises(ConfigError, match="must be above 0"):
         offload(add_one, 1, timeout_s=timeout_s)
+
+
+@task("stop_all", size=lambda: 0.0)
+def stop_all() -> None:
+    raise SystemExit(3)
+
+
+def test_a_task_that_would_end_the_process_fails_alone(make: Make) -> None:
+    """SystemExit and its like are the task's failure, onboard as in the cloud."""
+    with make(OnboardRunner()) as offload:
+        with pytest.raises(TaskFailed, match="SystemExit: 3"):
+            offload(stop_all)
+        assert offload(add_one, 1) == 2
+
+
+def test_an_observer_that_fails_costs_no_answer(make: Make, caplog: pytest.LogCaptureFixture) -> None:
+    """The answer is returned, the failure logged, the next observer called."""
+    seen: list[object] = []
+
+    def broken(record: object) -> None:
+        raise ValueError(record)
+
+    with make(OnboardRunner(), observers=[broken, seen.append]) as offload:
+        assert offload(add_one, 1) == 2
+    assert len(seen) == 1
+    assert "failed on task 0" in caplog.text
+
+
+def test_a_call_after_close_is_one_clear_error(make: Make) -> None:
+    """A closed offloader says so instead of hanging."""
+    offload = make(OnboardRunner())
+    offload.close()
+    with pytest.raises(OffloadError, match="closed"):
+        offload(add_one, 1)
 
 
 def test_close_closes_every_runner(make: Make) -> None:

@@ -1,5 +1,7 @@
 """Registering tasks and finding them again."""
 
+from pathlib import Path
+
 import pytest
 
 from common.errors import BadValue, ConfigError, UnknownTask
@@ -68,7 +70,23 @@ def test_unknown_names_list_the_known() -> None:
         kind_of(len)
 
 
-def test_a_module_that_cannot_be_imported_is_named() -> None:
-    """--tasks with a typo says which module."""
-    with pytest.raises(ConfigError, match="task module 'no_such_module' cannot be imported"):
-        load_modules(["no_such_module"])
+@pytest.mark.parametrize(
+    ("name", "why"), [("no_such_module", "ModuleNotFound"), ("", "ValueError"), ("sick", "1 / 0")]
+)
+def test_a_module_that_cannot_be_imported_is_named(
+    name: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """--tasks with a typo, an empty name or a module that fails says which module and why."""
+    (tmp_path / "sick.py").write_text("raise RuntimeError('1 / 0')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ConfigError, match=f"task module '{name}' cannot be imported: .*{why}"):
+        load_modules([name])
+
+
+def test_a_parameter_that_goes_by_keyword_only_is_refused() -> None:
+    """Calls cross the wire as positions; a keyword-only parameter would be lost on the way."""
+    with pytest.raises(ConfigError, match="'scale' can only be given by keyword"):
+
+        @task("scaled", size=abs)
+        def scaled(number: float, *, scale: float = 1.0) -> float:
+            return number * scale

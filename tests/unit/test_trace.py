@@ -108,6 +108,16 @@ def test_a_restarted_robot_appends_after_a_torn_line(tmp_path: Path) -> None:
     assert [fields["i"] for fields in read(path)] == [0, 7]
 
 
+@pytest.mark.parametrize("text", ["my thesis", "my thesis\nchapter 1\n", '{"a": 1}'])
+def test_a_file_that_is_no_trace_is_left_alone(tmp_path: Path, text: str) -> None:
+    """--trace with the name of another file is refused, and the file is what it was."""
+    path = tmp_path / "thesis.txt"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match="is no trace"):
+        Trace(path)
+    assert path.read_text() == text
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [

@@ -38,8 +38,9 @@ class Positive:
 
 GOLDEN: list[tuple[wire.Message, str]] = [
     (
-        Hello({"plan_path": "ab12"}, "0.1.0"),
-        "9301a568656c6c6f82a57461736b7381a9706c616e5f70617468a461623132a8736f667477617265a5302e312e30",
+        Hello({"plan_path": "ab12"}, "0.1.0", 4096),
+        "9301a568656c6c6f83a57461736b7381a9706c616e5f70617468a461623132a8736f667477617265a5302e312e30"
+        "b16d6573736167655f62797465735f6d6178cd1000",
     ),
     (
         Request(7, "plan_path", 0.25, 2, (DIGEST,), [b"\x90"]),
@@ -47,9 +48,9 @@ GOLDEN: list[tuple[wire.Message, str]] = [
         "a7617474656d707402a5626c6f627391c420" + DIGEST.hex() + "|90",
     ),
     (
-        Reply(7, "ok", "", 0.5, 0.25, 3, (), [b"\xc0", b"raw"]),
-        "9301a57265706c7987a2696407a6737461747573a26f6ba56572726f72a0a771756575655f73cb3fe0000000000000"
-        "a572756e5f73cb3fd0000000000000ab71756575655f646570746803a76d697373696e6790|c0|726177",
+        Reply(7, "ok", "", 0.5, 0.25, 3, (), False, [b"\xc0", b"raw"]),
+        "9301a57265706c7988a2696407a6737461747573a26f6ba56572726f72a0a771756575655f73cb3fe0000000000000"
+        "a572756e5f73cb3fd0000000000000ab71756575655f646570746803a76d697373696e6790ac7365727665725f6661756c74c2|c0|726177",
     ),
     (Ping(1), "9301a470696e6781a2696401"),
     (Pong(1, 2), "9301a4706f6e6782a2696401ab71756575655f646570746802"),
@@ -96,6 +97,7 @@ def test_another_version_is_told_apart(header: list[Any]) -> None:
 
 REQUEST = {"id": 1, "kind": "k", "budget_s": 1.0, "attempt": 1, "blobs": []}
 REPLY = {"id": 1, "status": "ok", "error": "", "queue_s": 0.0, "run_s": 0.0, "queue_depth": 0, "missing": []}
+REPLY |= {"server_fault": False}
 
 
 @pytest.mark.parametrize(
@@ -123,6 +125,7 @@ REPLY = {"id": 1, "status": "ok", "error": "", "queue_s": 0.0, "run_s": 0.0, "qu
         ("reply", REPLY, {"run_s": "1"}),
         ("reply", REPLY, {"queue_depth": 1.5}),
         ("reply", REPLY, {"missing": [1]}),
+        ("reply", REPLY, {"server_fault": 1}),
     ],
 )
 def test_a_wrong_field_is_refused(name: str, fields: dict[str, Any], wrong: dict[str, Any]) -> None:
@@ -492,4 +495,4 @@ def test_an_array_that_lies_askew_is_put_straight() -> None:
 def test_messages_too_big_are_not_packed() -> None:
     """Our own bounds hold for what we send."""
     with pytest.raises(BadValue):
-        wire.pack(Hello({f"task_{n:05}": "h" * 64 for n in range(1000)}, "1"))
+        wire.pack(Hello({f"task_{n:05}": "h" * 64 for n in range(1000)}, "1", 1))
