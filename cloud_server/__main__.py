@@ -10,6 +10,7 @@ from typing import Any
 
 from cloud_server.config import ServerConfig
 from common.config import as_dict, load, run_command
+from common.errors import ConfigError
 
 DESCRIPTION = (
     "Runs tasks for robots over ZMQ; /health, /ready, /metrics, /config, /tasks and /docs over HTTP."
@@ -34,9 +35,11 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
     from cloud_server.metrics import Metrics
     from cloud_server.server import Server
     from cloud_server.web import Web, create_app
-    from common.tasks import load_modules
+    from common.tasks import kinds, load_modules
 
     load_modules(config.tasks)
+    if not kinds():
+        raise ConfigError(f"--tasks: {','.join(config.tasks)} registers no task")
     log.info("settings: %s", as_dict(config))
     metrics = Metrics()
     server = Server(

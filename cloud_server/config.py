@@ -26,7 +26,7 @@ class ServerConfig:
     )
     tasks: tuple[str, ...] = setting(
         ("common.planner",),
-        "modules that register tasks, comma-separated (default: common.planner)",
+        "modules that register tasks, comma-separated",
         metavar="MODULE,MODULE",
     )
     queue_max: int = setting(64, "waiting requests; beyond it the answer is busy", minimum=1, maximum=100_000)

@@ -6,14 +6,18 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-import uvicorn
-from fastapi import FastAPI, Response
-from fastapi.responses import JSONResponse
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
 
 from cloud_server.metrics import Status
 from common import VERSION, tasks
-from common.errors import ConfigError
+from common.errors import ConfigError, MissingExtra
+
+try:
+    import uvicorn
+    from fastapi import FastAPI, Response
+    from fastapi.responses import JSONResponse
+except ImportError as error:
+    raise MissingExtra("cloud-server", "cloud") from error
 
 STALL_S = 2.0  # the loop turns at least every 0.5 s
 STOP_S = 2.0

@@ -6,6 +6,7 @@ What the settings are is the business of each process's own `config.py`.
 import argparse
 import dataclasses
 import difflib
+import os
 import sys
 import tomllib
 import types
@@ -19,7 +20,7 @@ from common.errors import ConfigError, DataError, OffloadError
 C = TypeVar("C")
 
 REQUIRED: Any = dataclasses.MISSING
-INTERRUPTED_EXIT = 130  # as a shell counts it: 128 + SIGINT
+INTERRUPTED_EXIT, BROKEN_PIPE_EXIT = 130, 141  # as a shell counts them: 128 + the signal
 
 
 def setting(
@@ -56,7 +57,7 @@ def load(
 ) -> C:
     """Build `cls` from `argv`, then `PREFIX_NAME` in `environ`, then the TOML file of `--config`."""
     parser = CommandParser(prog=prog, description=description)
-    add_flags(parser, cls)
+    add_flags(parser, cls, prefix)
     parser.add_argument("--config", type=Path, metavar="FILE", help="TOML file with the same names")
     return resolve(cls, parser.parse_args(argv), environ=environ, prefix=prefix)
 
@@ -99,8 +100,9 @@ def from_table(cls: type[C], table: Mapping[str, Any], path: Path, section: str)
         raise DataError(f"{path}: {error}") from error
 
 
-def add_flags(parser: argparse.ArgumentParser, cls: type) -> None:
+def add_flags(parser: argparse.ArgumentParser, cls: type, prefix: str) -> None:
     """One flag a setting; values stay text until `resolve` converts them."""
+    parser.epilog = f"Each flag can also be given in the environment, --one-flag as {prefix}_ONE_FLAG."
     for field in _settings(cls):
         help = field.metadata["help"]
         if field.default is not REQUIRED and field.default not in (None, ()):
@@ -136,7 +138,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise DataError(f"{path}: no such file") from None
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise DataError(f"{path}: {error}") from error
+        raise DataError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -149,7 +151,12 @@ class CommandParser(argparse.ArgumentParser):
 def run_command(prog: str, command: Callable[[], int]) -> int:
     """Run a console command; a user's mistake is one line and 2, a failed run one line and 1."""
     try:
-        return command()
+        code = command()
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:  # whoever read our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return BROKEN_PIPE_EXIT
     except (ConfigError, DataError) as error:
         print(f"{prog}: {error}", file=sys.stderr)
         return 2

@@ -52,7 +52,7 @@ class DemoConfig:
 def _demo(argv: Sequence[str]) -> int:
     """350 plans on a real map, three processes on loopback, and the paper's table"""
     parser = CommandParser(prog="loadgen demo", description=_demo.__doc__)
-    add_flags(parser, DemoConfig)
+    add_flags(parser, DemoConfig, ENVIRONMENT)
     config = resolve(DemoConfig, parser.parse_args(argv), environ=os.environ, prefix=ENVIRONMENT)
     from loadgen.play import play_demo
 
@@ -63,7 +63,7 @@ def _run(argv: Sequence[str]) -> int:
     """play a scenario and write its trace"""
     parser = CommandParser(prog="loadgen run", description=_run.__doc__)
     parser.add_argument("scenario", metavar="SCENARIO", help="TOML file, or the name of a shipped one: demo")
-    add_flags(parser, RunConfig)
+    add_flags(parser, RunConfig, ENVIRONMENT)
     flags = parser.parse_args(argv)
     config = resolve(RunConfig, flags, environ=os.environ, prefix=ENVIRONMENT)
     from loadgen.play import play
@@ -82,7 +82,7 @@ def _table(argv: Sequence[str]) -> int:
     parser.add_argument(
         "trace", type=Path, metavar="TRACE", help="trace.jsonl, or CSV size,onboard_s,cloud_s"
     )
-    add_flags(parser, TableConfig)
+    add_flags(parser, TableConfig, ENVIRONMENT)
     flags = parser.parse_args(argv)
     return run_table(flags.trace, resolve(TableConfig, flags, environ=os.environ, prefix=ENVIRONMENT))
 
@@ -92,7 +92,7 @@ def _wan(argv: Sequence[str]) -> int:
     from loadgen.wan import WanConfig, run_wan
 
     parser = CommandParser(prog="loadgen wan", description=_wan.__doc__)
-    add_flags(parser, WanConfig)
+    add_flags(parser, WanConfig, "WAN")
     return run_wan(resolve(WanConfig, parser.parse_args(argv), environ=os.environ, prefix="WAN"))
 
 

@@ -8,14 +8,17 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any, Protocol
 
-import uvicorn
-from fastapi import FastAPI, Request
-from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
-from pydantic import BaseModel, ConfigDict, Field
-
-from common.errors import ConfigError
+from common.errors import ConfigError, MissingExtra
 from loadgen.link import DISTRIBUTIONS, Link
+
+try:
+    import uvicorn
+    from fastapi import FastAPI, Request
+    from fastapi.exceptions import RequestValidationError
+    from fastapi.responses import JSONResponse
+    from pydantic import BaseModel, ConfigDict, Field
+except ImportError as error:
+    raise MissingExtra("the relay", "bench") from error
 
 STOP_S = 1  # how long a reply in progress may take when the relay stops
 

@@ -38,9 +38,10 @@ def play(scenario: Scenario, out: Path) -> int:
         if held is not None:
             print(f"quota: {held.cpus:g} CPU over {held.period_s * 1e3:g} ms by {held.kind}", flush=True)
         code = testbed.wait("robot", max(ROBOT_S_AT_LEAST, ROBOT_S_A_TASK * scenario.workload.tasks))
-        if code < 0:
-            raise OffloadError(f"the robot was ended by signal {-code}")
-        return code
+    if code < 0:
+        raise OffloadError(f"the robot was ended by signal {-code}")
+    print(f"written: {trace}", flush=True)
+    return code
 
 
 def play_demo(out: Path) -> int:
@@ -50,7 +51,7 @@ def play_demo(out: Path) -> int:
         raise OffloadError(f"the robot ended with exit code {code}")
     text = table_text(out / TRACE, TableConfig(windows=DEMO_WINDOWS, feedback="both"))
     (out / TABLE).write_text(text)
-    print(f"\n{text}\nwritten: {out / TRACE}, {out / TABLE}")
+    print(f"\n{text}\nwritten: {out / TABLE}")
     return 0
 
 

@@ -5,6 +5,7 @@ changes its link is `wan.py`. The TCP handshake itself is not delayed, only the 
 """
 
 import asyncio
+import logging
 import select
 import selectors
 import time
@@ -17,6 +18,8 @@ from loadgen.link import SEGMENT_BYTES, Link, LinkConditions, Pipe
 CHUNK_BYTES = 8 * SEGMENT_BYTES  # a long read is cut, so that its first bytes do not wait for its last
 CONNECT_S = 5.0
 SPIN_S = 0.0003
+
+log = logging.getLogger(__name__)
 
 
 class Relay:
@@ -33,6 +36,7 @@ class Relay:
         self.seed = seed
         self.buffer_bytes = buffer_bytes
         self._connections_max = connections_max
+        self._target_is_up = True
         self.connections: set[Connection] = set()  # bounded by connections_max
         self.accepted = 0
         self.refused = 0
@@ -53,6 +57,15 @@ class Relay:
         connection = Connection(self, self.accepted)
         self.connections.add(connection)
         return connection.client
+
+    def target_up(self) -> None:
+        self._target_is_up = True
+
+    def target_down(self, error: OSError) -> None:
+        """Say once that connections are closed because the cloud takes none."""
+        if self._target_is_up:
+            log.warning("cannot connect to %s:%d: %s", *self.target, error)
+        self._target_is_up = False
 
     def abort(self) -> None:
         """Close every connection now."""
@@ -209,7 +222,9 @@ class Connection:
             async with asyncio.timeout(CONNECT_S):
                 await asyncio.get_running_loop().create_connection(lambda: cloud, *self._relay.target)
             self._open_sides.add(cloud)
-        except OSError:  # TimeoutError is one
+            self._relay.target_up()
+        except OSError as error:  # TimeoutError is one
+            self._relay.target_down(error)
             self.abort()
 
     def _lost(self, side: Side) -> None:

@@ -115,7 +115,10 @@ def _read_trace(path: Path, kind: str | None) -> Rows:
         first_lines.setdefault(str(fields["kind"]), line)
         _add(path, found, row)
     if not found:
-        raise DataError(f"{path}: no {kind or 'task'} ran well on both sites; measure with --measure both")
+        raise DataError(
+            f"{path}: no {kind or 'task'} ran well on both sites; measure with "
+            "`loadgen run SCENARIO --measure both` or `robot-client --measure K`"
+        )
     if len(first_lines) > 1:
         kinds = ", ".join(f"{name} (line {line})" for name, line in first_lines.items())
         raise DataError(f"{path}: holds tasks of several kinds: {kinds}; choose one with --kind")

@@ -91,14 +91,17 @@ def read_scenario(path: Path) -> Scenario:
             raise unknown_key(path, key, known)
     name, seed = table.get("name"), table.get("seed", 1)
     if not isinstance(name, str) or not name.isidentifier():
-        raise DataError(f"{path}: name = {name!r} is not a word")
+        raise DataError(f"{path}: name = {name!r} is not a word" if name else f"{path}: name is missing")
     if type(seed) is not int or seed < 0:
         raise DataError(f"{path}: seed = {seed!r} is not a whole number from 0")
     workload = from_table(Workload, _table(table, "workload", path), path, "workload")
+    workload = replace(workload, map=(path.parent / workload.map).resolve())
+    if not workload.map.is_file():
+        raise DataError(f"{path}: workload.map: {workload.map}: no such file")
     return Scenario(
         name,
         seed,
-        _located(workload, path.parent),
+        workload,
         from_table(RobotPart, _table(table, "robot", path), path, "robot"),
         from_table(CloudPart, _table(table, "cloud", path), path, "cloud"),
         _link(_table(table, "link", path), path),
@@ -120,10 +123,6 @@ def _table(table: Mapping[str, Any], section: str, path: Path) -> Mapping[str, A
     if not isinstance(found, dict):
         raise DataError(f"{path}: {section} is not a table")
     return found
-
-
-def _located(workload: Workload, folder: Path) -> Workload:
-    return replace(workload, map=(folder / workload.map).resolve())
 
 
 def _link(table: Mapping[str, Any], path: Path) -> Mapping[str, Any]:

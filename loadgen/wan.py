@@ -89,7 +89,7 @@ def address(flag: str, text: str) -> tuple[str, int]:
     """Host and port of HOST:PORT, [HOST]:PORT for IPv6; ConfigError names the flag."""
     host, _, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
-    if not (host and port.isascii() and port.isdigit() and int(port) <= PORT_MAX):
+    if not (host and "/" not in host and port.isascii() and port.isdigit() and int(port) <= PORT_MAX):
         raise ConfigError(f"{flag}: {text!r} is not HOST:PORT with a port from 0 to {PORT_MAX}")
     return host, int(port)
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 from common.config import as_dict, load, run_command
-from common.errors import ConfigError
+from common.errors import ConfigError, OffloadError
 from robot_client.config import RobotConfig
 from robot_client.runner import ONBOARD, PORT_MAX
 from robot_client.trace import Record
@@ -60,10 +60,13 @@ def _drive(config: RobotConfig) -> int:
             drive.warm()
             for site, why in offload.wait_for_sites(plan_path, config.connect_s).items():
                 log.warning("starting without %s: %s; tasks run %s", site, why, ONBOARD)
-            return drive.run()
+            drive.run()
     finally:
         if trace:
             trace.close()
+    if trace and trace.lost:
+        raise OffloadError(f"{trace.lost} of {config.tasks} tasks are not in {trace.path}")
+    return 0
 
 
 def _metrics(config: RobotConfig) -> list[Callable[[Record], None]]:

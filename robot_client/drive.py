@@ -35,7 +35,8 @@ class Drive:
         warm()
         plan_path(*self._robot.request())
 
-    def run(self) -> int:
+    def run(self) -> None:
+        """All plans, and the summary."""
         for number in range(self._config.tasks):
             measured = number < self._config.measure
             plan = self._offload(plan_path, *self._robot.request(), where=BOTH if measured else None)
@@ -46,7 +47,6 @@ class Drive:
             self._progress(number + 1, record)
         for line in self._summary.lines():
             self._say(line)
-        return 0
 
     def _progress(self, done: int, record: Record) -> None:
         if sys.stdout.isatty():

@@ -14,6 +14,7 @@ from typing import Any, Self
 
 from common.errors import BadValue, CloudBroken, CloudError, ConfigError, TaskError
 from common.tasks import Kind, Task, kind_of
+from common.values import encode
 from robot_client import policies, predictors
 from robot_client.onboard import OnboardRunner
 from robot_client.policies import Decision, Forecast, Outlook, Policy
@@ -55,6 +56,7 @@ class Offloader:
         self._timeout_s = _checked_timeout(timeout_s)
         self._observers = tuple(observers)
         self._memories: dict[str, dict[str, _Memory]] = {}
+        self._crossed: set[str] = set()  # kinds whose values are known to cross the wire
         self._lock = threading.Lock()
         self._numbers = itertools.count()
         self._session = secrets.token_hex(4)
@@ -110,6 +112,9 @@ class Offloader:
         kind = kind_of(function)
         args = kind.bind(args, kwargs)
         task = Task(kind, args, kind.size_of(args))
+        first = kind.name not in self._crossed and len(self._runners) > 1
+        if first:
+            _check_crosses(kind, "arguments", list(args))
         started_at, started = datetime.now(UTC), time.perf_counter()
         forecast, absent = self._predict(kind, task.size)
         decision = self._decide(kind, forecast, absent, where)
@@ -137,6 +142,9 @@ class Offloader:
                 log.exception("observer %r failed on task %d", observe, number)
         if answer.failure is not None:
             raise answer.failure
+        if first:
+            _check_crosses(kind, "result", answer.value)
+            self._crossed.add(kind.name)
         return answer.value
 
     async def run(self, function: Callable[..., Any], *args: Any, **options: Any) -> Any:
@@ -196,7 +204,8 @@ class Offloader:
         if where == BOTH and not kind.duplicate:
             raise ConfigError(f"where='both': task {kind.name} is declared duplicate=False")
         if where == BOTH:
-            return Decision(ONBOARD, len(forecast.sites) > 1, "measured on both", "pinned")
+            both = len(forecast.sites) > 1
+            return Decision(ONBOARD, both, "measured on both" if both else "only onboard was there", "pinned")
         if where not in forecast.sites:
             return Decision(ONBOARD, False, f"pinned to {where}, which cannot take it", "pinned")
         return Decision(where, False, "pinned by the caller", "pinned")
@@ -251,6 +260,14 @@ class _Memory:
         self.predictor.learn(size, execution.seconds)
         self._failures = 0 if execution.ok else self._failures + 1
         self.age = 0
+
+
+def _check_crosses(kind: Kind, what: str, value: Any) -> None:
+    """BadValue at the first call, wherever it runs, and not at the first one that goes to a server."""
+    try:
+        encode(value, kind.types)
+    except BadValue as error:
+        raise BadValue(f"{what} of task {kind.name}: {error}") from error
 
 
 def _checked_timeout(timeout_s: float) -> float:

@@ -77,7 +77,7 @@ class Trace:
             self._file = path.open("ab", buffering=0)
         except OSError as error:
             raise ConfigError(f"trace {path}: {error.strerror}") from error
-        self._lost = 0
+        self.lost = 0  # records that could not be written
 
     def write(self, record: Record) -> None:
         line = json.dumps(as_dict(record), separators=(",", ":")).encode() + b"\n"
@@ -86,9 +86,9 @@ class Trace:
             if self._file.write(line) < len(line):  # a disk that fills up takes the part that fits
                 raise OSError(errno.ENOSPC, "no space left for the whole line")
         except OSError as error:
-            self._lost += 1
+            self.lost += 1
             log.error(
-                "trace %s: task %d lost (%d so far): %s", self.path, record.i, self._lost, error.strerror
+                "trace %s: task %d lost (%d so far): %s", self.path, record.i, self.lost, error.strerror
             )
             with contextlib.suppress(OSError):
                 os.truncate(self._file.fileno(), end)

@@ -140,7 +140,8 @@ FILES = {
     "text.csv": "size,onboard_s,cloud_s\n1,2,3\n1,two,3\n",
     "empty.csv": "",
     "open.map": "type octile\nheight 3\nwidth 3\nmap\n...\n...\n...\n",
-    "text-link.toml": 'name = "odd"\n[workload]\nmap = "m.yaml"\n[link]\ndelay_ms = "slow"\n',
+    "text-link.toml": 'name = "odd"\n[workload]\nmap = "open.map"\n[link]\ndelay_ms = "slow"\n',
+    "no-map.toml": 'name = "odd"\n[workload]\nmap = "none.yaml"\n',
     "odd.toml": 'name = "odd"\n[workload]\nmap = "m.yaml"\ntask = 3\n',
 }
 
@@ -178,6 +179,9 @@ FILES = {
         (["loadgen", "table", "bad.jsonl"], "bad.jsonl:1: no field"),
         (["loadgen", "table", "text.csv", "--windows", "0"], "--windows: '0'"),
         (["loadgen", "run", "odd.toml"], "odd.toml:4: unknown key 'task'; did you mean 'tasks'?"),
+        (["loadgen", "run", "no-map.toml"], "no-map.toml: workload.map: "),
+        (["cloud_server", "--tasks", "json"], "--tasks: json registers no task"),
+        (["cloud_server", "--config", "."], ".: Is a directory"),
         (["loadgen", "run", "none"], "scenario 'none' is neither a file nor one of demo"),
         (["loadgen", "run", "text-link.toml"], "text-link.toml: link.delay-ms: 'slow' is not a number"),
         (["loadgen", "run", "demo", "--out", "words.txt"], "--out: words.txt cannot be written to"),
@@ -198,3 +202,32 @@ def test_a_users_mistake_is_one_line_and_exit_code_2(
     assert message in done.stderr
     assert len(done.stderr.splitlines()) == 1, done.stderr
     assert done.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("command", "extra"),
+    [(["cloud_server"], "cloud"), (["loadgen", "wan"], "bench"), (["loadgen", "run", "demo"], "bench")],
+)
+def test_a_missing_extra_is_named(command: list[str], extra: str) -> None:
+    """Without the optional libraries a command says what to install, exit code 2."""
+    probe = (
+        "import runpy, sys\n"
+        "sys.modules['uvicorn'] = sys.modules['fastapi'] = None\n"
+        f"sys.argv = {command!r}\n"
+        "runpy.run_module(sys.argv[0], run_name='__main__')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, timeout=30)
+    assert done.returncode == 2
+    assert done.stderr.endswith(f"pip install 'offboard[{extra}]'\n")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_reader_that_leaves_early_is_no_error(tmp_path: Path) -> None:
+    """`loadgen table ... | head -1` ends quietly."""
+    rows = "\n".join(f"{n},{n},1" for n in range(1, 40))
+    (tmp_path / "rows.csv").write_text(f"size,onboard_s,cloud_s\n{rows}\n")
+    table = f"{sys.executable} -m loadgen table rows.csv --windows {','.join(map(str, range(2, 35)))}"
+    done = subprocess.run(
+        f"{table} --format json | true", shell=True, cwd=tmp_path, capture_output=True, text=True, timeout=30
+    )
+    assert done.stderr == ""

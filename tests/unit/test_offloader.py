@@ -176,6 +176,30 @@ def test_a_value_that_cannot_cross_the_wire_is_one_clear_error(make: Make) -> No
         offload(add_one, 1, where="both")
 
 
+@task("unique", size=lambda items: len(items))
+def unique(items: list[int]) -> object:
+    return set(items) if items else None
+
+
+@pytest.mark.parametrize("where", [None, ONBOARD, CLOUD])
+def test_the_first_call_says_what_cannot_cross(make: Make, where: str | None) -> None:
+    """Argument or result, on whichever site it runs, with the server there or not: BadValue at once."""
+    cloud = cloud_answers()
+    cloud.absent = "not connected"
+    with make(cloud, OnboardRunner()) as offload:
+        with pytest.raises(BadValue, match=r"arguments of task unique: .*set"):
+            offload(unique, {1, 2}, where=where)
+        with pytest.raises(BadValue, match=r"result of task unique: .*set"):
+            offload(unique, [1, 2], where=where)
+        assert offload(unique, [], where=where) is None
+
+
+def test_onboard_alone_takes_any_value(make: Make) -> None:
+    """Where no other site is named nothing has to cross."""
+    with make(OnboardRunner()) as offload:
+        assert offload(unique, {1, 2}) == {1, 2}
+
+
 def test_a_function_that_is_no_task_is_refused(make: Make) -> None:
     """The message says to decorate it."""
     with make(OnboardRunner()) as offload, pytest.raises(UnknownTask, match="decorate it with @task"):
