@@ -115,31 +115,9 @@ class Offloader:
         first = kind.name not in self._crossed and len(self._runners) > 1
         if first:
             _check_crosses(kind, "arguments", list(args))
-        started_at, started = datetime.now(UTC), time.perf_counter()
-        forecast, absent = self._predict(kind, task.size)
-        decision = self._decide(kind, forecast, absent, where)
-        executions = self._execute(task, decision, forecast, budget_s)
-        answer = _answer(executions)
-        self._learn(task, executions)
-        number = next(self._numbers)
-        record = Record(
-            i=number,
-            id=f"{self._session}-{number}",
-            kind=kind.name,
-            size=task.size,
-            sites=forecast.sites,
-            decision=decision,
-            executions=tuple(replace(execution, value=None) for execution in executions),
-            used=answer.site if answer.ok else None,
-            waited_s=time.perf_counter() - started,
-            started_at=started_at,
-        )
+        answer, record = self._offload(task, where, budget_s)
         self.last = record
-        for observe in self._observers:
-            try:
-                observe(record)
-            except Exception:
-                log.exception("observer %r failed on task %d", observe, number)
+        self._tell(record)
         if answer.failure is not None:
             raise answer.failure
         if first:
@@ -169,6 +147,37 @@ class Offloader:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _offload(self, task: Task, where: str | None, budget_s: float) -> tuple[Execution, Record]:
+        """Predict, decide, execute, learn, record."""
+        started_at, started = datetime.now(UTC), time.perf_counter()
+        forecast, absent = self._predict(task.kind, task.size)
+        decision = self._decide(task.kind, forecast, absent, where)
+        executions = self._execute(task, decision, forecast, budget_s)
+        answer = _answer(executions)
+        self._learn(task, executions)
+        number = next(self._numbers)
+        record = Record(
+            i=number,
+            id=f"{self._session}-{number}",
+            kind=task.kind.name,
+            size=task.size,
+            sites=forecast.sites,
+            decision=decision,
+            executions=tuple(replace(execution, value=None) for execution in executions),
+            used=answer.site if answer.ok else None,
+            waited_s=time.perf_counter() - started,
+            started_at=started_at,
+        )
+        return answer, record
+
+    def _tell(self, record: Record) -> None:
+        """An observer that fails must not cost the caller its answer."""
+        for observe in self._observers:
+            try:
+                observe(record)
+            except Exception:
+                log.exception("observer %r failed on task %d", observe, record.i)
 
     def _absent(self, kind: Kind) -> dict[str, str]:
         return {site: why for site, runner in self._runners.items() if (why := runner.unavailable(kind))}
