@@ -5,6 +5,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -14,23 +16,52 @@ from robot_client.trace import read
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
 
 ROOT = Path(__file__).parents[2]
+MARK = f"OFFBOARD_TEST_MARK={os.getpid()}"
 
 
 def loadgen(*args: str | Path) -> list[str]:
     return [sys.executable, "-m", "loadgen", *map(str, args)]
 
 
-def session_processes(session: int) -> list[str]:
-    """Command lines of what still runs with this session's mark in its environment."""
-    mark = f"OFFBOARD_TEST_MARK={session}".encode()
-    left = []
+def marked_processes() -> dict[int, str]:
+    """Process id and command line of all that runs with this test's mark in its environment."""
+    left = {}
     for process in Path("/proc").glob("[0-9]*"):
         try:
-            if mark in (process / "environ").read_bytes():
-                left.append((process / "cmdline").read_bytes().replace(b"\0", b" ").decode())
+            if MARK.encode() in (process / "environ").read_bytes():
+                command = (process / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+                left[int(process.name)] = command
         except OSError:
             continue
     return left
+
+
+@contextmanager
+def running_demo(out: Path) -> Iterator[subprocess.Popen[str]]:
+    """`loadgen run demo`, once its first tasks are answered."""
+    name, value = MARK.split("=")
+    host = subprocess.Popen(
+        loadgen("run", "demo", "--out", out),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        env=os.environ | {name: value},
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    assert host.stderr is not None
+    trace, until = out / "trace.jsonl", time.monotonic() + 90
+    try:
+        while not trace.exists() or trace.read_bytes().count(b"\n") < 5:
+            assert host.poll() is None
+            assert time.monotonic() < until, "no task was answered"
+            time.sleep(0.1)
+        yield host
+    finally:
+        host.kill()
+        host.wait()
+        host.stderr.close()
 
 
 def test_a_scenario_is_played_to_its_end(tmp_path: Path) -> None:
@@ -68,25 +99,18 @@ def test_the_same_seed_plays_the_same_tasks(tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_leaves_nothing_behind(tmp_path: Path, number: signal.Signals) -> None:
     """Ctrl-C or SIGTERM half-way: exit code 130 or 143, no process left, every line of the trace whole."""
-    trace = tmp_path / "trace.jsonl"
-    host = subprocess.Popen(
-        loadgen("run", "demo", "--out", tmp_path),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        cwd=ROOT,
-        env=os.environ | {"OFFBOARD_TEST_MARK": str(os.getpid())},
-        start_new_session=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )
-    try:
-        until = time.monotonic() + 90
-        while not trace.exists() or trace.read_bytes().count(b"\n") < 5:
-            assert host.poll() is None
-            assert time.monotonic() < until, "no task was answered"
-            time.sleep(0.1)
+    with running_demo(tmp_path) as host:
         host.send_signal(number)
         assert host.wait(30) == 128 + number
-    finally:
-        host.kill()
-    assert session_processes(os.getpid()) == []
-    assert len(list(read(trace))) >= 5
+    assert marked_processes() == {}
+    assert len(list(read(tmp_path / "trace.jsonl"))) >= 5
+
+
+def test_a_killed_robot_is_a_failed_run(tmp_path: Path) -> None:
+    """Kill -9 of the robot: exit code 1 with one line that says so, no process left."""
+    with running_demo(tmp_path) as host:
+        (robot,) = (pid for pid, command in marked_processes().items() if "robot_client" in command)
+        os.kill(robot, signal.SIGKILL)
+        assert host.wait(30) == 1
+        assert host.stderr.read() == "loadgen run: the robot was ended by signal 9\n"
+    assert marked_processes() == {}
