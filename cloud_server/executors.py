@@ -9,7 +9,7 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from multiprocessing import get_context
@@ -271,7 +271,8 @@ def _all_started(met: "list[Future[int]]", pids: list[int]) -> "Future[None]":
     left = threading.Semaphore(len(met) - 1)
 
     def one_met(future: "Future[int]") -> None:
-        error = future.exception()
+        # Cancelled: the executor was closed before this worker came to it.
+        error = CancelledError("closed") if future.cancelled() else future.exception()
         if error is None:
             pids.append(future.result())
         if left.acquire(blocking=False):

@@ -141,6 +141,7 @@ FILES = {
     "empty.csv": "",
     "open.map": "type octile\nheight 3\nwidth 3\nmap\n...\n...\n...\n",
     "text-link.toml": 'name = "odd"\n[workload]\nmap = "open.map"\n[link]\ndelay_ms = "slow"\n',
+    "open.toml": 'name = "open"\n[workload]\nmap = "open.map"\n',
     "no-map.toml": 'name = "odd"\n[workload]\nmap = "none.yaml"\n',
     "odd.toml": 'name = "odd"\n[workload]\nmap = "m.yaml"\ntask = 3\n',
 }
@@ -184,7 +185,7 @@ FILES = {
         (["cloud_server", "--config", "."], ".: Is a directory"),
         (["loadgen", "run", "none"], "scenario 'none' is neither a file nor one of demo"),
         (["loadgen", "run", "text-link.toml"], "text-link.toml: link.delay-ms: 'slow' is not a number"),
-        (["loadgen", "run", "demo", "--out", "words.txt"], "--out: words.txt cannot be written to"),
+        (["loadgen", "run", "open.toml", "--out", "words.txt"], "--out: words.txt cannot be written to"),
         (["loadgen", "wan", "--delay-ms", "-1"], "--delay-ms: -1"),
         (["loadgen", "wan", "--to", "nowhere"], "--to: 'nowhere' is not HOST:PORT"),
     ],
