@@ -176,7 +176,7 @@ class Offloader:
         for observe in self._observers:
             try:
                 observe(record)
-            except Exception:
+            except Exception:  # an observer is the user's own code
                 log.exception("observer %r failed on task %d", observe, record.i)
 
     def _absent(self, kind: Kind) -> dict[str, str]:
