@@ -10,7 +10,7 @@ PACKAGES := common robot_client cloud_server loadgen
 BENCH_READY := $(VENV)/.bench-ready
 DEV_READY := $(VENV)/.dev-ready
 
-.PHONY: help demo install format lint type test unit integration compose up down table lock wheel clean
+.PHONY: help demo install format lint type test unit integration compose browser torch up down table lock wheel clean
 
 help: ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -42,6 +42,17 @@ integration: $(DEV_READY) ## tests with real sockets and processes
 
 compose: $(DEV_READY) ## tests with real containers; needs a Docker engine
 	$(BIN)/pytest tests/compose
+
+browser: $(DEV_READY) ## tests in a real browser; needs Chromium
+	$(BIN)/pytest tests/browser
+
+# On x86-64 PyPI's PyTorch brings gigabytes of CUDA: there it is left to whoever wants it.
+TORCH := torch==2.13.0
+torch: $(DEV_READY) ## PyTorch for the LSTM, where pip finds a build for the CPU alone
+	@if test "$$(uname -m)" != x86_64 || $(BIN)/python -m pip install --quiet --dry-run --no-deps \
+	  --ignore-installed --report - $(TORCH) 2>/dev/null | grep -q '"url".*cpu'; then \
+	  $(BIN)/python -m pip install --quiet $(TORCH); \
+	else echo "no build of $(TORCH) for the CPU alone: the LSTM's tests will be skipped"; fi
 
 up: ## the three containers, then the robot's table; the server stays up
 	docker compose up --build

@@ -105,14 +105,13 @@ def add_flags(parser: argparse.ArgumentParser, cls: type, prefix: str) -> None:
     parser.epilog = f"Each flag can also be given in the environment, --one-flag as {prefix}_ONE_FLAG."
     for field in _settings(cls):
         help = field.metadata["help"]
-        if field.default is not REQUIRED and field.default not in (None, ()):
+        if field.default is not REQUIRED and not _obvious(field.default):
             help += f" (default: {_shown(field.default)})"
         parser.add_argument(
             f"--{_flag(field)}",
             dest=field.name,
-            metavar=field.metadata["metavar"] or _metavar(field, cls),
             help=help.replace("%", "%%"),
-            **_arity(field, cls),
+            **_shape(field, cls),
         )
 
 
@@ -186,18 +185,19 @@ def _base_type(field: dataclasses.Field[Any], cls: type) -> tuple[type, bool]:
     return hint, False
 
 
-def _metavar(field: dataclasses.Field[Any], cls: type) -> str:
-    if field.metadata["choices"]:
-        return "|".join(field.metadata["choices"])
-    base, _ = _base_type(field, cls)
-    return {int: "K", float: "X", Path: "FILE"}.get(base, "TEXT")
+def _obvious(default: Any) -> bool:
+    """Nothing that --help need say."""
+    return default is None or default is False or default == ()
 
 
-def _arity(field: dataclasses.Field[Any], cls: type) -> dict[str, Any]:
+def _shape(field: dataclasses.Field[Any], cls: type) -> dict[str, Any]:
+    """How a flag is written: --name VALUE, again for each of a list, --name or --no-name for a fact."""
     base, many = _base_type(field, cls)
     if base is bool:
-        return {"nargs": "?", "const": "true"}
-    return {"action": "append"} if many else {}
+        return {"action": argparse.BooleanOptionalAction}
+    metavar = field.metadata["metavar"] or "|".join(field.metadata["choices"] or ())
+    metavar = metavar or {int: "K", float: "X", Path: "FILE"}.get(base, "TEXT")
+    return {"metavar": metavar, "action": "append" if many else "store"}
 
 
 def _convert(where: str, field: dataclasses.Field[Any], cls: type, value: Any) -> Any:

@@ -20,10 +20,18 @@ class RobotConfig:
     )
     site: tuple[str, ...] = setting((), "a further named server; may be given again", metavar="NAME=ENDPOINT")
     policy: str = setting("paper", "where to run", choices=policies.names())
-    predictor: str = setting(predictors.LEAST_SQUARES, "how times are predicted", choices=predictors.names())
+    predictor: str = setting(
+        predictors.LEAST_SQUARES, f"how times are predicted: {predictors.HELP}", metavar="NAME"
+    )
     window: int = setting(WINDOW, "executions remembered for each site", minimum=2, maximum=1_000_000)
     tasks: int = setting(200, "plans to make", minimum=1, maximum=1_000_000)
     measure: int = setting(0, "run the first K of them on both sites", minimum=0)
+    alone: int = setting(
+        0,
+        "then run K further plans onboard alone, in the cloud alone and on both at once; "
+        "their trace is beside --trace",
+        minimum=0,
+    )
     timeout_s: float = setting(
         TIMEOUT_S,
         "seconds to wait for a server before running onboard",
@@ -44,11 +52,20 @@ class RobotConfig:
 
     def __post_init__(self) -> None:
         check(self)
+        predictors.check_name(self.predictor, "--predictor")
         if self.measure > self.tasks:
             raise ConfigError(f"--measure: {self.measure} is above --tasks {self.tasks}")
+        self._check_alone()
         if self.cloud is not None:
             check_endpoint("--cloud", self.cloud)
         self.sites()
+
+    def _check_alone(self) -> None:
+        if self.alone > self.tasks:
+            raise ConfigError(f"--alone: {self.alone} is above --tasks {self.tasks}")
+        for flag, value in (("--trace", self.trace), ("--cloud", self.cloud)):
+            if self.alone and value is None:
+                raise ConfigError(f"--alone: {self.alone} plans cannot be measured without {flag}")
 
     def sites(self) -> dict[str, str]:
         """Endpoint by name of every `--site`."""

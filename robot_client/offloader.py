@@ -17,7 +17,7 @@ from common.tasks import Kind, Task, kind_of
 from common.values import encode
 from robot_client import policies, predictors
 from robot_client.onboard import OnboardRunner
-from robot_client.policies import Decision, Forecast, Outlook, Policy
+from robot_client.policies import PINNED, Decision, Forecast, Outlook, Policy
 from robot_client.predictors import LEAST_SQUARES, Predictor
 from robot_client.runner import CLOUD, ONBOARD, Execution, Runner
 from robot_client.trace import Record
@@ -72,15 +72,19 @@ class Offloader:
         predictor: str = LEAST_SQUARES,
         window: int = WINDOW,
         timeout_s: float = TIMEOUT_S,
+        seed: int = 0,
         observers: Iterable[Callable[[Record], None]] = (),
     ) -> Self:
-        """Onboard, `cloud` at `endpoint` (tcp://HOST:PORT) and any further named `sites`."""
+        """Onboard, `cloud` at `endpoint` (tcp://HOST:PORT) and any further named `sites`.
+
+        `seed` is that of predictors that draw.
+        """
         from robot_client.cloud import CloudRunner  # zmq is loaded only where a socket is opened
 
         servers = ({CLOUD: endpoint} if endpoint else {}) | (sites or {})
 
         def remember() -> Predictor:
-            return predictors.make(predictor, window)
+            return predictors.make(predictor, window, seed)
 
         chosen = policies.make(policy)
         remember()  # a wrong name or window is said now, not at the first task
@@ -214,10 +218,10 @@ class Offloader:
             raise ConfigError(f"where='both': task {kind.name} is declared duplicate=False")
         if where == BOTH:
             both = len(forecast.sites) > 1
-            return Decision(ONBOARD, both, "measured on both" if both else "only onboard was there", "pinned")
+            return Decision(ONBOARD, both, "measured on both" if both else "only onboard was there", PINNED)
         if where not in forecast.sites:
-            return Decision(ONBOARD, False, f"pinned to {where}, which cannot take it", "pinned")
-        return Decision(where, False, "pinned by the caller", "pinned")
+            return Decision(ONBOARD, False, f"pinned to {where}, which cannot take it", PINNED)
+        return Decision(where, False, "pinned by the caller", PINNED)
 
     def _execute(
         self, task: Task, decision: Decision, forecast: Forecast, timeout_s: float
@@ -255,7 +259,7 @@ class _Memory:
         self._failures = 0
 
     def outlook(self, size: float) -> Outlook:
-        prediction = self.predictor.predict(size)
+        prediction = self.predictor.predict(size, self.age + 1)
         return Outlook(
             predicted_s=prediction.seconds if prediction else None,
             spread_s=prediction.spread_s if prediction else None,

@@ -10,6 +10,8 @@ from typing import Protocol
 from common.errors import ConfigError
 from robot_client.runner import CLOUD, ONBOARD
 
+PINNED = "pinned"  # what stands for a policy where the caller said where to run
+
 
 @dataclass(frozen=True, slots=True)
 class Outlook:

@@ -42,9 +42,7 @@ class Window:
     """
 
     def __init__(self, length: int) -> None:
-        if not 2 <= length <= WINDOW_MAX:
-            raise ConfigError(f"window {length}: must be from 2 to {WINDOW_MAX}")
-        self.length = length
+        self.length = checked_length(length)
         self._observations: deque[tuple[float, float]] = deque(maxlen=length)
         self._origin_d = self._origin_t = 0.0
         self._sx = self._sy = self._sxx = self._sxy = self._syy = 0.0
@@ -111,6 +109,13 @@ class Window:
         self._syy = sum(y * y for y in ys)
         self._peak_xx, self._peak_yy = self._sxx, self._syy
         self._appends = 0
+
+
+def checked_length(length: int) -> int:
+    """The length of a window; ConfigError where there is none of it."""
+    if not 2 <= length <= WINDOW_MAX:
+        raise ConfigError(f"window {length}: must be from 2 to {WINDOW_MAX}")
+    return length
 
 
 def _centre(values: list[float]) -> float:

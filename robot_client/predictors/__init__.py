@@ -1,24 +1,66 @@
-"""Predictors by name; one family a file."""
+"""Predictors by name; one family a file, loaded when it is asked for."""
 
-from collections.abc import Callable
+import importlib
+from dataclasses import dataclass
 
 from common.errors import ConfigError
 from robot_client.predictors.base import Prediction, Predictor
-from robot_client.predictors.linear import LeastSquares
 
-__all__ = ["LEAST_SQUARES", "Prediction", "Predictor", "make", "names"]
+__all__ = ["LEAST_SQUARES", "Prediction", "Predictor", "check_name", "make", "names", "slow"]
 
 LEAST_SQUARES = "least-squares"
+RIVER = "river:"
 
-_MAKERS: dict[str, Callable[[int], Predictor]] = {LEAST_SQUARES: LeastSquares}
+
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    """Where a predictor is; `slow`: fitting takes so long that `loadgen table` does so once unless told."""
+
+    module: str
+    name: str
+    slow: bool = False
 
 
-def make(name: str, window: int) -> Predictor:
-    """A fresh predictor that remembers the last `window` executions."""
-    if name not in _MAKERS:
-        raise ConfigError(f"predictor {name!r} is not one of {', '.join(names())}")
-    return _MAKERS[name](window)
+_ENTRIES: dict[str, _Entry] = {
+    LEAST_SQUARES: _Entry("linear", "LeastSquares"),
+    "recursive-least-squares": _Entry("linear", "RecursiveLeastSquares"),
+    "theil-sen": _Entry("robust", "TheilSen"),
+    "huber": _Entry("robust", "Huber"),
+    "random-forest": _Entry("forest", "RandomForest", slow=True),
+    "arima": _Entry("series", "Arima", slow=True),
+    "sarima": _Entry("series", "Sarima", slow=True),
+    "lstm": _Entry("lstm", "Lstm", slow=True),
+}
+HELP = f"{', '.join(_ENTRIES)}, or {RIVER}MODULE.CLASS"  # for --help of whoever takes a name
+
+
+def make(name: str, window: int, seed: int = 0) -> Predictor:
+    """A fresh predictor that remembers the last `window` executions; the same seed gives the same answers.
+
+    MissingExtra where its library is not installed.
+    """
+    check_name(name)
+    if name.startswith(RIVER):
+        from robot_client.predictors.online import River
+
+        return River(name.removeprefix(RIVER), window, seed)
+    entry = _ENTRIES[name]
+    module = importlib.import_module(f"robot_client.predictors.{entry.module}")
+    made: Predictor = getattr(module, entry.name)(window, seed=seed)
+    return made
 
 
 def names() -> tuple[str, ...]:
-    return tuple(_MAKERS)
+    """All but those of river, which has its own."""
+    return tuple(_ENTRIES)
+
+
+def slow(name: str) -> bool:
+    """Whether one fit takes tenths of a second or more."""
+    return name in _ENTRIES and _ENTRIES[name].slow
+
+
+def check_name(name: str, where: str = "predictor") -> None:
+    """ConfigError, naming `where` it stood, unless `make` knows it; nothing is loaded."""
+    if name not in _ENTRIES and not name.startswith(RIVER):
+        raise ConfigError(f"{where}: {name!r} is not one of {HELP}")

@@ -44,9 +44,11 @@ def test_lists_come_with_commas_or_again() -> None:
 
 
 def test_a_switch_needs_no_value() -> None:
-    """--fast alone is true; the environment may say no."""
+    """--fast alone is true; the environment may say so or not, and --no-fast overrules it."""
     assert settings("--fast").fast
     assert not settings(environ={"TOOL_FAST": "no"}).fast
+    assert settings(environ={"TOOL_FAST": "yes"}).fast
+    assert not settings("--no-fast", environ={"TOOL_FAST": "yes"}).fast
 
 
 @pytest.mark.parametrize(
@@ -58,7 +60,7 @@ def test_a_switch_needs_no_value() -> None:
         (["--timeout", "nan"], {}, "--timeout: nan is below 0.1, the least allowed"),
         ([], {"TOOL_TIMEOUT": "soon"}, "TOOL_TIMEOUT: 'soon' is not a number"),
         (["--policy", "papr"], {}, "--policy: 'papr' is not one of paper, cloud"),
-        (["--fast", "maybe"], {}, "--fast: 'maybe' is neither true nor false"),
+        ([], {"TOOL_FAST": "maybe"}, "TOOL_FAST: 'maybe' is neither true nor false"),
     ],
 )
 def test_a_wrong_value_names_its_source_and_what_is_allowed(
@@ -142,6 +144,7 @@ FILES = {
     "open.map": "type octile\nheight 3\nwidth 3\nmap\n...\n...\n...\n",
     "text-link.toml": 'name = "odd"\n[workload]\nmap = "open.map"\n[link]\ndelay_ms = "slow"\n',
     "open.toml": 'name = "open"\n[workload]\nmap = "open.map"\n',
+    "alone.toml": 'name = "alone"\n[workload]\nmap = "open.map"\ntasks = 3\nalone = 4\n',
     "no-map.toml": 'name = "odd"\n[workload]\nmap = "none.yaml"\n',
     "odd.toml": 'name = "odd"\n[workload]\nmap = "m.yaml"\ntask = 3\n',
 }
@@ -170,6 +173,19 @@ FILES = {
             "--cloud: 'tcp:/x' is not tcp://HOST:PORT",
         ),
         (["robot_client", "--map", "m.yaml", "--site", "edge"], "--site: 'edge' is not NAME=tcp://HOST:PORT"),
+        (
+            ["robot_client", "--map", "m.yaml", "--trace", "t", "--alone", "3"],
+            "--alone: 3 plans cannot be measured without --cloud",
+        ),
+        (
+            ["robot_client", "--map", "m.yaml", "--cloud", "tcp://h:1", "--alone", "3"],
+            "--alone: 3 plans cannot be measured without --trace",
+        ),
+        (
+            ["robot_client", "--map", "m.yaml", "--tasks", "3", "--alone", "4"],
+            "--alone: 4 is above --tasks 3",
+        ),
+        (["loadgen", "run", "alone.toml"], "alone.toml: workload.alone: 4 is above workload.tasks 3"),
         (["cloud_server", "--listen", "localhost"], "--listen: 'localhost'"),
         (["cloud_server", "--tasks", "no.such.module"], "'no.such.module' cannot be imported"),
         (["loadgen"], "COMMAND"),
@@ -183,7 +199,7 @@ FILES = {
         (["loadgen", "run", "no-map.toml"], "no-map.toml: workload.map: "),
         (["cloud_server", "--tasks", "json"], "--tasks: json registers no task"),
         (["cloud_server", "--config", "."], ".: Is a directory"),
-        (["loadgen", "run", "none"], "scenario 'none' is neither a file nor one of demo"),
+        (["loadgen", "run", "none"], "scenario 'none' is neither a file nor one of congested, demo, paper"),
         (["loadgen", "run", "text-link.toml"], "text-link.toml: link.delay-ms: 'slow' is not a number"),
         (["loadgen", "run", "open.toml", "--out", "words.txt"], "--out: words.txt cannot be written to"),
         (["loadgen", "wan", "--delay-ms", "-1"], "--delay-ms: -1"),

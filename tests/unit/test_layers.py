@@ -22,6 +22,12 @@ OWNERS = {
     "numba": {"common/compiled.py"},
     "PIL": {"common/maps.py"},
     "yaml": {"common/maps.py"},
+    "matplotlib": {"loadgen/charts.py"},
+    "sklearn": {"robot_client/predictors/forest.py"},
+    "statsmodels": {"robot_client/predictors/series.py"},
+    "threadpoolctl": {"robot_client/predictors/series.py"},
+    "torch": {"robot_client/predictors/lstm.py"},
+    "river": {"robot_client/predictors/online.py"},
 }
 
 
@@ -57,10 +63,11 @@ def test_heavy_libraries_have_one_owner_a_room(library: str) -> None:
 
 
 def test_the_robot_library_needs_no_extra() -> None:
-    """robot_client imports where fastapi, uvicorn, docker, numba, Pillow and yaml are absent."""
+    """robot_client imports where fastapi, docker, numba, Pillow, yaml and what learns are absent."""
     block = (
         "import sys\n"
-        "for name in ('fastapi', 'uvicorn', 'docker', 'numba', 'PIL', 'yaml', 'httpx', 'rich'):\n"
+        "for name in ('fastapi', 'uvicorn', 'docker', 'numba', 'PIL', 'yaml', 'httpx', 'rich',\n"
+        "             'sklearn', 'statsmodels', 'river', 'torch', 'scipy', 'pandas'):\n"
         "    sys.modules[name] = None\n"
         "import robot_client, robot_client.cloud, robot_client.metrics\n"
         "print(robot_client.Offloader.__name__)\n"
@@ -71,7 +78,8 @@ def test_the_robot_library_needs_no_extra() -> None:
 
 @pytest.mark.parametrize("command", ["robot_client", "cloud_server", "loadgen"])
 def test_help_loads_no_heavy_library(command: str) -> None:
-    """--help answers with exit code 0 without importing zmq, numba or fastapi."""
+    """--help answers with exit code 0 without importing zmq, numba, fastapi or what learns."""
+    heavy = ("zmq", "numba", "fastapi", "sklearn", "statsmodels", "river", "torch", "scipy")
     probe = (
         "import runpy, sys\n"
         f"sys.argv = [{command!r}, '--help']\n"
@@ -79,7 +87,7 @@ def test_help_loads_no_heavy_library(command: str) -> None:
         f"    runpy.run_module({command!r}, run_name='__main__')\n"
         "except SystemExit as end:\n"
         "    assert end.code in (0, None), end.code\n"
-        "print([name for name in ('zmq', 'numba', 'fastapi') if name in sys.modules], file=sys.stderr)\n"
+        f"print([name for name in {heavy!r} if name in sys.modules], file=sys.stderr)\n"
     )
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, cwd=ROOT, timeout=30)
     assert done.stderr == "[]\n", done.stderr

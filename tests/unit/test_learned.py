@@ -1,0 +1,368 @@
+"""What the learned predictors add to the contract: exact shortcuts, series, networks and river's names."""
+
+import math
+import random
+import sys
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from common.errors import ConfigError
+from robot_client.predictors import LEAST_SQUARES, Predictor, make
+
+Row = tuple[float, float]  # size, seconds
+
+# Predictor: the fixture that it needs, and the part of its observations after which it is fitted anew.
+REFITTED = {"random-forest": ("forest", 10), "arima": ("series", 4), "lstm": ("torch", 2)}
+
+
+@pytest.fixture
+def forest() -> Any:
+    pytest.importorskip("sklearn", reason="scikit-learn is not installed: `make install`")
+    from robot_client.predictors import forest
+
+    return forest
+
+
+@pytest.fixture
+def series() -> Any:
+    pytest.importorskip("statsmodels", reason="statsmodels is not installed: `make install`")
+    from robot_client.predictors import series
+
+    return series
+
+
+@pytest.fixture
+def torch() -> Any:
+    return pytest.importorskip("torch", reason="torch is not installed: `make torch`")
+
+
+@pytest.fixture
+def online() -> Any:
+    pytest.importorskip("river", reason="river is not installed: `make install`")
+    from robot_client.predictors import online
+
+    return online
+
+
+def rows_of(
+    shape: Callable[[float], float], count: int, noise_s: float, series: Iterable[float] = (), seed: int = 5
+) -> list[Row]:
+    """Sizes from 0 to 5 and their times, with normal noise, or with `series` where given."""
+    rng = random.Random(seed)
+    sizes = [rng.uniform(0, 5) for _ in range(count)]
+    noise = list(series) or [rng.gauss(0, noise_s) for _ in range(count)]
+    return [(size, shape(size) + e) for size, e in zip(sizes, noise, strict=True)]
+
+
+def line(size: float) -> float:
+    return 0.1 + 0.03 * size
+
+
+def bend(size: float) -> float:
+    """Flat up to the middle, a parabola from there."""
+    return 0.1 + 0.03 * max(0.0, size - 2.5) ** 2
+
+
+def taught(name: str, window: int, rows: Iterable[Row], seed: int = 0) -> Predictor:
+    predictor = make(name, window, seed)
+    for row in rows:
+        predictor.learn(*row)
+    return predictor
+
+
+def seconds(predictor: Predictor, size: float, ahead: int = 1) -> float:
+    prediction = predictor.predict(size, ahead)
+    assert prediction is not None
+    return prediction.seconds
+
+
+def error(predictor: Predictor, shape: Callable[[float], float]) -> float:
+    """Mean absolute error inside the sizes of `rows_of`."""
+    sizes = np.linspace(0.2, 4.8, 60).tolist()
+    return float(np.mean([abs(seconds(predictor, size) - shape(size)) for size in sizes]))
+
+
+def error_ahead(name: str, window: int, rows: list[Row]) -> float:
+    """Mean absolute error of the next time, for each row after the first `window`, learnt one by one."""
+    predictor = taught(name, window, rows[:window])
+    errors = []
+    for row in rows[window:]:
+        errors.append(abs(seconds(predictor, row[0]) - row[1]))
+        predictor.learn(*row)
+    return sum(errors) / len(errors)
+
+
+def arma(
+    count: int, phi: float, theta: float, s_phi: float = 0.0, s_theta: float = 0.0, seed: int = 3
+) -> list[float]:
+    """(1 - phi B)(1 - s_phi B^10) r = (1 + theta B)(1 + s_theta B^10) e, with e of 10 ms."""
+    rng = random.Random(seed)
+    e, r = [0.0] * 11, [0.0] * 11
+    for _ in range(count + 200):
+        e.append(rng.gauss(0, 0.01))
+        r.append(
+            phi * r[-1]
+            + s_phi * r[-10]
+            - phi * s_phi * r[-11]
+            + e[-1]
+            + theta * e[-2]
+            + s_theta * e[-11]
+            + theta * s_theta * e[-12]
+        )
+    return r[-count:]
+
+
+@pytest.mark.parametrize("count", [20, 40])
+@pytest.mark.parametrize("name", REFITTED)
+def test_a_fit_lasts_until_its_part_of_new_observations_came(
+    name: str, count: int, request: pytest.FixtureRequest
+) -> None:
+    """While the window fills and when it is full, a fit stands for a fixed part of what it was made on."""
+    library, part = REFITTED[name]
+    request.getfixturevalue(library)
+    predictor = taught(name, 40, [(i % 7, 0.1) for i in range(count)])
+    assert seconds(predictor, 3.0) == pytest.approx(0.1)
+    for _ in range(count // part - 1):
+        predictor.learn(3.0, 10.0)
+        assert seconds(predictor, 3.0) == pytest.approx(0.1)
+    predictor.learn(3.0, 10.0)
+    assert seconds(predictor, 3.0) > 0.2
+
+
+@pytest.mark.parametrize("count", [2, 5, 60, 400])
+def test_the_step_function_is_the_forest(forest: Any, count: int) -> None:
+    """For any size, seen or not, the prediction is that of scikit-learn's forest, to the bit."""
+    rows = [(0.0, 0.1), (1.0, 0.2)] + [(size / 5, time) for size, time in rows_of(bend, count - 2, 0.02)]
+    predictor = taught("random-forest", count, rows, seed=9)
+    x, y = (np.array(column) for column in zip(*rows, strict=True))
+    theirs = forest.RandomForestRegressor(
+        forest.TREES, min_samples_leaf=forest.leaf_min(count), random_state=9
+    ).fit(x[:, np.newaxis], y)
+    seen = np.sort(x)
+    asked = np.concatenate([seen, (seen[1:] + seen[:-1]) / 2, np.linspace(-0.5, 1.5, 500)])
+    ours = [seconds(predictor, size) for size in asked.tolist()]
+    assert ours == theirs.predict(asked[:, np.newaxis]).tolist()
+
+
+@pytest.mark.usefixtures("forest")
+def test_the_forest_takes_any_range_of_sizes() -> None:
+    """Sizes that 32 bits cannot tell apart, or hold, are told apart."""
+    for low, step in ((1e12, 1.0), (0.0, 1e300), (0.0, 1e-300)):
+        predictor = taught("random-forest", 60, [(low + step * i, 0.1 if i < 30 else 0.4) for i in range(60)])
+        assert seconds(predictor, low + 5 * step) == pytest.approx(0.1)
+        assert seconds(predictor, low + 55 * step) == pytest.approx(0.4)
+
+
+@pytest.mark.usefixtures("forest")
+def test_the_spread_of_the_forest_is_that_of_the_noise() -> None:
+    """Out of bag, so noise of 20 ms in 40 observations is not explained away: in sample it would be 16 ms."""
+    found = [
+        taught("random-forest", 40, rows_of(line, 40, 0.02, seed=seed)).predict(2.0) for seed in range(5)
+    ]
+    mean = sum(one.spread_s or 0.0 for one in found if one) / len(found)
+    assert 0.02 < mean < 0.027
+
+
+@pytest.mark.parametrize(
+    ("season", "residuals"),
+    [(0, arma(600, 0.7, 0.3)), (0, arma(600, 0.9, -0.6)), (10, arma(600, 0.5, 0.2, 0.6, -0.3))],
+)
+def test_the_recursion_equals_statsmodels(series: Any, season: int, residuals: list[float]) -> None:
+    """Fitted on 400 residuals and told 200 more, it forecasts as statsmodels does, one and 40 steps on."""
+    values = np.array(residuals)
+    ours, _ = series.fit_series(values[:400], season)
+    scale = values[:400].std()
+    orders = {"order": (1, 0, 1), "seasonal_order": (1, 0, 1, season) if season else (0, 0, 0, 0)}
+    model = series.ARIMA(values[:400] / scale, **orders, trend="n", concentrate_scale=True)
+    with series.BLAS.limit(limits=1, user_api="blas"):
+        theirs = model.fit().append(values[400:] / scale, refit=False)
+    one_ahead = []
+    for value in values[400:].tolist():
+        one_ahead.append(ours.forecast(1))
+        ours.follow(value)
+    assert one_ahead == pytest.approx((theirs.fittedvalues[400:] * scale).tolist(), abs=1e-6 * scale)
+    further = [ours.forecast(ahead) for ahead in range(1, 41)]
+    assert further == pytest.approx((theirs.forecast(40) * scale).tolist(), abs=1e-6 * scale)
+
+
+@pytest.mark.usefixtures("series")
+def test_arima_uses_what_the_residuals_say() -> None:
+    """Where the residuals keep two thirds of their last value, it errs a fifth less than least squares."""
+    rows = rows_of(line, 500, 0.0, series=arma(500, 0.67, 0.0))
+    arima, plain = error_ahead("arima", 200, rows), error_ahead(LEAST_SQUARES, 200, rows)
+    assert arima < 0.8 * plain, (arima, plain)
+    # The best there is knows phi, and errs by the mean absolute value of noise of 10 ms.
+    assert arima < 1.1 * 0.01 * math.sqrt(2 / math.pi), arima
+
+
+@pytest.mark.usefixtures("series")
+def test_sarima_uses_what_a_season_ago_says() -> None:
+    """Where every tenth residual is alike, SARIMA errs less than ARIMA, which does not look so far."""
+    rows = rows_of(line, 300, 0.0, series=arma(300, 0.0, 0.0, 0.8))
+    sarima, arima = error_ahead("sarima", 200, rows), error_ahead("arima", 200, rows)
+    assert sarima < 0.8 * arima, (sarima, arima)
+
+
+@pytest.mark.parametrize("name", ["arima", "sarima"])
+def test_the_forecast_fades_to_the_line(series: Any, name: str) -> None:
+    """The longer ago the last observation, the nearer is the prediction to least squares."""
+    rows = rows_of(line, 200, 0.0, series=[*arma(199, 0.8, 0.0), 0.08])
+    predictor, plain = taught(name, 200, rows), taught(LEAST_SQUARES, 200, rows)
+    apart = [abs(seconds(predictor, 2.0, ahead) - seconds(plain, 2.0)) for ahead in (1, 3, 10, 40, 200)]
+    assert apart == sorted(apart, reverse=True)
+    assert apart[0] > 0.02
+    assert apart[-1] < apart[0] / 100
+    assert seconds(predictor, 2.0, 10**9) == seconds(predictor, 2.0, series.AHEAD_MAX)
+
+
+@pytest.mark.parametrize("name", ["arima", "sarima"])
+def test_without_a_series_the_prediction_is_the_line(series: Any, name: str) -> None:
+    """With too few observations, or residuals that flip for ever, it is least squares."""
+    few = series.Arima.observations_min if name == "arima" else series.Sarima.observations_min
+    rows = rows_of(line, few - 1, 0.0, series=arma(few - 1, 0.8, 0.0, seed=4))
+    flips = [(float(i // 2 % 3), 1.0 + 0.01 * (-1) ** i) for i in range(99)]
+    for known in (rows, flips):
+        predictor, plain = taught(name, 100, known), taught(LEAST_SQUARES, 100, known)
+        for size in (0.0, 2.0, 50.0):
+            assert seconds(predictor, size) == pytest.approx(seconds(plain, size), rel=1e-9)
+    predictor = taught(name, 100, [*rows, (2.0, 0.2)])
+    assert seconds(predictor, 2.0) != pytest.approx(seconds(predictor, 2.0, ahead=series.AHEAD_MAX), rel=1e-3)
+
+
+@pytest.mark.usefixtures("torch")
+@pytest.mark.parametrize(("shape", "gain"), [(line, 0.15), (bend, 0.25)])
+def test_lstm_learns_a_line_and_a_bend(shape: Callable[[float], float], gain: float) -> None:
+    """It errs by a small part of what the mean time does; on a bend also far less than a line."""
+    rows = rows_of(shape, 300, 0.005)
+    lstm = error(taught("lstm", 300, rows), shape)
+    mean = sum(time for _, time in rows) / len(rows)
+    spread = np.mean([abs(shape(size) - mean) for size in np.linspace(0.2, 4.8, 60).tolist()])
+    assert lstm < gain * spread, (lstm, spread)
+    if shape is bend:
+        assert lstm < 0.5 * error(taught(LEAST_SQUARES, 300, rows), shape)
+
+
+@pytest.mark.usefixtures("torch")
+def test_lstm_saturates_beyond_the_sizes_seen() -> None:
+    """Far beyond them the prediction is a constant, not the line that it learnt."""
+    predictor = taught("lstm", 100, rows_of(line, 100, 0.002))
+    far = [seconds(predictor, size) for size in (1e6, 1e9, 1e300)]
+    assert far[0] == pytest.approx(far[1], rel=1e-3)
+    assert far[1] == pytest.approx(far[2], rel=1e-3)
+    assert far[0] < line(30)
+
+
+def test_lstm_answers_by_its_seed_alone(torch: Any) -> None:
+    """Same seed, same answer, whatever torch's own generator did; another seed, another answer."""
+    rows = rows_of(bend, 60, 0.005)
+
+    def answer(seed: int) -> float:
+        torch.rand(3)
+        return seconds(taught("lstm", 60, rows, seed), 3.0)
+
+    assert answer(1) == answer(1)
+    assert answer(1) != answer(2)
+
+
+def test_lstm_leaves_torch_as_it_was(torch: Any) -> None:
+    """Neither the state of torch's generator nor its threads change."""
+    before, threads = torch.get_rng_state(), torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        seconds(taught("lstm", 60, rows_of(line, 60, 0.005)), 3.0)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_lstm_learns_inside_the_inference_of_another(torch: Any) -> None:
+    """A task may itself be a torch model, and the caller in a mode that allows no training."""
+    rows = rows_of(line, 60, 0.005)
+    for mode in (torch.no_grad, torch.inference_mode):
+        with mode():
+            inside = taught("lstm", 60, rows)
+            seconds(inside, 2.0)
+        assert seconds(inside, 2.0) == seconds(taught("lstm", 60, rows), 2.0)
+
+
+def test_every_regressor_of_river_learns_at_any_scale(online: Any) -> None:
+    """Each on offer predicts; 1,024 times longer tasks of 2^-20 of the size are the same to it."""
+    rows = rows_of(line, 60, 0.005)
+    assert {"linear_model.BayesianLinearRegression", "tree.HoeffdingTreeRegressor"} <= set(online.known())
+    for path in online.known():
+        predictor = taught(f"river:{path}", 50, rows, seed=4)
+        scaled = taught(f"river:{path}", 50, [(size / 2**20, 2**10 * time) for size, time in rows], seed=4)
+        assert seconds(scaled, 3 / 2**20) == 2**10 * seconds(predictor, 3.0), path
+        assert 0 < seconds(predictor, 3.0) < 0.4, path
+
+
+@pytest.mark.usefixtures("online")
+def test_a_linear_model_of_river_finds_the_line() -> None:
+    """Bayesian regression is least squares but for its faint prior; its spread is the noise."""
+    rows = rows_of(line, 400, 0.01)
+    predictor = taught("river:linear_model.BayesianLinearRegression", 100, rows)
+    assert error(predictor, line) < 0.002
+    prediction = predictor.predict(1.0)
+    assert prediction is not None
+    assert prediction.spread_s == pytest.approx(0.01, rel=0.2)
+
+
+@pytest.mark.usefixtures("online")
+def test_river_takes_the_seed() -> None:
+    """Where a model draws, the seed decides."""
+    rows = rows_of(line, 60, 0.01)
+    one, same, other = (seconds(taught("river:forest.ARFRegressor", 50, rows, s), 3.0) for s in (1, 1, 2))
+    assert one == same != other
+
+
+@pytest.mark.parametrize("answer", [None, math.nan, math.inf])
+def test_without_an_answer_of_the_model_it_is_the_mean(
+    online: Any, answer: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A model that has no answer, or none that is a number, does not leave the robot without one."""
+
+    class Mute(online.Regressor):  # type: ignore[misc]
+        def learn_one(self, x: object, y: object) -> None: ...
+
+        def predict_one(self, x: object) -> float | None:  # noqa: ARG002
+            return answer
+
+    monkeypatch.setattr(online, "load", lambda *_: Mute())
+    assert seconds(taught("river:mute", 5, [(1.0, 0.1), (2.0, 0.2), (3.0, 0.6)]), 2.0) == pytest.approx(0.3)
+
+
+@pytest.mark.usefixtures("online")
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [
+        ("linear_model.BayesianLinearRegresion", "such as linear_model.BayesianLinearRegression"),
+        ("tree.HoeffdingTree", "such as tree.HoeffdingTreeRegressor"),
+        ("linear_model", "linear_model.PARegressor"),
+        ("linear_model.LogisticRegression", "linear_model.LinearRegression"),
+        ("base.Regressor", "no regressor"),
+        ("ensemble.BaggingRegressor", "cannot be made without model, unlike "),
+        ("facto.FMRegressor", "does not learn one number from another (AttributeError: "),
+        ("tree.ISOUPTreeRegressor", "does not learn one number from another (AttributeError: "),
+        ("", "such as ensemble."),
+        (".", "no regressor"),
+        ("..", "no regressor"),
+        ("os.system", "no regressor"),
+        ("this.s", "no regressor"),
+        ("tree.base.os", "no regressor"),
+        ("linear_model.__builtins__", "no regressor"),
+        ("a\nb.C", "no regressor"),
+    ],
+)
+def test_a_path_that_is_no_regressor_of_river_is_refused(path: str, said: str) -> None:
+    """One line names the path and what there is instead; nothing outside of river is loaded."""
+    with pytest.raises(ConfigError) as refused:
+        make(f"river:{path}", 50)
+    text = str(refused.value)
+    assert text.startswith(f"predictor {f'river:{path}'!r} ")
+    assert said in text
+    assert "\n" not in text
+    assert "this" not in sys.modules

@@ -1,0 +1,112 @@
+"""The predictor contract for every predictor, and the registry."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from common.errors import ConfigError, MissingExtra
+from robot_client import predictors
+from robot_client.predictors import Predictor
+from tests import checks
+
+ROOT = Path(__file__).parents[2]
+BAYES = "river:linear_model.BayesianLinearRegression"
+NAMES = (*predictors.names(), BAYES)
+
+
+# The error on a plain line is below this share of the mean time's; those that do not assume a line err more.
+GAINS = dict.fromkeys(NAMES, 0.05) | {"random-forest": 0.2, "lstm": 0.3}
+EXTRAS = {  # predictor: libraries it cannot do without, and the extra that brings them
+    "random-forest": ("sklearn", "learned"),
+    "arima": ("statsmodels", "learned"),
+    "sarima": ("statsmodels", "learned"),
+    "lstm": ("torch", "lstm"),
+    BAYES: ("river", "river"),
+}
+BASE = tuple(name for name in predictors.names() if name not in EXTRAS)
+HEAVY = ("sklearn", "statsmodels", "river", "torch", "scipy", "pandas")
+
+
+@pytest.fixture(params=NAMES)
+def name(request: pytest.FixtureRequest) -> str:
+    """Each predictor whose library is installed."""
+    name: str = request.param
+    try:
+        predictors.make(name, checks.WINDOW)
+    except MissingExtra as missing:
+        pytest.skip(str(missing))
+    return name
+
+
+@pytest.fixture
+def make(name: str) -> Callable[[], Predictor]:
+    return lambda: predictors.make(name, checks.WINDOW, seed=3)
+
+
+@pytest.mark.parametrize("check", checks.CONTRACT, ids=lambda check: check.__name__)
+def test_contract(check: Callable[[checks.Make], None], make: checks.Make) -> None:
+    """Every check of the contract holds for every predictor."""
+    check(make)
+
+
+def test_a_line_is_learnt(name: str, make: checks.Make) -> None:
+    """Every predictor uses the input size: on a plain line it errs far less than the mean time does."""
+    checks.learns_a_line(make, GAINS[name])
+
+
+def test_an_unknown_name_is_refused_with_all_names() -> None:
+    """A misspelt predictor gets every name there is, and how river's are written."""
+    for refuse in (predictors.check_name, lambda name: predictors.make(name, 50)):
+        with pytest.raises(ConfigError) as refused:
+            refuse("theil-send")
+        for part in ("'theil-send'", *predictors.names(), "river:MODULE.CLASS"):
+            assert part in str(refused.value)
+
+
+@pytest.mark.parametrize("length", [0, 1, 10**9])
+def test_a_window_out_of_bounds_is_refused(name: str, length: int) -> None:
+    """No predictor takes a window shorter than 2 or longer than its limit."""
+    with pytest.raises(ConfigError, match=f"window {length}: "):
+        predictors.make(name, length)
+
+
+@pytest.mark.parametrize(("name", "library", "extra"), [(name, *needs) for name, needs in EXTRAS.items()])
+def test_a_missing_library_names_its_extra(name: str, library: str, extra: str) -> None:
+    """Without its library a predictor cannot be made, and one line says what to install."""
+    said = python(
+        "import sys\n"
+        f"sys.modules[{library!r}] = None\n"
+        "from common.errors import MissingExtra\n"
+        "from robot_client import predictors\n"
+        "try:\n"
+        f"    predictors.make({name!r}, 50)\n"
+        "except MissingExtra as missing:\n"
+        "    print(missing)\n"
+    )
+    assert said.endswith(f"needs the extra '{extra}': pip install 'offboard[{extra}]'\n"), said
+    assert said.count("\n") == 1
+
+
+def test_the_base_predictors_load_no_heavy_library() -> None:
+    """Those that need no extra learn and predict on numpy alone."""
+    said = python(
+        "import sys\n"
+        "from robot_client import predictors\n"
+        f"for name in {BASE!r}:\n"
+        "    predictor = predictors.make(name, 5)\n"
+        "    for i in range(6):\n"
+        "        predictor.learn(i, i * i)\n"
+        "    assert predictor.predict(3.0)\n"
+        f"print([name for name in {HEAVY!r} if name in sys.modules])\n"
+    )
+    assert said == "[]\n"
+
+
+def python(code: str) -> str:
+    """What the code prints, in a process of its own."""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=30)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
