@@ -11,12 +11,12 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Protocol
 
-from common import tasks
+from common import cpu, tasks
 from common.blobs import BlobStore, Buffer, StoredBlob
 from common.errors import CloudBroken, ProtocolError, describe
 from common.values import decode, encode
@@ -31,12 +31,14 @@ Blobs = Mapping[bytes, StoredBlob]
 class Outcome:
     """How a task went: ok, failed, or busy where it could not start; `run_s` is the time in the worker.
 
+    `cpu_s` is the CPU time used meanwhile, by all that shares the quota, or else by the process that ran it.
     `server_fault`: it failed, but not by its own doing.
     """
 
     status: str
     error: str = ""
     run_s: float = 0.0
+    cpu_s: float | None = None
     frames: list[Buffer] = field(default_factory=list)
     server_fault: bool = False
 
@@ -163,16 +165,19 @@ EXECUTORS: dict[str, Callable[[int, Sequence[str], int], Executor]] = {
 
 def run_task(kind_name: str, frames: Sequence[Buffer], blobs: Blobs) -> Outcome:
     """Decode the arguments, call the task, encode its result; whatever it raises becomes the outcome."""
-    started = time.perf_counter()
+    cpu_before_s, started = cpu.used_s(), time.perf_counter()
+    status, failure = "ok", ""
+    result: list[Buffer] = []
     try:
         kind = tasks.kind_named(kind_name)
         args = decode(frames, kind.types, blobs)
         if not isinstance(args, list):
             raise ProtocolError("the body is not a list of arguments")
-        body = encode(kind.function(*args), kind.types)
+        result = encode(kind.function(*args), kind.types).frames
     except BaseException as error:  # noqa: BLE001 - a task may raise anything
-        return Outcome("failed", describe(error), time.perf_counter() - started)
-    return Outcome("ok", "", time.perf_counter() - started, body.frames)
+        status, failure = "failed", describe(error)
+    run_s = time.perf_counter() - started
+    return Outcome(status, failure, run_s, cpu.used_s() - cpu_before_s, result)
 
 
 class _Spool:
@@ -256,10 +261,11 @@ def _meet() -> int:
 def _run_in_worker(kind: str, frames: list[bytes], digests: list[bytes]) -> Outcome:
     assert _worker is not None
     outcome = run_task(kind, frames, {digest: _worker.blob(digest) for digest in digests})
-    return Outcome(outcome.status, outcome.error, outcome.run_s, [bytes(f) for f in outcome.frames])
+    return replace(outcome, frames=[bytes(f) for f in outcome.frames])
 
 
 def _warm_kinds() -> None:
+    cpu.used_s()  # the first call looks for what to read
     for kind in tasks.kinds():
         if kind.warm is not None:
             kind.warm()

@@ -11,6 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
+from dataclasses import replace
 
 import zmq
 
@@ -252,7 +253,7 @@ class Server:
         size = byte_count(outcome.frames)
         if size > self._message_bytes_max:
             error = f"BadValue: the result takes {size} bytes, at most {self._message_bytes_max} are allowed"
-            outcome = Outcome("failed", error, outcome.run_s, server_fault=True)
+            outcome = replace(outcome, status="failed", error=error, frames=[], server_fault=True)
         self.metrics.queue_s.labels(request.kind).observe(work.queue_s)
         self.metrics.run_s.labels(request.kind).observe(outcome.run_s)
         self._count(request, outcome.status)
@@ -268,6 +269,7 @@ class Server:
                     len(self._waiting),
                     server_fault=outcome.server_fault,
                     body=outcome.frames,
+                    cpu_s=outcome.cpu_s,
                 ),
             )
 

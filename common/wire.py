@@ -96,7 +96,9 @@ class Request:
 class Reply:
     """How a request went; `body` is the encoded result, empty unless `status` is ok.
 
-    `server_fault`: it failed, but not by the task's own doing, so another site may well answer.
+    `server_fault`: it failed, but not by the task's own doing, so another site may well answer. `cpu_s` is
+    the CPU time that the server used while the task ran; None, and not sent, where it did not run, or where
+    the server is older than the field.
     """
 
     id: int
@@ -108,6 +110,7 @@ class Reply:
     missing: tuple[bytes, ...] = ()
     server_fault: bool = False
     body: list[Buffer] = field(default_factory=list)
+    cpu_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +147,8 @@ def pack(message: Message) -> list[Buffer]:
     fields = {f.name: getattr(message, f.name) for f in dataclasses.fields(message) if f.name != raw}
     if isinstance(message, Reply):
         fields["error"] = message.error[:ERROR_LENGTH_MAX].encode("utf-8", "replace").decode()
+        if message.cpu_s is None:
+            del fields["cpu_s"]
     header: bytes = msgpack.packb([VERSION, name, fields])
     frames: list[Buffer] = [header]
     if isinstance(message, Request | Reply):
@@ -266,6 +271,7 @@ def _reply(fields: _Fields, rest: list[Buffer]) -> Reply:
         missing=fields.digests("missing"),
         server_fault=fields.flag("server_fault"),
         body=rest,
+        cpu_s=fields.seconds("cpu_s") if "cpu_s" in fields.values else None,
     )
 
 

@@ -29,6 +29,7 @@ class Workload:
     resolution: float = setting(0.025, "metres a cell to plan at", minimum=0.001)
     tasks: int = setting(200, "plans to make", minimum=1)
     measure: int = setting(0, "the first K of them on both sites", minimum=0)
+    alone: int = setting(0, "further plans: each on each site alone, and on both at once", minimum=0)
     obstacles: int = setting(40, "boxes that the map lacks", minimum=0)
     radius_m: float = setting(0.15, "radius of the robot in metres", name="radius", minimum=0.0)
 
@@ -36,6 +37,8 @@ class Workload:
         check(self)
         if self.measure > self.tasks:
             raise ConfigError(f"workload.measure: {self.measure} is above workload.tasks {self.tasks}")
+        if self.alone > self.tasks:
+            raise ConfigError(f"workload.alone: {self.alone} is above workload.tasks {self.tasks}")
 
 
 @dataclass(frozen=True)
@@ -44,12 +47,13 @@ class RobotPart:
 
     cpus: float = setting(0.2, "CPU quota", minimum=CPUS_MIN, maximum=CPUS_MAX)
     policy: str = setting("paper", "where to run", choices=policies.names())
-    predictor: str = setting(predictors.LEAST_SQUARES, "how times are predicted", choices=predictors.names())
+    predictor: str = setting(predictors.LEAST_SQUARES, f"how times are predicted: {predictors.HELP}")
     window: int = setting(50, "executions remembered for each site", minimum=2)
     timeout_s: float = setting(2.0, "seconds to wait for a server", name="timeout", minimum=0.001)
 
     def __post_init__(self) -> None:
         check(self)
+        predictors.check_name(self.predictor, "robot.predictor")
 
 
 @dataclass(frozen=True)
@@ -74,11 +78,14 @@ class Scenario:
     cloud: CloudPart = field(default_factory=CloudPart)
     link: Mapping[str, Any] = field(default_factory=dict)
 
-    def changed(self, *, seed: int | None, tasks: int | None, measure_all: bool) -> "Scenario":
+    def changed(
+        self, *, seed: int | None, tasks: int | None, measure_all: bool, alone: int | None = None
+    ) -> "Scenario":
         """The same with another seed or number of tasks, or every task on both sites."""
         count = self.workload.tasks if tasks is None else tasks
         measure = count if measure_all else min(self.workload.measure, count)
-        workload = replace(self.workload, tasks=count, measure=measure)
+        alone = min(self.workload.alone if alone is None else alone, count)
+        workload = replace(self.workload, tasks=count, measure=measure, alone=alone)
         return replace(self, seed=self.seed if seed is None else seed, workload=workload)
 
 

@@ -4,7 +4,8 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import NoReturn
 
 from common.config import as_dict, load, run_command
@@ -41,32 +42,46 @@ def _drive(config: RobotConfig) -> int:
     from common.planner import plan_path
     from robot_client.drive import Drive, read_prior
     from robot_client.offloader import Offloader
-    from robot_client.trace import Trace
+    from robot_client.trace import Trace, alone_path
 
     prior = read_prior(config.map, config.resolution)
     trace = Trace(config.trace) if config.trace else None
+    alone = Trace(alone_path(config.trace)) if config.trace and config.alone else None
     observers = ([trace.write] if trace else []) + _metrics(config)
+    connect = partial(Offloader.connect, config.cloud, timeout_s=config.timeout_s)
     try:
-        with Offloader.connect(
-            config.cloud,
+        with connect(
             sites=config.sites(),
             policy=config.policy,
             predictor=config.predictor,
             window=config.window,
-            timeout_s=config.timeout_s,
+            seed=config.seed,
             observers=observers,
         ) as offload:
             drive = Drive(config, prior, offload, print)
-            drive.warm()
-            for site, why in offload.wait_for_sites(plan_path, config.connect_s).items():
-                log.warning("starting without %s: %s; tasks run %s", site, why, ONBOARD)
+            with connect(sites=config.sites()) as unseen:
+                absent = unseen.wait_for_sites(plan_path, config.connect_s)
+                drive.warm(unseen)
+            _say_absent("starting", absent or offload.wait_for_sites(plan_path, config.connect_s))
             drive.run()
+        if alone:
+            # An offloader of its own: what the run learnt, wrote and counted is of the run alone.
+            with connect(observers=[alone.write]) as offload:
+                _say_absent("measuring", offload.wait_for_sites(plan_path, config.connect_s))
+                drive.run_alone(offload)
     finally:
-        if trace:
-            trace.close()
-    if trace and trace.lost:
-        raise OffloadError(f"{trace.lost} of {config.tasks} tasks are not in {trace.path}")
+        for file in (trace, alone):
+            if file:
+                file.close()
+    for file in (trace, alone):
+        if file and file.lost:
+            raise OffloadError(f"{file.lost} tasks are not in {file.path}")
     return 0
+
+
+def _say_absent(doing: str, absent: Mapping[str, str]) -> None:
+    for site, why in absent.items():
+        log.warning("%s without %s: %s; tasks run %s", doing, site, why, ONBOARD)
 
 
 def _metrics(config: RobotConfig) -> list[Callable[[Record], None]]:

@@ -274,6 +274,7 @@ class CloudRunner:
             queue_s=reply.queue_s,
             run_s=reply.run_s,
             network_s=max(0.0, seconds - reply.queue_s - reply.run_s),
+            cpu_s=reply.cpu_s,
             bytes_out=pending.bytes_out,
             bytes_in=bytes_in,
             started=reply.status in ("ok", "failed"),

@@ -4,16 +4,19 @@ import statistics
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from random import Random
 
+from common import cpu
 from common.maps import GridMap, read_map, resampled
 from common.planner import plan_path, warm
 from robot_client.config import RobotConfig
 from robot_client.offloader import BOTH, Offloader
 from robot_client.robot import SimulatedRobot
-from robot_client.runner import ONBOARD
+from robot_client.runner import CLOUD, ONBOARD
 from robot_client.trace import Record
 
 PROGRESS_EVERY = 10  # tasks
+WAYS = (ONBOARD, CLOUD, BOTH)  # in which `Drive.run_alone` runs each of its plans
 
 
 class Drive:
@@ -30,10 +33,14 @@ class Drive:
         )
         self._summary = Summary()
 
-    def warm(self) -> None:
-        """Compile the planner and prepare the map before the first measured task."""
+    def warm(self, offload: Offloader) -> None:
+        """Compile the planner and prepare the map on all sites before the first measured task.
+
+        `offload` is not the one of the run, which shall learn and record nothing of this.
+        """
         warm()
-        plan_path(*self._robot.request())
+        cpu.used_s()  # the first call looks for what to read
+        offload(plan_path, *self._robot.request(), where=BOTH)
 
     def run(self) -> None:
         """All plans, and the summary."""
@@ -44,23 +51,49 @@ class Drive:
             record = self._offload.last
             assert record is not None
             self._summary.add(record, planned=plan.status == "NONE")
-            self._progress(number + 1, record)
+            _progress(number + 1, self._config.tasks, record)
         for line in self._summary.lines():
             self._say(line)
 
-    def _progress(self, done: int, record: Record) -> None:
-        if sys.stdout.isatty():
-            print(f"\r\x1b[K{done}/{self._config.tasks} {describe(record)}"[:160], end="", flush=True)
-            if done == self._config.tasks:
-                print()
-        elif done % PROGRESS_EVERY == 0 or done == self._config.tasks:
-            print(f"{done}/{self._config.tasks} {describe(record)}", flush=True)
+    def run_alone(self, offload: Offloader) -> None:
+        """`config.alone` further plans, each run in all WAYS one after the other, in turning order.
+
+        `offload` knows onboard and the cloud, and nobody else.
+        """
+        whole = 0
+        for number, order in enumerate(orders(self._config.alone, self._config.seed)):
+            request, ran = self._robot.request(), 0
+            for n, way in enumerate(order, 1):
+                plan = offload(plan_path, *request, where=way)
+                record = offload.last
+                assert record is not None
+                ran += _ran(record, way)
+                _progress(number * len(WAYS) + n, self._config.alone * len(WAYS), record)
+            self._robot.drive(plan)
+            whole += ran == len(WAYS)
+        missing = f"; the {CLOUD} did not answer for the others" if whole < self._config.alone else ""
+        self._say(
+            f"run on each site alone and on both at once: {whole} of {self._config.alone} plans{missing}"
+        )
 
 
 def read_prior(path: Path, resolution: float) -> GridMap:
     """The map that the robot was given; ROS maps at the planning resolution."""
     grid = read_map(path)
     return grid if path.suffix == ".map" else resampled(grid, resolution)
+
+
+def orders(count: int, seed: int) -> list[tuple[str, ...]]:
+    """The order of WAYS for each of so many plans; in every three each way is first, second and third once.
+
+    Whatever a run leaves behind for the next one, warm caches or a spent quota, meets all ways alike.
+    """
+    random = Random(seed)
+    found: list[tuple[str, ...]] = []
+    while len(found) < count:
+        order = random.sample(WAYS, len(WAYS))
+        found += [(*order[n:], *order[:n]) for n in range(len(WAYS))]
+    return found[:count]
 
 
 def describe(record: Record) -> str:
@@ -70,6 +103,21 @@ def describe(record: Record) -> str:
         for one in record.executions
     )
     return f"size {record.size:.2f} -> {took} ({record.decision.reason})"
+
+
+def _ran(record: Record, way: str) -> bool:
+    """Whether it ran well where it was sent, and nowhere else."""
+    sent = [ONBOARD, CLOUD] if way == BOTH else [way]
+    return sorted(one.site for one in record.executions if one.ok) == sorted(sent)
+
+
+def _progress(done: int, total: int, record: Record) -> None:
+    if sys.stdout.isatty():
+        print(f"\r\x1b[K{done}/{total} {describe(record)}"[:160], end="", flush=True)
+        if done == total:
+            print()
+    elif done % PROGRESS_EVERY == 0 or done == total:
+        print(f"{done}/{total} {describe(record)}", flush=True)
 
 
 class Summary:

@@ -3,6 +3,7 @@
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 
+from common import cpu
 from common.errors import OffloadError, TaskFailed, describe
 from common.tasks import Kind, Task
 from robot_client.runner import ONBOARD, Execution
@@ -30,19 +31,13 @@ class OnboardRunner:
 
 
 def _run(task: Task, published: float) -> Execution:
-    started = time.perf_counter()
+    cpu_before_s, started = cpu.used_s(), time.perf_counter()
+    value, failure = None, None
     try:
         value = task.kind.function(*task.args)
     except BaseException as error:  # noqa: BLE001 - whatever a user's function raises is the task's failure
         failure = TaskFailed(describe(error))
         failure.__cause__ = error
-        return _execution(published, started, failure=failure)
-    return _execution(published, started, value=value)
-
-
-def _execution(
-    published: float, started: float, value: object = None, failure: TaskFailed | None = None
-) -> Execution:
     now = time.perf_counter()
     return Execution(
         ONBOARD,
@@ -52,4 +47,5 @@ def _execution(
         queue_s=started - published,
         run_s=now - started,
         network_s=0.0,
+        cpu_s=cpu.used_s() - cpu_before_s,
     )

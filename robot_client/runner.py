@@ -21,8 +21,9 @@ class Execution:
 
     `seconds` is from publishing the task until its answer was received, or until it was given up; then
     `failure` says why, and `censored` that the true time is longer. `queue_s` and `run_s` are the server's
-    own; `network_s` is the rest. Bytes are those of the messages, without transport headers. `started` is
-    false where the task certainly never ran there.
+    own; `network_s` is the rest. `cpu_s` is the CPU time that whatever ran it used meanwhile: onboard the
+    robot, in the cloud the server, other tasks at the same time included. Bytes are those of the messages,
+    without transport headers. `started` is false where the task certainly never ran there.
     """
 
     site: str
@@ -33,6 +34,7 @@ class Execution:
     queue_s: float | None = None
     run_s: float | None = None
     network_s: float | None = None
+    cpu_s: float | None = None
     bytes_out: int = 0
     bytes_in: int = 0
     started: bool = True

@@ -41,6 +41,7 @@ _EXECUTION_FIELDS = (
     "queue_s",
     "run_s",
     "network_s",
+    "cpu_s",
     "bytes_out",
     "bytes_in",
 )
@@ -107,6 +108,11 @@ class Trace:
         if kept < self.path.stat().st_size:
             log.warning("trace %s: cut off a torn last line", self.path)
             os.truncate(self.path, kept)
+
+
+def alone_path(path: Path) -> Path:
+    """The trace of the plans that `robot-client --alone` measures, beside the trace of the run."""
+    return path.with_name(f"{path.stem}.alone.jsonl")
 
 
 def as_dict(record: Record) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import os
 import time
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,20 @@ def echo(value: object = None) -> object:
 def nap(seconds: float) -> float:
     time.sleep(seconds)
     return seconds
+
+
+@task("burn", size=lambda seconds: seconds)
+def burn(seconds: float) -> list[float]:
+    """Computes until its thread has used so many CPU seconds; those used, and those it waited for a CPU."""
+    start_s, waited_s = time.thread_time(), _waited_s()
+    while (used_s := time.thread_time() - start_s) < seconds:
+        pass
+    return [used_s, _waited_s() - waited_s]
+
+
+def _waited_s() -> float:
+    """How long this thread could have run and did not, by the kernel's count."""
+    return int(Path("/proc/thread-self/schedstat").read_text().split()[1]) / 1e9
 
 
 @task("total", size=lambda numbers: float(len(numbers)))

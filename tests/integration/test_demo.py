@@ -65,7 +65,7 @@ def running_demo(out: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 def test_a_scenario_is_played_to_its_end(tmp_path: Path) -> None:
-    """`loadgen run`: every plan answered, the first ones on both sites, the quota in force, exit 0."""
+    """`loadgen run`: every plan answered on both sites, the map there before, the quota in force, exit 0."""
     done = subprocess.run(
         loadgen("run", "demo", "--tasks", "24", "--measure", "both", "--out", tmp_path),
         capture_output=True,
@@ -80,7 +80,7 @@ def test_a_scenario_is_played_to_its_end(tmp_path: Path) -> None:
     assert [record["i"] for record in records] == list(range(24))
     assert all(record["decision"]["both"] for record in records)
     assert all(one["ok"] for record in records for one in record["executions"])
-    assert sum(one["bytes_out"] > 4_000_000 for record in records for one in record["executions"]) == 1
+    assert all(one["bytes_out"] < 100_000 for record in records for one in record["executions"])
 
 
 def test_the_same_seed_plays_the_same_tasks(tmp_path: Path) -> None:

@@ -195,12 +195,13 @@ def until(condition: Callable[[], bool]) -> None:
 
 @pytest.mark.parametrize("executor", sorted(EXECUTORS))
 def test_a_request_is_answered(serve: Serve, join: Join, executor: str) -> None:
-    """The result comes with the server's own queue and run seconds, whichever executor runs it."""
+    """The result comes with the server's own queue, run and CPU seconds, whichever executor runs it."""
     peer = join(serve(executor).server.endpoint)
     peer.request(7, "served_sum", np.arange(100.0))
     reply = peer.reply()
     assert (reply.id, reply.status, wire.decode(reply.body, [], {})) == (7, "ok", 4950.0)
     assert reply.run_s > 0
+    assert reply.cpu_s > 0
     assert reply.queue_s > 0
     assert reply.queue_depth == 0
 
@@ -214,9 +215,10 @@ def test_faults_of_the_task_are_told(serve: Serve, join: Join, executor: str) ->
     peer_reply = peer.reply()
     assert (peer_reply.id, peer_reply.status) == (1, "failed")
     assert peer_reply.error == "ValueError: no such place"
+    assert peer_reply.cpu_s > 0
     peer.request(2, "never_heard_of")
     reply = peer.reply()
-    assert (reply.id, reply.status) == (2, "unknown_task")
+    assert (reply.id, reply.status, reply.cpu_s) == (2, "unknown_task", None)
     assert running.counted("requests_total", kind="unknown", status="unknown_task") == 1
 
 

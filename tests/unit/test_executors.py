@@ -18,9 +18,11 @@ from cloud_server.executors import EXECUTORS, Executor, Outcome, Processes
 from common.wire import StoredBlob, decode, encode
 
 WAIT_S = 8
+BURNT_S = 0.2
+TOLERANCE_S = 0.05  # the CPU time of whatever else the process does meanwhile
 ROOT = Path(__file__).parents[2]
 MODULE = '''
-import asyncio, os, signal, threading
+import asyncio, os, signal, threading, time
 from common.tasks import task
 
 warmed = []
@@ -66,6 +68,14 @@ def exec_echo(value):
 def exec_wait_for_file(path):
     with open(path) as pipe:  # a named pipe: opening waits for the writer
         return pipe.read()
+
+@task("exec_burn", size=lambda seconds: seconds)
+def exec_burn(seconds):
+    """Computes until its thread has used so many CPU seconds; those it did use."""
+    start = time.thread_time()
+    while (used := time.thread_time() - start) < seconds:
+        pass
+    return used
 
 @task("exec_die", size=lambda: 0)
 def exec_die():
@@ -163,6 +173,20 @@ def test_an_unsound_body_fails_alone(executor: Executor, frames: list[bytes]) ->
     assert not executor.broken
 
 
+def test_the_outcome_says_what_cpu_time_was_used(executor: Executor, tmp_path: Path) -> None:
+    """What the task computed is counted, also where it failed, and hardly anything where it waited."""
+    outcome = run(executor, "exec_burn", BURNT_S)
+    burnt_s, pipe = value(outcome), tmp_path / "pipe"
+    os.mkfifo(pipe)
+    waiting = executor.submit("exec_wait_for_file", encode([str(pipe)]).frames, {})
+    pipe.write_text("go")
+    waited = waiting.result(WAIT_S)
+    failed = run(executor, "exec_raise", "no such place")
+    for name, one, expected_s in [("burn", outcome, burnt_s), ("wait", waited, 0), ("raise", failed, 0)]:
+        assert one.cpu_s == pytest.approx(expected_s, abs=TOLERANCE_S), name
+    assert run(executor, "exec_burn", 0.0).cpu_s > 0
+
+
 def test_every_worker_is_warm_and_tasks_run_side_by_side(executor: Executor, tmp_path: Path) -> None:
     """Two tasks that wait do so at once, and `warm` ran before the first task."""
     pipes = [tmp_path / "a", tmp_path / "b"]
@@ -203,7 +227,8 @@ def test_a_dead_worker_fails_what_ran_and_a_new_pool_works(
     for outcome in (run(executor, "exec_die"), beside.result(WAIT_S)):
         assert (outcome.status, outcome.error) == ("failed", "a worker process died while this task ran")
     assert executor.broken
-    assert run(executor, "exec_echo", 1).status == "busy"
+    busy = run(executor, "exec_echo", 1)
+    assert (busy.status, busy.cpu_s) == ("busy", None)
     executor.warm().result(WAIT_S)
     assert value(run(executor, "exec_sum", np.ones(50_000))) == 50_000
 

@@ -52,6 +52,12 @@ GOLDEN: list[tuple[wire.Message, str]] = [
         "9301a57265706c7988a2696407a6737461747573a26f6ba56572726f72a0a771756575655f73cb3fe0000000000000"
         "a572756e5f73cb3fd0000000000000ab71756575655f646570746803a76d697373696e6790ac7365727665725f6661756c74c2|c0|726177",
     ),
+    (
+        Reply(7, "failed", "why", 0.5, 0.25, 3, (), True, cpu_s=0.125),
+        "9301a57265706c7989a2696407a6737461747573a66661696c6564a56572726f72a3776879a771756575655f73cb3fe0000000000000"
+        "a572756e5f73cb3fd0000000000000ab71756575655f646570746803a76d697373696e6790ac7365727665725f6661756c74c3"
+        "a56370755f73cb3fc0000000000000",
+    ),
     (Ping(1), "9301a470696e6781a2696401"),
     (Pong(1, 2), "9301a4706f6e6782a2696401ab71756575655f646570746802"),
     (Cancel(2**63 - 1), "9301a663616e63656c81a26964cf7fffffffffffffff"),
@@ -86,6 +92,22 @@ def test_version_1_encodes_values_as_these_bytes() -> None:
 def test_unknown_fields_are_ignored() -> None:
     """A later version 1 may add fields."""
     assert wire.unpack([msgpack.packb([1, "ping", {"id": 5, "later": [1, 2]}])]) == Ping(5)
+
+
+def test_a_reply_without_cpu_time_is_as_it_was() -> None:
+    """The field is optional: not sent where there is no figure, None where an older server left it out."""
+    assert b"cpu_s" not in wire.pack(Reply(7, "busy"))[0]
+    reply = wire.unpack([msgpack.packb([1, "reply", REPLY]), b"\xc0"])
+    assert isinstance(reply, Reply)
+    assert reply.cpu_s is None
+
+
+@pytest.mark.parametrize("cpu_s", [-1e-9, float("nan"), float("inf"), 1e7, "1", True, None])
+def test_a_wrong_cpu_time_is_refused(cpu_s: Any) -> None:
+    """Left out or right: any other CPU time is a ProtocolError."""
+    assert wire.unpack([msgpack.packb([1, "reply", REPLY | {"cpu_s": 0}]), b"\xc0"])
+    with pytest.raises(ProtocolError, match=r"reply\.cpu_s"):
+        wire.unpack([msgpack.packb([1, "reply", REPLY | {"cpu_s": cpu_s}]), b"\xc0"])
 
 
 @pytest.mark.parametrize("header", [[2, "ping", {"id": 1}], [0], [2, {"all": "different"}, 1, 2]])
