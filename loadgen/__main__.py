@@ -6,15 +6,18 @@ from argparse import RawDescriptionHelpFormatter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from common.config import CommandParser, add_flags, check, resolve, run_command, setting
+
+C = TypeVar("C")
 
 ENVIRONMENT = "LOADGEN"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
-    listing = "\n".join(f"  {name:<8}{command.__doc__}" for name, command in COMMANDS.items())
+    listing = "\n".join(f"  {name:<9}{command.__doc__}" for name, command in COMMANDS.items())
     parser = CommandParser(
         prog="loadgen",
         usage="loadgen COMMAND ... (loadgen COMMAND --help says more)",
@@ -31,7 +34,9 @@ class RunConfig:
     """How a scenario is played."""
 
     out: Path = setting(Path("out/run"), "folder for the trace and logs", metavar="DIR")
-    testbed: str = setting("local", "where it is played", choices=("local",))
+    testbed: str = setting(
+        "local", "where it is played: processes, or containers", choices=("local", "docker")
+    )
     measure: str = setting(
         "scenario", "run every task on both sites, or as the scenario says", choices=("scenario", "both")
     )
@@ -62,29 +67,73 @@ def _demo(argv: Sequence[str]) -> int:
 def _run(argv: Sequence[str]) -> int:
     """play a scenario and write its trace"""
     parser = CommandParser(prog="loadgen run", description=_run.__doc__)
-    parser.add_argument("scenario", metavar="SCENARIO", help="TOML file, or the name of a shipped one: demo")
+    parser.add_argument(
+        "scenario", metavar="SCENARIO", help="TOML file, or a shipped one: demo, paper, congested"
+    )
     add_flags(parser, RunConfig, ENVIRONMENT)
     flags = parser.parse_args(argv)
     config = resolve(RunConfig, flags, environ=os.environ, prefix=ENVIRONMENT)
-    from loadgen.play import play
+    from loadgen.dataset import PLAYERS
     from loadgen.scenario import find_scenario, read_scenario
 
     scenario = read_scenario(find_scenario(flags.scenario))
     scenario = scenario.changed(seed=config.seed, tasks=config.tasks, measure_all=config.measure == "both")
-    return play(scenario, config.out)
+    return PLAYERS[config.testbed](scenario, config.out)
 
 
 def _table(argv: Sequence[str]) -> int:
     """the paper's Table II, and what it left out, from a trace or CSV"""
     from loadgen.evaluate import TableConfig, run_table
 
-    parser = CommandParser(prog="loadgen table", description=_table.__doc__)
+    return run_table(*_file_and_config("table", _table.__doc__, TableConfig, argv))
+
+
+def _replay(argv: Sequence[str]) -> int:
+    """what each policy would have made of the tasks of a trace or CSV"""
+    from loadgen.replay import ReplayConfig, run_replay
+
+    return run_replay(*_file_and_config("replay", _replay.__doc__, ReplayConfig, argv))
+
+
+def _report(argv: Sequence[str]) -> int:
+    """a run as one HTML page of charts and tables, and the charts as PNGs"""
+    from loadgen.report import ReportConfig, run_report
+
+    parser = CommandParser(prog="loadgen report", description=_report.__doc__)
+    parser.add_argument("run", type=Path, metavar="DIR", help="a run's folder; or a trace or CSV file")
+    add_flags(parser, ReportConfig, ENVIRONMENT)
+    flags = parser.parse_args(argv)
+    return run_report(flags.run, resolve(ReportConfig, flags, environ=os.environ, prefix=ENVIRONMENT))
+
+
+def _dataset(argv: Sequence[str]) -> int:
+    """measure a scenario's plans on both sites: NAME.csv, and how it was measured"""
+    from loadgen.dataset import DatasetConfig, run_dataset
+
+    parser = CommandParser(prog="loadgen dataset", description=_dataset.__doc__)
+    parser.add_argument("scenario", metavar="SCENARIO", help="TOML file, or a shipped one: paper, congested")
+    add_flags(parser, DatasetConfig, ENVIRONMENT)
+    flags = parser.parse_args(argv)
+    config = resolve(DatasetConfig, flags, environ=os.environ, prefix=ENVIRONMENT)
+    return run_dataset(flags.scenario, config, ["loadgen", "dataset", *argv])
+
+
+def _export(argv: Sequence[str]) -> int:
+    """the tasks of a trace that ran on both sites, as a CSV dataset"""
+    from loadgen.dataset import ExportConfig, run_export
+
+    return run_export(*_file_and_config("export", _export.__doc__, ExportConfig, argv))
+
+
+def _file_and_config(name: str, about: str | None, cls: type[C], argv: Sequence[str]) -> tuple[Path, C]:
+    """The arguments of a command that reads one file of measured times."""
+    parser = CommandParser(prog=f"loadgen {name}", description=about)
     parser.add_argument(
         "trace", type=Path, metavar="TRACE", help="trace.jsonl, or CSV size,onboard_s,cloud_s"
     )
-    add_flags(parser, TableConfig, ENVIRONMENT)
+    add_flags(parser, cls, ENVIRONMENT)
     flags = parser.parse_args(argv)
-    return run_table(flags.trace, resolve(TableConfig, flags, environ=os.environ, prefix=ENVIRONMENT))
+    return flags.trace, resolve(cls, flags, environ=os.environ, prefix=ENVIRONMENT)
 
 
 def _wan(argv: Sequence[str]) -> int:
@@ -100,6 +149,10 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "demo": _demo,
     "run": _run,
     "table": _table,
+    "replay": _replay,
+    "report": _report,
+    "dataset": _dataset,
+    "export": _export,
     "wan": _wan,
 }
 

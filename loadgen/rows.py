@@ -3,7 +3,9 @@
 What is computed from them is in `evaluate`.
 """
 
+import contextlib
 import csv
+import io
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,6 +17,7 @@ import numpy.typing as npt
 
 from common.errors import ConfigError, DataError
 from robot_client import trace
+from robot_client.policies import PINNED
 from robot_client.runner import CLOUD, ONBOARD
 
 HEADER = ("size", "onboard_s", "cloud_s")
@@ -32,13 +35,14 @@ Column = npt.NDArray[np.float64]
 class Rows:
     """Three columns of equal length, in the order in which the tasks ran.
 
-    `left_out` counts the tasks without both times.
+    `left_out` counts the tasks without both times; `notes` say, a line each, how the rows were measured.
     """
 
     size: Column
     onboard_s: Column
     cloud_s: Column
     left_out: int = 0
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.size)
@@ -48,13 +52,67 @@ class Rows:
         return Rows(self.size[start:], self.onboard_s[start:], self.cloud_s[start:])
 
 
-def read(path: Path, kind: str | None = None) -> Rows:
-    """Read `path`, a CSV where it is named so, else a trace; `kind` picks one kind of task of a trace."""
-    if path.suffix.lower() != ".csv":
-        return _read_trace(path, kind)
+@dataclass(frozen=True, slots=True)
+class Lived:
+    """The tasks of a trace that ran where the robot's policy chose: what was waited for each, and which went
+    to the cloud."""
+
+    waited_s: Column
+    to_cloud: npt.NDArray[np.bool_]
+
+
+def read(path: Path, kind: str | None = None, *, least: int = 1) -> Rows:
+    """Read `path`, a CSV where it is named so, else a trace; `kind` picks one kind of task of a trace.
+
+    A trace with fewer than `least` rows is a DataError.
+    """
+    if not is_csv(path):
+        return _read_trace(path, kind, least)
     if kind is not None:
         raise ConfigError(f"--kind: {kind!r} is for traces; {path} is a CSV, which holds no kinds")
     return _read_csv(path)
+
+
+def read_lived(path: Path, kind: str | None = None) -> Lived:
+    """The tasks of a trace that were decided; none in a CSV."""
+    lived: list[tuple[float, bool]] = []
+    for line, fields in enumerate(() if is_csv(path) else trace.read(path), 1):
+        decision, where = fields["decision"], f"{path}:{line}"
+        if kind is not None and fields["kind"] != kind:
+            continue
+        try:
+            if not decision["both"] and decision["policy"] != PINNED:
+                lived.append((_number(where, "waited_s", fields["waited_s"]), decision["site"] == CLOUD))
+        except (TypeError, KeyError) as error:
+            raise DataError(f"{where}: decision: {error!r}; it holds site, both, policy") from None
+    return Lived(np.array([s for s, _ in lived]), np.array([cloud for _, cloud in lived], dtype=bool))
+
+
+def write_csv(path: Path, rows: Rows) -> None:
+    """Write a dataset that `read` reads back to the last digit; an existing file is replaced whole or not."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(HEADER)
+    writer.writerows(zip(rows.size.tolist(), rows.onboard_s.tolist(), rows.cloud_s.tolist(), strict=True))
+    write_whole(path, text.getvalue())
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file completely or, where that fails, not at all."""
+    part = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            part.unlink()
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def is_csv(path: Path) -> bool:
+    """Whether a file is a dataset; any other is a trace."""
+    return path.suffix.lower() == ".csv"
 
 
 def _read_csv(path: Path) -> Rows:
@@ -101,7 +159,7 @@ def _csv_row(where: str, header: Sequence[str], places: Sequence[int], cells: Se
     return size, onboard_s, cloud_s
 
 
-def _read_trace(path: Path, kind: str | None) -> Rows:
+def _read_trace(path: Path, kind: str | None, least: int) -> Rows:
     found: list[Row] = []
     first_lines: dict[str, int] = {}  # of each kind
     left_out = 0
@@ -114,7 +172,7 @@ def _read_trace(path: Path, kind: str | None) -> Rows:
             continue
         first_lines.setdefault(str(fields["kind"]), line)
         _add(path, found, row)
-    if not found:
+    if len(found) < least:
         raise DataError(
             f"{path}: no {kind or 'task'} ran well on both sites; measure with "
             "`loadgen run SCENARIO --measure both` or `robot-client --measure K`"
@@ -161,5 +219,5 @@ def _add(path: Path, found: list[Row], row: Row) -> None:
 
 
 def _rows(found: list[Row], left_out: int = 0) -> Rows:
-    size, onboard_s, cloud_s = np.array(found, dtype=np.float64).T.copy()
+    size, onboard_s, cloud_s = np.array(found, dtype=np.float64).reshape(-1, 3).T.copy()
     return Rows(size, onboard_s, cloud_s, left_out)

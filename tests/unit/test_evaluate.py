@@ -6,6 +6,7 @@ import json
 import math
 import random
 import re
+import sys
 from collections.abc import Callable
 from fractions import Fraction
 from functools import cache
@@ -15,7 +16,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from common.errors import ConfigError, DataError
+from common.errors import ConfigError, DataError, MissingExtra
 from loadgen.evaluate import PAPER_WINDOWS, TableConfig, run_table
 
 PAGE = (Path(__file__).parents[2] / "docs" / "evaluation.md").read_text(encoding="utf-8")
@@ -96,15 +97,16 @@ def expected_line(rows: list[Line], label: str, feedback: str) -> list[str]:
     scored = rows[length:]
     count = len(scored)
     cells = [label, *(printed(r) for r in correlations(tuple(rows), len(rows) if split else length))]
-    errors = {}
+    errors, percents = {}, {}
     for side, predicted in ((2, [s.p_cloud for s in steps]), (1, [s.p_onboard for s in steps])):
         true = [row[side] for row in scored]
         mean_t, mean_p = sum(true) / count, sum(predicted) / count
         cells += [printed(mean_t), printed(mean_p), printed(mean_p - mean_t)]
+        percents[side] = f"{100 * (mean_p - mean_t) / mean_t:z.2f}"
         errors[side] = sorted(abs(p - t) for p, t in zip(predicted, true, strict=True))
     rank = math.ceil(Fraction(95, 100) * count)
     right, *rule = rule_cells(scored, [step.cloud for step in steps])
-    cells += [right, str(count)]
+    cells += [right, str(count), percents[2], percents[1]]
     cells += [printed(sum(errors[side]) / count) for side in (2, 1)]
     cells += [printed(errors[side][rank - 1]) for side in (2, 1)]
     return cells + rule
@@ -136,7 +138,7 @@ def constant_line(rows: list[Line], label: str, to_cloud: list[bool]) -> list[st
     mean = [printed(sum(row[side] for row in rows) / len(rows)) for side in (2, 1)]
     right, *rule = rule_cells(rows, to_cloud)
     none = [UNDEFINED, UNDEFINED]
-    return [label, *none, mean[0], *none, mean[1], *none, right, str(len(rows)), *none, *none, *rule]
+    return [label, *none, mean[0], *none, mean[1], *none, right, str(len(rows)), *none, *none, *none, *rule]
 
 
 def expected_table(rows: list[Line], labels: tuple[str, ...], feedback: str) -> list[list[str]]:
@@ -267,8 +269,8 @@ def test_stale_window_shows_in_chosen_only(table: Print) -> None:
     rows = [(1.0 + i % 2, 5.0, 9.0 if i < 2 else 1.0) for i in range(10)]
     chosen, full = (lines_of(table(rows, windows=("2",), feedback=mode))[0] for mode in ("chosen", "full"))
     # Columns: cloud residual, accuracy, regret, cloud share; full first sees a fast cloud after rows 3 and 4.
-    assert [chosen[i] for i in (5, 9, 16, 18)] == ["8.00000", "0.00", "32.00000", "0.00"]
-    assert [full[i] for i in (5, 9, 16, 18)] == ["2.00000", "75.00", "8.00000", "75.00"]
+    assert [chosen[i] for i in (5, 9, 18, 20)] == ["8.00000", "0.00", "32.00000", "0.00"]
+    assert [full[i] for i in (5, 9, 18, 20)] == ["2.00000", "75.00", "8.00000", "75.00"]
 
 
 def test_overestimates_stay_with_chosen_feedback(table: Print) -> None:
@@ -341,7 +343,7 @@ def test_correlation_survives_large_offsets(table: Print, offset: float, step: f
 def test_correlation_in_blocks_is_the_same(table: Print, monkeypatch: pytest.MonkeyPatch) -> None:
     """The bound on memory does not change a figure."""
     whole = table(THOUSAND[:100], windows=("5", "30"))
-    monkeypatch.setattr("loadgen.evaluate.BLOCK_CELLS_MAX", 64)
+    monkeypatch.setattr("loadgen.score.BLOCK_CELLS_MAX", 64)
     assert table(THOUSAND[:100], windows=("5", "30")) == whole
 
 
@@ -349,13 +351,13 @@ def test_tie_of_predictions_stays_onboard(table: Print) -> None:
     """Equal predictions send nothing to the cloud, and do not move its window."""
     rows = [(1.0, 2.0, 2.0)] * 3 + [(1.0, 2.0, 1.0)] * 5
     line = lines_of(table(rows, windows=("3",)))[0]
-    assert (line[4], line[7], line[18]) == ("2.00000", "2.00000", "0.00")
+    assert (line[4], line[7], line[20]) == ("2.00000", "2.00000", "0.00")
 
 
 def test_oracle_of_no_time_has_no_ratio(table: Print) -> None:
     """Where the oracle takes no time at all, time/oracle is undefined and regret is not."""
     lines = lines_of(table([(1.0, 2.0, 0.0), (2.0, 2.0, 0.0), (3.0, 0.0, 2.0)], windows=()))
-    assert [line[15:17] for line in lines] == [
+    assert [line[17:19] for line in lines] == [
         [UNDEFINED, cell] for cell in ("4.00000", "2.00000", "0.00000")
     ]
 
@@ -395,3 +397,53 @@ def test_bad_file_prints_nothing(table: Print, capsys: pytest.CaptureFixture[str
     with pytest.raises(DataError, match=r"bad\.csv:3: cloud_s: 'slow' is not a finite number"):
         table("size,onboard_s,cloud_s\n1,2,3\n1,2,slow\n", name="bad.csv")
     assert capsys.readouterr().out == ""
+
+
+def test_several_predictors_share_a_table(table: Print) -> None:
+    """A column names the predictor; the rules that predict nothing come once, at the end."""
+    names = ("least-squares", "theil-sen")
+    lines = lines_of(table(TWELVE, windows=("3", "full"), predictors=names))
+    assert [tuple(line[:2]) for line in lines] == [
+        *((name, window) for name in names for window in ("3", "full")),
+        *(("", rule) for rule in ("always-onboard", "always-cloud", "oracle")),
+    ]
+    alone = lines_of(table(TWELVE, windows=("3", "full")))
+    assert [line[1:] for line in lines[:2]] == alone[:2]
+
+
+def test_slow_predictors_are_fitted_once_unless_told(table: Print) -> None:
+    """The forest has a line for full only, the same in both modes; --every-window gives it every N."""
+    rows, settings = THOUSAND[:60], {"windows": ("50", "full"), "predictors": ("random-forest",)}
+    out = json.loads(table(rows, feedback="both", format="json", **settings))
+    chosen, full = (one["scores"] for one in out["tables"])
+    assert [score["window"] for score in chosen[:2]] == ["full", "always-onboard"]
+    assert chosen[0] == full[0]
+    every = lines_of(table(rows, every_window=True, **settings))
+    assert [line[0] for line in every[:2]] == ["50", "full"]
+
+
+def test_a_missing_library_is_named(table: Print, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Asked for by name it is an error that names the extra; among all it has a line that does."""
+    monkeypatch.setitem(sys.modules, "sklearn", None)
+    monkeypatch.setitem(sys.modules, "sklearn.ensemble", None)
+    monkeypatch.delitem(sys.modules, "robot_client.predictors.forest", raising=False)
+    with pytest.raises(MissingExtra, match=r"random-forest needs the extra 'learned'"):
+        table(TWELVE, windows=("full",), predictors=("random-forest",))
+    monkeypatch.setattr("robot_client.predictors.names", lambda: ("least-squares", "random-forest"))
+    lines = lines_of(table(TWELVE, windows=("full",), predictors=("all",)))
+    assert lines[0][:2] == ["least-squares", "full"]
+    assert lines[1][0].startswith("random-forest: predictor random-forest needs the extra 'learned'")
+
+
+def test_intervals_hold_their_figures(table: Print) -> None:
+    """--bootstrap: two lines under each, and each figure lies between them, whatever the blocks."""
+    out = json.loads(table(THOUSAND, windows=("50",), bootstrap=True, format="json"))
+    line, low, high = out["tables"][0]["scores"][:3]
+    assert [one["bound"] for one in (line, low, high)] == ["", "2.5 %", "97.5 %"]
+    figures = [name for name, value in line.items() if isinstance(value, float)]
+    assert len(figures) == 19
+    for name in figures:
+        assert low[name] < line[name] < high[name], name
+    assert lines_of(table(THOUSAND, windows=("50",), bootstrap=True))[1][:2] == ["50", "2.5 %"]
+    wider = json.loads(table(THOUSAND, windows=("50",), bootstrap=True, block=100, format="json"))
+    assert wider["tables"][0]["scores"][0] == line

@@ -4,19 +4,28 @@ import csv
 import io
 import json
 import re
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 
 import pytest
 
-from loadgen.render import FORMATS, Score, Table, render
+from loadgen.render import FORMATS, Table, render
+from loadgen.score import HEADINGS, Score
 
 SCORE = Score(
-    "50", 0.302734, 0.70641, 0.14025, 0.14061, 0.00036, 0.17554, 0.18027, -0.00473, 78.8, 950,
-    0.02, 0.03, 0.05, 0.06, 1.25, 12.5, 0.0131579, 55.5,
+    "least-squares", "50", "", 0.302734, 0.70641, 0.14025, 0.14061, 0.00036, 0.17554, 0.18027, -0.00473,
+    78.8, 950, 0.25, -2.7, 0.02, 0.03, 0.05, 0.06, 1.25, 12.5, 0.0131579, 55.5,
 )  # fmt: skip
-NO_FIGURES = Score("500", note="not enough rows")
-TABLE = Table("my_trace 50%.jsonl", 1000, 3, "chosen", "least-squares", (SCORE, NO_FIGURES))
-COLUMNS = 19
+NO_FIGURES = Score("least-squares", "500", note="not enough rows")
+SHOWN = {name: heading for name, heading in HEADINGS.items() if name not in ("predictor", "bound")}
+COLUMNS = len(SHOWN)
+
+
+def table_of(*scores: Score) -> Table:
+    about = {"source": "my_trace 50%.jsonl", "rows": 1000, "left_out": 3, "feedback": "chosen"}
+    return Table("my_trace 50%.jsonl: 1000 rows, feedback chosen.", about, SHOWN, scores, ("A note.",))
+
+
+TABLE = table_of(SCORE, NO_FIGURES)
 
 
 def cells(line: str) -> list[str]:
@@ -24,22 +33,18 @@ def cells(line: str) -> list[str]:
 
 
 def test_markdown_has_all_columns_in_every_line() -> None:
-    """Caption, heading, rule and one line a score, each with the same number of columns."""
-    caption, blank, *lines = render([TABLE], "md").splitlines()
-    assert caption == (
-        "my_trace 50%.jsonl: 1000 rows (3 tasks without both times left out), "
-        "predictor least-squares, feedback chosen."
-    )
-    assert blank == ""
+    """Caption, notes, heading, rule and one line a score, each with the same number of columns."""
+    caption, note, blank, *lines = render([TABLE], "md").splitlines()
+    assert (caption, note, blank) == ("my_trace 50%.jsonl: 1000 rows, feedback chosen.", "A note.", "")
     assert [len(cells(line)) for line in lines] == [COLUMNS] * 4
     assert cells(lines[2])[:5] == ["50", "0.30273", "0.70641", "0.14025", "0.14061"]
     assert cells(lines[2])[8:11] == ["-0.00473", "78.80", "950"]
-    assert cells(lines[3]) == ["500: not enough rows", *["–"] * 9, "0", *["–"] * 8]  # noqa: RUF001
+    assert cells(lines[3]) == ["500: not enough rows", *["–"] * 9, "0", *["–"] * 10]  # noqa: RUF001
 
 
 def test_rounding_to_nothing_has_no_sign() -> None:
     """A residual of -1e-9 is printed as 0.00000."""
-    table = Table("t", 9, 0, "full", "least-squares", (Score("5", cloud_residual_s=-1e-9),))
+    table = table_of(Score("least-squares", "5", cloud_residual_s=-1e-9))
     assert cells(render([table], "md").splitlines()[-1])[5] == "0.00000"
 
 
@@ -58,7 +63,7 @@ def test_csv_parses_back_to_full_precision() -> None:
 def test_json_parses_back_to_the_tables() -> None:
     """JSON holds exactly the tables, with null for what is undefined."""
     parsed = json.loads(render([TABLE, TABLE], "json"))
-    expected = {**asdict(TABLE), "scores": [asdict(SCORE), asdict(NO_FIGURES)]}
+    expected = {**TABLE.about, "notes": ["A note."], "scores": [asdict(SCORE), asdict(NO_FIGURES)]}
     assert parsed == {"tables": [expected, expected]}
     assert parsed["tables"][0]["scores"][1]["r_cloud"] is None
 
@@ -82,7 +87,7 @@ def test_latex_has_a_row_for_every_score_and_escapes_text() -> None:
 @pytest.mark.parametrize("format", FORMATS)
 def test_every_format_holds_every_table(format: str) -> None:
     """Two tables in, two feedback modes named in the output."""
-    full = Table("t", 9, 0, "full", "least-squares", (SCORE,))
+    full = replace(TABLE, caption="t, feedback full.", about=dict(TABLE.about) | {"feedback": "full"})
     text = render([TABLE, full], format)
     assert "chosen" in text
     assert "full" in text

@@ -1,0 +1,195 @@
+"""`loadgen report`, opened in a real browser."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page
+
+from loadgen.evaluate import PAPER_WINDOWS
+from tests.browser.conftest import Opened
+
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(120)]
+
+Open = Callable[..., Opened]
+
+CHARTS = ("times", "decisions", "errors", "accuracy", "ecdf")
+PHONE, DESKTOP = {"width": 360, "height": 740}, {"width": 1280, "height": 800}
+LETTERS_PX = 7.5  # least height of a chart's letters on a phone
+CONTRAST = 4.5  # WCAG 2.2, level AA, for text
+
+# Marks with a name: how many are there, and how many of them can be seen inside their chart.
+MARKS = """() => Object.fromEntries([...document.querySelectorAll('.chart svg g[id]')].map(group => {
+  const chart = group.ownerSVGElement.getBoundingClientRect();
+  const marks = [...group.querySelectorAll('use, path')].filter(mark => !mark.closest('defs'));
+  const seen = marks.filter(mark => {
+    const box = mark.getBoundingClientRect(), style = getComputedStyle(mark);
+    return Math.max(box.width, box.height) > 0.5 && style.visibility === 'visible'
+      && (style.fill !== 'none' || style.stroke !== 'none')
+      && box.left >= chart.left - 1 && box.right <= chart.right + 1
+      && box.top >= chart.top - 1 && box.bottom <= chart.bottom + 1;
+  });
+  return [group.id, [marks.length, seen.length]];
+}))"""
+
+# The least contrast of any text of the page with what lies behind it: [ratio, element].
+LEAST_CONTRAST = """() => {
+  const parse = text => (text.match(/[\\d.]+/g) || []).map(Number);
+  const luminance = ([r, g, b]) => [r, g, b].map(v => v / 255)
+    .map(v => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
+    .reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
+  const behind = element => {
+    for (; element; element = element.parentElement) {
+      const colour = parse(getComputedStyle(element).backgroundColor);
+      if (colour.length === 3 || colour[3] === 1) return colour;
+    }
+    return [255, 255, 255];
+  };
+  const texts = [...document.querySelectorAll('body *')].filter(element =>
+    !['title', 'style'].includes(element.tagName) && [...element.childNodes].some(
+      node => node.nodeType === Node.TEXT_NODE && node.textContent.trim()));
+  return texts.map(element => {
+    const style = getComputedStyle(element);
+    const colour = parse(element.tagName === 'text' ? style.fill : style.color);
+    const [a, b] = [colour, behind(element)].map(luminance);
+    return [(Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05), element.outerHTML.slice(0, 80)];
+  }).sort((one, other) => one[0] - other[0])[0];
+}"""
+
+# The least height of the letters in the charts, in pixels of the screen.
+LEAST_LETTERS = """() => Math.min(...[...document.querySelectorAll('.chart text')].map(text =>
+  parseFloat(getComputedStyle(text).fontSize) * text.getScreenCTM().a || Infinity))"""
+
+
+def all_seen(page: Page) -> dict[str, int]:
+    """The number of marks of each named series, every one of which can be seen."""
+    found: dict[str, list[int]] = page.evaluate(MARKS)
+    hidden = {name: counts for name, counts in found.items() if counts[0] != counts[1]}
+    assert hidden == {}, "series: marks, of which can be seen"
+    return {name: seen for name, (_, seen) in found.items()}
+
+
+def body_rows(page: Page) -> list[int]:
+    """Rows of each table's body."""
+    return [section.locator("tbody tr").count() for section in page.locator("section").all()]
+
+
+def test_opened_from_the_disk_it_asks_for_nothing(opened: Open, dataset_report: Path) -> None:
+    """The page is the only request; the console stays silent; no script and no picture is in it."""
+    report = opened(dataset_report.as_uri())
+    assert report.requests == [dataset_report.as_uri()]
+    assert report.complaints == []
+    assert report.page.locator("script, img, iframe, object, link[href]:not([href='data:,'])").count() == 0
+    assert report.page.title() == f"Report on {dataset_report.parent / 'rows.csv'}"
+
+
+def test_served_it_asks_for_nothing_else(opened: Open, served: tuple[str, list[str]]) -> None:
+    """Over HTTP the server sees one request, the page."""
+    address, asked = served
+    report = opened(address)
+    assert report.requests == [address]
+    assert asked == ["/report.html"]
+    assert report.complaints == []
+
+
+def test_its_policy_refuses_everything_from_outside(
+    opened: Open, dataset_report: Path, tmp_path: Path
+) -> None:
+    """A picture and a script that somebody puts into the page are refused, and the browser says so."""
+    text = dataset_report.read_text(encoding="utf-8")
+    spoilt = tmp_path / "spoilt.html"
+    outside = '<img src="http://127.0.0.1:9/x.png"><script>document.title = "run"</script></main>'
+    spoilt.write_text(text.replace("</main>", outside), encoding="utf-8")
+    report = opened(spoilt.as_uri())
+    assert [message.count("Content Security Policy") > 0 for message in report.complaints] == [True, True]
+    assert report.page.title() != "run"
+
+
+def test_every_chart_of_a_dataset_has_its_marks(opened: Open, dataset_report: Path) -> None:
+    """300 rows: two marks a row against d, 250 decisions, and every line, band and crossing can be seen."""
+    page = opened(dataset_report.as_uri(), viewport=DESKTOP).page
+    assert [figure.get_attribute("id") for figure in page.locator("figure").all()] == list(CHARTS)
+    seen = all_seen(page)
+    assert (seen["times-points-onboard"], seen["times-points-cloud"]) == (300, 300)
+    assert seen["decisions-chosen-onboard"] + seen["decisions-chosen-cloud"] == 250
+    # A line, and a marker for each N: 500 of the paper's is more than the rows.
+    windows = len(PAPER_WINDOWS) - 1
+    for name in ("errors-mae-onboard-0", "errors-residual-cloud-1", "accuracy-accuracy-1"):
+        assert seen[name] == 1 + windows, name
+    assert seen["accuracy-accuracy-printed"] == 1 + len(PAPER_WINDOWS)
+    single = (
+        *("times-line-onboard", "times-line-cloud", "times-crossing", "decisions-share"),
+        *("decisions-share-oracle", "accuracy-interval", "accuracy-interval-full"),
+        *("accuracy-accuracy-always-onboard", "accuracy-accuracy-always-cloud", "accuracy-accuracy-oracle"),
+        *("ecdf-ecdf-paper", "ecdf-ecdf-onboard", "ecdf-ecdf-cloud", "ecdf-ecdf-oracle"),
+    )
+    assert {name: seen.get(name) for name in single} == dict.fromkeys(single, 1)
+
+
+def test_every_chart_of_a_run_has_its_marks(opened: Open, run_folder_report: Path) -> None:
+    """60 measured and 40 decided tasks: the decisions are those recorded, and have a distribution."""
+    seen = all_seen(opened(run_folder_report.as_uri(), viewport=DESKTOP).page)
+    assert (seen["times-points-onboard"], seen["times-points-cloud"]) == (60, 60)
+    assert (seen["decisions-chosen-onboard"], seen["decisions-chosen-cloud"]) == (20, 20)
+    assert "decisions-share-oracle" not in seen
+    assert (seen["ecdf-ecdf-as-recorded"], seen["ecdf-ecdf-paper"]) == (1, 1)
+
+
+@pytest.mark.parametrize("viewport", [PHONE, DESKTOP], ids=["phone", "desktop"])
+def test_it_fits_the_screen(opened: Open, dataset_report: Path, viewport: Any) -> None:
+    """Nothing hangs over the edge of the page; charts fill their cards; their letters can be read."""
+    page = opened(dataset_report.as_uri(), viewport=viewport).page
+    assert page.evaluate("document.documentElement.scrollWidth") <= viewport["width"]
+    for name in CHARTS:
+        chart, card = (page.locator(f"#{name}{part}").bounding_box() for part in (" svg", ""))
+        assert chart is not None
+        assert card is not None
+        assert 0.85 * card["width"] < chart["width"] < card["width"]
+        assert card["x"] + card["width"] <= viewport["width"]
+    assert page.evaluate(LEAST_LETTERS) >= LETTERS_PX
+    all_seen(page)
+
+
+def test_tables_have_their_rows_and_scroll_by_keyboard(opened: Open, dataset_report: Path) -> None:
+    """Replay, Table II twice, the paper's; a table wider than a phone is moved with the arrow keys."""
+    page = opened(dataset_report.as_uri(), viewport=PHONE).page
+    table = 2 * len(PAPER_WINDOWS) + 3  # two predictors, three rules
+    assert body_rows(page) == [4, table, table, len(PAPER_WINDOWS)]
+    wide = page.locator("#table-2 .scroll")
+    wide.focus()
+    page.keyboard.press("ArrowRight")
+    page.wait_for_function("document.querySelector('#table-2 .scroll').scrollLeft > 0")
+    first = wide.locator("tbody th").first.bounding_box()
+    frame = wide.bounding_box()
+    assert first is not None
+    assert frame is not None
+    assert first["x"] == frame["x"], "the first column stays where it is"
+
+
+def test_a_run_has_a_line_for_what_was_recorded(opened: Open, run_folder_report: Path) -> None:
+    """The replay table of a run begins with the run itself."""
+    page = opened(run_folder_report.as_uri()).page
+    assert page.locator("#table-1 tbody th").all_inner_texts() == [
+        *("as recorded", "paper", "onboard", "cloud", "oracle")
+    ]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_text_stands_out(opened: Open, dataset_report: Path, scheme: str) -> None:
+    """Every text, in the charts too, has the contrast of WCAG AA; a dark screen gets a dark page."""
+    page = opened(dataset_report.as_uri(), color_scheme=scheme).page
+    ratio, element = page.evaluate(LEAST_CONTRAST)
+    assert ratio >= CONTRAST, element
+    dark = page.evaluate("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).every(v => v < 64)")
+    assert dark == (scheme == "dark")
+
+
+def test_charts_are_named_for_those_who_do_not_see_them(opened: Open, dataset_report: Path) -> None:
+    """The page has a language and one main heading; each chart is a picture with a name."""
+    page = opened(dataset_report.as_uri()).page
+    assert page.locator("html").get_attribute("lang") == "en"
+    assert page.locator("h1").count() == 1
+    for figure in page.locator("figure").all():
+        title = figure.locator("h2").inner_text()
+        assert figure.get_by_role("img", name=title, exact=True).count() == 1

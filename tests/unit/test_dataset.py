@@ -1,0 +1,113 @@
+"""Datasets: what is written beside the rows, what is read back, and what the containers are told."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from common.config import load
+from common.errors import ConfigError, DataError
+from loadgen.compose import _overlay
+from loadgen.dataset import DatasetConfig, ExportConfig, run_dataset, run_export
+from loadgen.evaluate import TableConfig, table_text
+from loadgen.notes import notes
+from loadgen.rows import read
+from loadgen.scenario import read_scenario
+from loadgen.wan import WanConfig
+from robot_client.config import RobotConfig
+from robot_client.policies import Decision
+from robot_client.runner import Execution
+from robot_client.trace import Record, Trace
+
+ROOT = Path(__file__).parents[2]
+CSV = "size,onboard_s,cloud_s\n1,0.1,0.2\n2,0.2,0.1\n3,0.3,0.1\n"
+
+
+def test_export_writes_what_read_reads(tmp_path: Path) -> None:
+    """The rows come back to the last digit; a task without both times is left out."""
+    trace = Trace(tmp_path / "trace.jsonl")
+    for i in range(5):
+        sites = {"onboard": 0.1 + i / 3, "cloud": 0.2 + i / 7} if i != 2 else {"onboard": 0.1}
+        executions = tuple(Execution(site, seconds) for site, seconds in sites.items())
+        decision = Decision("onboard", len(sites) > 1, "", "pinned")
+        trace.write(Record(i, str(i), "plan", i / 9, {}, decision, executions, "onboard", 0.1))
+    trace.close()
+    out = tmp_path / "new" / "d.csv"
+    assert run_export(trace.path, ExportConfig(csv=out)) == 0
+    written, known = read(out), read(trace.path)
+    assert len(written) == 4
+    assert out.read_text().splitlines()[0] == "size,onboard_s,cloud_s"
+    for name in ("size", "onboard_s", "cloud_s"):
+        np.testing.assert_array_equal(getattr(written, name), getattr(known, name))
+
+
+def test_export_that_cannot_write_leaves_the_old_file(tmp_path: Path) -> None:
+    """One line names the file; nothing is half written."""
+    (tmp_path / "d.csv").write_text(CSV)
+    (tmp_path / "folder.csv").mkdir()
+    with pytest.raises(ConfigError, match=r"folder\.csv: cannot be written: Is a directory"):
+        run_export(tmp_path / "d.csv", ExportConfig(csv=tmp_path / "folder.csv"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["d.csv", "folder.csv"]
+
+
+def test_notes_are_printed_with_the_table(tmp_path: Path) -> None:
+    """What NAME.json says of the measurement stands under the caption of every table of NAME.csv."""
+    (tmp_path / "d.csv").write_text(CSV)
+    (tmp_path / "d.json").write_text(json.dumps({"notes": ["Robot 0.2 CPU.", "Ratio 1.02."]}))
+    lines = table_text(tmp_path / "d.csv", TableConfig(windows=("2",))).splitlines()
+    assert lines[1:3] == ["Robot 0.2 CPU.", "Ratio 1.02."]
+    (table,) = json.loads(table_text(tmp_path / "d.csv", TableConfig(windows=("2",), format="json")))[
+        "tables"
+    ]
+    assert table["notes"] == ["Robot 0.2 CPU.", "Ratio 1.02."]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("{", r"d\.json: holds no notes: Expecting property name"),
+        ("[]", r"d\.json: holds no notes: list indices"),
+        ("{}", r"d\.json: holds no notes: 'notes'"),
+        ('{"notes": "x"}', r"d\.json: notes: not a list of lines"),
+        ('{"notes": [1]}', r"d\.json: notes: not a list of lines"),
+    ],
+)
+def test_notes_of_somebody_else_are_named(tmp_path: Path, text: str, expected: str) -> None:
+    """A NAME.json that `loadgen dataset` did not write is one DataError."""
+    (tmp_path / "d.json").write_text(text)
+    with pytest.raises(DataError, match=expected):
+        notes(tmp_path / "d.csv")
+
+
+@pytest.mark.parametrize("name", ["demo", "paper", "congested"])
+def test_containers_are_told_the_scenario(name: str) -> None:
+    """The commands laid over docker-compose.yml are good ones, and carry the scenario's values."""
+    scenario = read_scenario(ROOT / "loadgen" / "scenarios" / f"{name}.toml")
+    services = _overlay(scenario)["services"]
+    environ: dict[str, str] = {}
+    robot = load(
+        RobotConfig, services["robot"]["command"], prog="", description="", environ=environ, prefix="ROBOT"
+    )
+    assert (robot.tasks, robot.seed, robot.alone) == (
+        scenario.workload.tasks,
+        scenario.seed,
+        scenario.workload.alone,
+    )
+    assert str(robot.map) == "/maps/willow-full-0.05.yaml"
+    assert services["robot"]["volumes"] == [f"{scenario.workload.map.parent}:/maps:ro"]
+    assert services["robot"]["cpu_quota"] == 2000
+    wan = load(
+        WanConfig, services["wan"]["command"][1:], prog="", description="", environ=environ, prefix="WAN"
+    )
+    assert wan.delay_ms == scenario.link["delay_ms"]
+    assert wan.distribution == scenario.link.get("distribution", "normal")
+    assert wan.seed == scenario.seed
+
+
+def test_containers_need_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Elsewhere one line says what is missing, before anything is written."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=r"--testbed: docker needs docker-compose\.yml of a checkout"):
+        run_dataset("paper", DatasetConfig(), ["loadgen", "dataset", "paper"])
+    assert not list(tmp_path.iterdir())
