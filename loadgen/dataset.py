@@ -46,7 +46,7 @@ def run_dataset(name: str, config: DatasetConfig, command: Sequence[str]) -> int
     scenario = read_scenario(find_scenario(name))
     scenario = scenario.changed(seed=config.seed, tasks=config.rows, measure_all=True, alone=config.alone)
     run = config.run / scenario.name
-    started_at = datetime.now(UTC)
+    started_at, commit = datetime.now(UTC), _commit()
     code = PLAYERS[config.testbed](scenario, run)
     if code != 0:
         raise OffloadError(f"the robot ended with exit code {code}; what it did is in {run}")
@@ -55,7 +55,7 @@ def run_dataset(name: str, config: DatasetConfig, command: Sequence[str]) -> int
         "name": scenario.name,
         "measured_at": started_at.isoformat(timespec="seconds"),
         "command": " ".join(command),
-        "commit": _commit(),
+        "commit": commit,
         "software": VERSION,
         "testbed": config.testbed,
         "machine": _machine(config.testbed),

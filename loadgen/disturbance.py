@@ -70,14 +70,15 @@ class Disturbance:
     def lines(self) -> list[str]:
         """For people."""
         found = [
-            f"{self.plans} plans, each on each site alone and on both at once; {self.skipped} records skipped"
+            f"Disturbance, from {self.plans} plans, each run on each site alone and on both at once "
+            f"({self.skipped} records of no whole plan):"
         ]
         for site, change in self.sites.items():
             found.append(f"{site}, beside {OTHER[site]}: {change.seconds}")
             if change.network is not None:
                 found.append(f"{site}, outside the server: {change.network}")
             if change.cpu_share is not None:
-                found.append(f"{site}, CPU time alone: {change.cpu_share:.0%} of the run")
+                found.append(f"{site}, CPU time alone: {change.cpu_share:.0%} of the time that the task ran")
         return found
 
     def as_dict(self) -> dict[str, Any]:

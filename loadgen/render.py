@@ -53,7 +53,8 @@ def _markdown(tables: Sequence[Table]) -> str:
         heading = "| " + " | ".join(heading.markdown for heading in table.headings.values()) + " |"
         rule = "|" + " --- |" * len(table.headings)
         lines = ["| " + " | ".join(cells(table, line)) + " |" for line in table.lines]
-        blocks.append("\n".join([table.caption, *table.notes, "", heading, rule, *lines, ""]))
+        notes = [f"- {note}" for note in table.notes]
+        blocks.append("\n".join([table.caption, *notes, "", heading, rule, *lines, ""]))
     return "\n".join(blocks)
 
 

@@ -56,7 +56,7 @@ def test_notes_are_printed_with_the_table(tmp_path: Path) -> None:
     (tmp_path / "d.csv").write_text(CSV)
     (tmp_path / "d.json").write_text(json.dumps({"notes": ["Robot 0.2 CPU.", "Ratio 1.02."]}))
     lines = table_text(tmp_path / "d.csv", TableConfig(windows=("2",))).splitlines()
-    assert lines[1:3] == ["Robot 0.2 CPU.", "Ratio 1.02."]
+    assert lines[1:3] == ["- Robot 0.2 CPU.", "- Ratio 1.02."]
     (table,) = json.loads(table_text(tmp_path / "d.csv", TableConfig(windows=("2",), format="json")))[
         "tables"
     ]

@@ -199,12 +199,13 @@ def test_it_is_told_to_people_and_machines(tmp_path: Path) -> None:
         record(1.0, onboard(0.25, 0.05), cloud(0.12, 0.06, 0.06)),
     )
     assert found.lines() == [
-        "1 plans, each on each site alone and on both at once; 0 records skipped",
+        "Disturbance, from 1 plans, each run on each site alone and on both at once "
+        "(0 records of no whole plan):",
         "onboard, beside cloud: 200.0 ms alone, 250.0 ms beside, ratio 1.250 (95 %: 1.250 to 1.250)",
-        "onboard, CPU time alone: 20% of the run",
+        "onboard, CPU time alone: 20% of the time that the task ran",
         "cloud, beside onboard: 100.0 ms alone, 120.0 ms beside, ratio 1.200 (95 %: 1.200 to 1.200)",
         "cloud, outside the server: 40.0 ms alone, 60.0 ms beside, ratio 1.500 (95 %: 1.500 to 1.500)",
-        "cloud, CPU time alone: 100% of the run",
+        "cloud, CPU time alone: 100% of the time that the task ran",
     ]
     told = json.loads(json.dumps(found.as_dict()))
     assert (told["plans"], told["skipped"]) == (1, 0)

@@ -35,7 +35,7 @@ def cells(line: str) -> list[str]:
 def test_markdown_has_all_columns_in_every_line() -> None:
     """Caption, notes, heading, rule and one line a score, each with the same number of columns."""
     caption, note, blank, *lines = render([TABLE], "md").splitlines()
-    assert (caption, note, blank) == ("my_trace 50%.jsonl: 1000 rows, feedback chosen.", "A note.", "")
+    assert (caption, note, blank) == ("my_trace 50%.jsonl: 1000 rows, feedback chosen.", "- A note.", "")
     assert [len(cells(line)) for line in lines] == [COLUMNS] * 4
     assert cells(lines[2])[:5] == ["50", "0.30273", "0.70641", "0.14025", "0.14061"]
     assert cells(lines[2])[8:11] == ["-0.00473", "78.80", "950"]
