@@ -32,13 +32,20 @@ class Panel:
     title: str
     caption: str
     svg: bytes | None
-    notes: tuple[str, ...] = ()
 
 
 def page(
-    title: str, about: str, facts: Mapping[str, str], panels: Sequence[Panel], tables: Sequence[Table]
+    title: str,
+    about: Sequence[str],
+    facts: Mapping[str, str],
+    panels: Sequence[Panel],
+    tables: Sequence[Table],
 ) -> str:
-    """The whole document; every text is escaped here, but that of the charts."""
+    """The whole document; every text is escaped here, but that of the charts.
+
+    `about` is said once, at the top: what notes the tables bring are among it.
+    """
+    said = "".join(f"<p>{escape(line)}</p>" for line in about)
     parts = [
         "<!doctype html>",
         '<html lang="en">',
@@ -52,7 +59,7 @@ def page(
         f"<style>{CSS}</style>",
         "</head>",
         "<body>",
-        f"<header><h1>{escape(title)}</h1><p>{escape(about)}</p></header>",
+        f"<header><h1>{escape(title)}</h1>{said}</header>",
         "<main>",
         f'<dl class="facts">{_pairs(facts)}</dl>',
         '<div class="charts">',
@@ -76,17 +83,15 @@ def _pairs(texts: Mapping[str, str]) -> str:
 def _panel(panel: Panel) -> str:
     heading = f"<h2>{escape(panel.title)}</h2>"
     chart = f'<div class="chart">{inline(panel.svg, panel.name, panel.title)}</div>' if panel.svg else ""
-    notes = "".join(f"<small>{escape(note)}</small>" for note in panel.notes)
-    caption = f"<figcaption>{escape(panel.caption)}{notes}</figcaption>"
+    caption = f"<figcaption>{escape(panel.caption)}</figcaption>"
     return f'<figure id="{panel.name}">{heading}{chart}{caption}</figure>'
 
 
 def _table(table: Table, name: str) -> str:
     headings = "".join(f'<th scope="col">{_heading(of.markdown)}</th>' for of in table.headings.values())
     lines = "".join(map(_line, (cells(table, line) for line in table.lines)))
-    notes = "".join(f"<p>{escape(note)}</p>" for note in table.notes)
     return (
-        f'<section id="{name}"><h2 id="{name}-caption">{escape(table.caption)}</h2>{notes}'
+        f'<section id="{name}"><h2 id="{name}-caption">{escape(table.caption)}</h2>'
         f'<div class="scroll" role="region" tabindex="0" aria-labelledby="{name}-caption"><table>'
         f"<thead><tr>{headings}</tr></thead><tbody>{lines}</tbody></table></div></section>"
     )
@@ -113,7 +118,7 @@ body { margin: 0 auto; max-width: 78rem; padding: 1.5rem clamp(0.75rem, 3vw, 2re
   background: var(--page); color: var(--text); font: 1rem/1.5 var(--font); overflow-wrap: anywhere; }
 h1 { margin: 0; font-size: 1.5rem; line-height: 1.25; }
 h2 { margin: 0 0 0.75rem; font-size: 1.05rem; }
-header p { margin: 0.4rem 0 0; color: var(--quiet); }
+header p { margin: 0.2rem 0 0; color: var(--quiet); font-size: 0.9rem; }
 .facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(9.5rem, 1fr)); gap: 0.75rem;
   margin: 1.25rem 0; }
 .facts div, figure, aside, section { background: var(--card); border: 1px solid var(--line);
@@ -128,14 +133,12 @@ aside dd { color: var(--quiet); }
 .charts { display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 1rem; }
 figure, aside { margin: 0; padding: clamp(0.6rem, 2vw, 1rem); break-inside: avoid; }
 figcaption { margin-top: 0.6rem; color: var(--quiet); font-size: 0.9rem; }
-figcaption small { display: block; margin-top: 0.3rem; }
 .chart { background: #ffffff; border-radius: 0.4rem; }
 .chart svg { display: block; width: 100%; height: auto; }
 .chart svg * { stroke-linejoin: round; stroke-linecap: butt; }
 .chart text { font-family: var(--font) !important; }
 @media (max-width: 60rem) { .charts { grid-template-columns: minmax(0, 1fr); } }
 section { margin-top: 1rem; padding: clamp(0.6rem, 2vw, 1rem); break-inside: avoid; }
-section p { margin: 0 0 0.5rem; font-size: 0.9rem; }
 section h2 { margin: 0 0 0.5rem; font-size: 0.95rem; }
 .scroll { overflow-x: auto; }
 .scroll:focus-visible { outline: 2px solid #4c8dd6; outline-offset: 2px; }

@@ -100,10 +100,11 @@ def run_report(path: Path, config: ReportConfig) -> int:
     panels = []
     for chart, drawing in zip(shown, drawings, strict=True):
         _write_png(out / f"{chart.name}.png", drawing.png if drawing else None)
-        svg, notes = (drawing.svg, findings.rows.notes) if drawing else (None, ())
-        panels.append(Panel(chart.name, chart.title, chart.caption, svg, notes))
+        panels.append(Panel(chart.name, chart.title, chart.caption, drawing.svg if drawing else None))
     tables = [findings.replayed, *findings.evaluated, paper.table()]
-    text = page(f"Report on {source}", about(findings), facts(findings), panels, tables)
+    text = page(
+        f"Report on {source}", [about(findings), *findings.rows.notes], facts(findings), panels, tables
+    )
     write_whole(out / PAGE, text)
     print(out / PAGE)
     return 0
