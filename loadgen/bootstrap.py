@@ -16,6 +16,7 @@ from loadgen.rows import Column
 from loadgen.score import BLOCK_CELLS_MAX
 
 RESAMPLES = 2000
+ROWS_MIN = 10  # fewer do not tell how far a figure would move on others
 PERCENTS = (2.5, 97.5)
 BOUNDS = tuple(f"{percent:g} %" for percent in PERCENTS)
 CONSTANT = 1e-12  # a variance below this share of the mean square is rounding
@@ -49,7 +50,12 @@ class Blocks:
             yield within.reshape(len(starts), -1)[:, : self.rows]
 
     def intervals(self, figures: Callable[[Picks], dict[str, Any]]) -> tuple[dict[str, Any], ...]:
-        """Low and high end of each figure, None where it is undefined; `figures` gives a value a resample."""
+        """Low and high end of each figure, None where undefined; `figures` gives one value a resample.
+
+        No figure has one below ROWS_MIN rows.
+        """
+        if self.rows < ROWS_MIN:
+            return tuple({} for _ in PERCENTS)
         parts = [figures(picks) for picks in self.picks()]
         found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
         return tuple(

@@ -76,15 +76,18 @@ def read(path: Path, kind: str | None = None, *, least: int = 1) -> Rows:
 def read_lived(path: Path, kind: str | None = None) -> Lived:
     """The tasks of a trace that were decided; none in a CSV."""
     lived: list[tuple[float, bool]] = []
+    first_lines: dict[str, int] = {}  # of each kind
     for line, fields in enumerate(() if is_csv(path) else trace.read(path), 1):
         decision, where = fields["decision"], f"{path}:{line}"
         if kind is not None and fields["kind"] != kind:
             continue
         try:
             if not decision["both"] and decision["policy"] != PINNED:
+                first_lines.setdefault(str(fields["kind"]), line)
                 lived.append((_number(where, "waited_s", fields["waited_s"]), decision["site"] == CLOUD))
         except (TypeError, KeyError) as error:
             raise DataError(f"{where}: decision: {error!r}; it holds site, both, policy") from None
+    _check_one_kind(path, first_lines)
     return Lived(np.array([s for s, _ in lived]), np.array([cloud for _, cloud in lived], dtype=bool))
 
 
@@ -177,10 +180,14 @@ def _read_trace(path: Path, kind: str | None, least: int) -> Rows:
             f"{path}: no {kind or 'task'} ran well on both sites; measure with "
             "`loadgen run SCENARIO --measure both` or `robot-client --measure K`"
         )
+    _check_one_kind(path, first_lines)
+    return _rows(found, left_out)
+
+
+def _check_one_kind(path: Path, first_lines: dict[str, int]) -> None:
     if len(first_lines) > 1:
         kinds = ", ".join(f"{name} (line {line})" for name, line in first_lines.items())
         raise DataError(f"{path}: holds tasks of several kinds: {kinds}; choose one with --kind")
-    return _rows(found, left_out)
 
 
 def _trace_row(where: str, fields: dict[str, Any]) -> Row | None:

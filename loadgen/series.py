@@ -158,8 +158,9 @@ def accuracy_intervals(
     found: dict[str, Interval] = {}
     for line in scores:
         scored = evaluation.predictions(line.predictor, line.window, feedback)
-        if scored is not None:
-            found[line.window] = _accuracy_interval(scored, seed)
+        interval = None if scored is None else _accuracy_interval(scored, seed)
+        if interval is not None:
+            found[line.window] = interval
     return found
 
 
@@ -171,14 +172,13 @@ def thin(count: int, seed: int) -> Picks:
     return np.random.default_rng(seed).integers(edges[:-1], edges[1:])
 
 
-def _accuracy_interval(scored: Scored, seed: int) -> Interval:
+def _accuracy_interval(scored: Scored, seed: int) -> Interval | None:
+    """None: too few rows."""
+
     def accuracy(picks: Picks) -> dict[str, Column]:
         return {"accuracy_percent": 100 * right[picks].mean(-1)}
 
     spent_s = np.where(scored.to_cloud, scored.cloud_s, scored.onboard_s)
     right = spent_s == np.minimum(scored.onboard_s, scored.cloud_s)
-    ends = Blocks(len(right), seed=seed).intervals(accuracy)
-    low, high = (end["accuracy_percent"] for end in ends)
-    assert low is not None, "an accuracy is always defined"
-    assert high is not None
-    return Interval(low, high)
+    low, high = Blocks(len(right), seed=seed).intervals(accuracy)
+    return Interval(low["accuracy_percent"], high["accuracy_percent"]) if low else None

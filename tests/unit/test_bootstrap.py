@@ -71,6 +71,12 @@ def test_correlation_of_constants_is_undefined() -> None:
     assert ends == ({"r": None}, {"r": None})
 
 
+def test_few_rows_have_no_interval() -> None:
+    """One row resampled is the same row again: no ends are better than equal ones."""
+    assert Blocks(9).intervals(lambda picks: {"mean": np.ones(len(picks))}) == ({}, {})
+    assert Blocks(10).intervals(lambda picks: {"mean": np.ones(len(picks))}) == ({"mean": 1.0},) * 2
+
+
 def test_block_length_grows_with_the_table() -> None:
     """32 rows in a block at 1,000 rows; never more than there are rows."""
     assert [block_length(rows) for rows in (1, 2, 200, 1000)] == [1, 2, 15, 32]

@@ -128,6 +128,18 @@ def test_measured_and_pinned_tasks_are_not_the_policys(tmp_path: Path, replayed:
     assert (paper["scored"], paper["mean_s"]) == (2, 0.1)
 
 
+def test_kinds_are_not_mixed(tmp_path: Path, replayed: Replayed) -> None:
+    """A live trace of two kinds asks which; tasks of the other are not counted."""
+    path = trace_of(tmp_path, *[("paper", "cloud", {"cloud": 0.1}, 0.1)] * 2)
+    text = path.read_text()
+    path.write_text(text + text.replace('"kind":"plan"', '"kind":"look"'))
+    with pytest.raises(
+        DataError, match=r"several kinds: plan \(line 1\), look \(line 3\); choose one with --kind"
+    ):
+        replayed(path)
+    assert replayed(path, kind="look")[0]["scored"] == 2
+
+
 def test_intervals_hold_the_estimate(tmp_path: Path, replayed: Replayed) -> None:
     """With --bootstrap each policy has three lines: the figure lies between its two ends."""
     path = dataset(tmp_path, csv_of(THOUSAND[:300]))
