@@ -1,0 +1,80 @@
+"""Scenarios played in containers by `loadgen`."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from loadgen.compose import PROJECT
+from loadgen.rows import read
+from tests.compose.conftest import ROOT, docker
+
+pytestmark = [pytest.mark.compose, pytest.mark.timeout(600), pytest.mark.usefixtures("engine")]
+
+START_S, END_S = 300, 200
+
+
+def loadgen(*args: str | Path) -> list[str]:
+    return [sys.executable, "-m", "loadgen", *map(str, args)]
+
+
+def left_over() -> list[str]:
+    """What is still there of a scenario's containers, networks and volumes."""
+    mine = ("--filter", f"label=com.docker.compose.project={PROJECT}", "--format")
+    return [
+        *docker("ps", "--all", *mine, "{{.Names}}").split(),
+        *docker("network", "ls", *mine, "{{.Name}}").split(),
+        *docker("volume", "ls", *mine, "{{.Name}}").split(),
+    ]
+
+
+def test_a_dataset_is_measured_in_containers(tmp_path: Path) -> None:
+    """Every row has both times, its JSON tells of the containers, and nothing of them is left."""
+    done = subprocess.run(
+        loadgen(
+            *("dataset", "paper", "--rows", "15", "--alone", "3"),
+            *("--out", tmp_path, "--run", tmp_path / "run"),
+        ),
+        capture_output=True,
+        text=True,
+        timeout=500,
+        cwd=ROOT,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    about = json.loads((tmp_path / "paper.json").read_text())
+    assert len(read(tmp_path / "paper.csv")) == about["rows"] == 15
+    assert about["machine"]["docker"]
+    assert about["disturbance"]["plans"] == 3
+    assert left_over() == []
+
+
+def test_an_interrupted_run_leaves_no_container(tmp_path: Path) -> None:
+    """Ctrl-C while the robot drives: exit 130, and containers, networks and volumes are gone."""
+    log = tmp_path / "log"
+    with log.open("w") as output:
+        host = subprocess.Popen(
+            loadgen("run", "paper", "--testbed", "docker", "--out", tmp_path),
+            stdout=output,
+            stderr=output,
+            cwd=ROOT,
+            start_new_session=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        )
+    until = time.monotonic() + START_S
+    try:
+        while f"{PROJECT}-robot-1" not in docker("ps", "--format", "{{.Names}}").split():
+            assert host.poll() is None
+            assert time.monotonic() < until, "the robot was not started"
+            time.sleep(0.5)
+        os.killpg(host.pid, signal.SIGINT)
+        host.wait(END_S)
+    finally:
+        host.kill()
+        host.wait()
+    assert host.returncode == 130, log.read_text()[-2000:]
+    assert left_over() == []
