@@ -22,6 +22,7 @@ PROJECT = "offboard-run"
 PERIOD_US = 10_000  # as in docker-compose.yml
 MAPS = Path("/maps")
 RESULTS = Path("/out")
+ASK_S = 30
 DOWN_S = 120
 COPY_S = 60
 
@@ -33,6 +34,7 @@ def play_in_containers(scenario: Scenario, out: Path) -> int:
     """
     if not FILE.is_file():
         raise ConfigError(f"--testbed: docker needs {FILE} of a checkout in the current folder")
+    _check_engine()
     make_room(out)
     overlay = out / "compose.json"
     overlay.write_text(json.dumps(_overlay(scenario), indent=2))
@@ -52,6 +54,18 @@ def play_in_containers(scenario: Scenario, out: Path) -> int:
         signal.signal(signal.SIGTERM, before)
     print(f"written: {out / TRACE}", flush=True)
     return code
+
+
+def _check_engine() -> None:
+    """ConfigError, with what Docker said, where no engine with Compose v2 answers."""
+    for question in (("docker", "info"), ("docker", "compose", "version")):
+        try:
+            done = subprocess.run(question, capture_output=True, text=True, timeout=ASK_S, check=False)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise ConfigError(f"--testbed: docker cannot be asked: {error}") from error
+        if done.returncode != 0:
+            said = (done.stderr.strip() or "nothing").splitlines()[-1]
+            raise ConfigError(f"--testbed: docker does not answer to `{' '.join(question)}`: {said}")
 
 
 def _overlay(scenario: Scenario) -> dict[str, Any]:
@@ -83,8 +97,6 @@ def _run(*command: str, timeout_s: float | None = None, codes: Sequence[int] = (
     free_ports = {"CLOUD_HTTP_PORT": "0", "WAN_HTTP_PORT": "0"}
     try:
         done = subprocess.run(command, env=os.environ | free_ports, timeout=timeout_s, check=False)
-    except OSError as error:
-        raise ConfigError(f"--testbed: docker cannot be run: {error.strerror}") from error
     except subprocess.TimeoutExpired as error:
         raise OffloadError(f"{' '.join(command)}: not done after {timeout_s:g} s") from error
     if done.returncode not in codes:

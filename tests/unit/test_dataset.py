@@ -8,7 +8,7 @@ import pytest
 
 from common.config import load
 from common.errors import ConfigError, DataError
-from loadgen.compose import _overlay
+from loadgen.compose import _overlay, play_in_containers
 from loadgen.dataset import DatasetConfig, ExportConfig, run_dataset, run_export
 from loadgen.evaluate import TableConfig, table_text
 from loadgen.notes import notes
@@ -103,6 +103,31 @@ def test_containers_are_told_the_scenario(name: str) -> None:
     assert wan.delay_ms == scenario.link["delay_ms"]
     assert wan.distribution == scenario.link.get("distribution", "normal")
     assert wan.seed == scenario.seed
+
+
+@pytest.mark.parametrize(
+    ("docker", "said"),
+    [
+        (None, r"docker cannot be asked: .*No such file"),
+        ("echo Cannot connect >&2; exit 1", r"docker does not answer to `docker info`: Cannot connect"),
+        (
+            'test "$1" = info || { echo unknown command >&2; exit 125; }',
+            r"docker does not answer to `docker compose version`: unknown command",
+        ),
+    ],
+)
+def test_containers_need_an_engine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, docker: str | None, said: str
+) -> None:
+    """No docker, no engine, no Compose: one line with what docker said, and nothing is written."""
+    if docker is not None:
+        (tmp_path / "docker").write_text(f"#!/bin/sh\n{docker}\n")
+        (tmp_path / "docker").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.chdir(ROOT)
+    with pytest.raises(ConfigError, match=f"--testbed: {said}"):
+        play_in_containers(read_scenario(ROOT / "loadgen" / "scenarios" / "paper.toml"), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_containers_need_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
