@@ -124,7 +124,8 @@ def test_containers_need_an_engine(
         (tmp_path / "docker").write_text(f"#!/bin/sh\n{docker}\n")
         (tmp_path / "docker").chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.chdir(ROOT)
+    monkeypatch.chdir(tmp_path)
+    Path("docker-compose.yml").touch()
     with pytest.raises(ConfigError, match=f"--testbed: {said}"):
         play_in_containers(read_scenario(ROOT / "loadgen" / "scenarios" / "paper.toml"), tmp_path / "out")
     assert not (tmp_path / "out").exists()
