@@ -27,23 +27,13 @@ ALL = "all"
 
 
 @dataclass(frozen=True)
-class TableConfig:
-    """What to print; every predictor with every window in every feedback mode."""
+class Asked:
+    """What is asked alike of `table` and `replay`."""
 
-    windows: tuple[str, ...] = setting(
-        PAPER_WINDOWS, "window lengths N; full: fit on the first 80 %, scored on the rest", metavar="N,N,.."
-    )
-    predictors: tuple[str, ...] = setting(
-        (predictors.LEAST_SQUARES,), f"{predictors.HELP}; or {ALL}", metavar="NAME,NAME,.."
-    )
     feedback: str = setting(
         CHOSEN,
-        "whose window moves after warm-up: the chosen site's, every site's (full), or a table of each (both)",
+        "who learns after warm-up: the site that ran the task, every site (full), or a table of each (both)",
         choices=(CHOSEN, FULL, BOTH),
-    )
-    every_window: bool = setting(
-        False,
-        "slow predictors (forest, ARIMA, SARIMA, LSTM) with every N too, not at full alone: takes hours",
     )
     bootstrap: bool = setting(False, "a 95 % interval of each figure, over blocks of neighbouring rows")
     block: int | None = setting(
@@ -52,6 +42,30 @@ class TableConfig:
     seed: int = setting(1, "of the bootstrap and of predictors that draw", minimum=0)
     format: str = setting("md", "output format", choices=FORMATS)
     kind: str | None = setting(None, "kind of task, where a trace holds several")
+
+    def modes(self) -> tuple[str, ...]:
+        """The feedback modes, a table each."""
+        return (CHOSEN, FULL) if self.feedback == BOTH else (self.feedback,)
+
+    def blocks(self, rows: int) -> Blocks:
+        """The resamples of a table of so many rows."""
+        return Blocks(rows, length=self.block, seed=self.seed)
+
+
+@dataclass(frozen=True)
+class TableConfig(Asked):
+    """What to print; every predictor with every window in every feedback mode."""
+
+    windows: tuple[str, ...] = setting(
+        PAPER_WINDOWS, "window lengths N; full: fit on the first 80 %, scored on the rest", metavar="N,N,.."
+    )
+    predictors: tuple[str, ...] = setting(
+        (predictors.LEAST_SQUARES,), f"{predictors.HELP}; or {ALL}", metavar="NAME,NAME,.."
+    )
+    every_window: bool = setting(
+        False,
+        "slow predictors (forest, ARIMA, SARIMA, LSTM) with every N too, not at full alone: may take an hour",
+    )
 
     def __post_init__(self) -> None:
         check(self)
@@ -82,9 +96,8 @@ def table_text(path: Path, config: TableConfig) -> str:
 
 def tables(path: Path, rows: Rows, config: TableConfig) -> list[Table]:
     """One table a feedback mode."""
-    modes = (CHOSEN, FULL) if config.feedback == BOTH else (config.feedback,)
     evaluation = Evaluation(rows, config)
-    return [_table(path, rows, config, mode, list(evaluation.scores(mode))) for mode in modes]
+    return [_table(path, rows, config, mode, list(evaluation.scores(mode))) for mode in config.modes()]
 
 
 class Evaluation:
@@ -97,7 +110,7 @@ class Evaluation:
         self._split = cache(self._find_split)
         self._correlations = cache(self._find_correlations)
         self._correlation_ends = cache(self._find_correlation_ends)
-        self._blocks = cache(self._find_blocks)
+        self._blocks = cache(config.blocks)
 
     def scores(self, feedback: str) -> Iterator[Score]:
         """The lines of one table: each predictor with each window, then the rules that predict nothing."""
@@ -186,9 +199,6 @@ class Evaluation:
             }
 
         return self._blocks(len(rows)).intervals(both)
-
-    def _find_blocks(self, count: int) -> Blocks:
-        return Blocks(count, length=self._config.block, seed=self._config.seed)
 
 
 def predict(rows: Rows, length: int, predictor: str, moving: str, seed: int) -> tuple[Column, Column]:

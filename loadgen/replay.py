@@ -15,10 +15,9 @@ import numpy as np
 from common.config import check, setting
 from common.tasks import Kind, Task, task
 from loadgen import bootstrap, score
-from loadgen.bootstrap import Blocks
-from loadgen.evaluate import BOTH, CHOSEN, FULL
+from loadgen.evaluate import BOTH, FULL, Asked
 from loadgen.notes import read_noted
-from loadgen.render import FORMATS, Heading, Table, render
+from loadgen.render import Heading, Table, render
 from loadgen.rows import Column, Rows, read_lived
 from loadgen.score import Scored, Sides
 from robot_client import policies, predictors
@@ -32,7 +31,7 @@ RECORDED = "as recorded"
 
 
 @dataclass(frozen=True)
-class ReplayConfig:
+class ReplayConfig(Asked):
     """Which policies to replay, and what they predict with."""
 
     policies: tuple[str, ...] = setting(
@@ -40,18 +39,6 @@ class ReplayConfig:
     )
     predictor: str = setting(predictors.LEAST_SQUARES, predictors.HELP, metavar="NAME")
     window: int = setting(WINDOW, "rows of warm-up, not scored", minimum=2, maximum=WINDOW_MAX)
-    feedback: str = setting(
-        CHOSEN,
-        "who learns after warm-up: the site that ran the task, every site (full), or a table of each (both)",
-        choices=(CHOSEN, FULL, BOTH),
-    )
-    bootstrap: bool = setting(False, "a 95 % interval of each figure, over blocks of neighbouring rows")
-    block: int | None = setting(
-        None, "rows in a block of the bootstrap; without it the square root of the rows", minimum=1
-    )
-    seed: int = setting(1, "of the bootstrap and of predictors that draw", minimum=0)
-    format: str = setting("md", "output format", choices=FORMATS)
-    kind: str | None = setting(None, "kind of task, where a trace holds several")
 
     def __post_init__(self) -> None:
         check(self)
@@ -113,9 +100,8 @@ def run_replay(path: Path, config: ReplayConfig) -> int:
 def tables(path: Path, config: ReplayConfig) -> list[Table]:
     """One table a feedback mode; the first line of a trace's is the run that it records."""
     rows, lived = read_noted(path, config.kind, least=0), read_lived(path, config.kind)
-    modes = (CHOSEN, FULL) if config.feedback == BOTH else (config.feedback,)
     recorded = [_recorded(lived.waited_s, lived.to_cloud)] if len(lived.waited_s) else []
-    return [_table(path, rows, config, mode, recorded) for mode in modes]
+    return [_table(path, rows, config, mode, recorded) for mode in config.modes()]
 
 
 def replay(rows: Rows, policy: str, *, predictor: str, window: int, feedback: str, seed: int = 1) -> Played:
@@ -222,8 +208,9 @@ def _lines(rows: Rows, policy: str, config: ReplayConfig, feedback: str) -> Iter
     sent = Scored(scored.onboard_s, scored.cloud_s, played.to_cloud)
     yield replace(line, scored=len(scored), **score.plain(_figures(sent, played.both)))
     if config.bootstrap:
-        blocks = Blocks(len(scored), length=config.block, seed=config.seed)
-        ends = blocks.intervals(lambda picks: _figures(sent.picked(picks), played.both[picks]))
+        ends = config.blocks(len(scored)).intervals(
+            lambda picks: _figures(sent.picked(picks), played.both[picks])
+        )
         for bound, end in zip(bootstrap.BOUNDS, ends, strict=True):
             yield replace(line, bound=bound, scored=len(scored), **end)
 
