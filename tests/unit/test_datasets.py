@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from loadgen.evaluate import PAPER_WINDOWS, TableConfig, table_text
+from loadgen.evaluate import PAPER_WINDOWS, Evaluation, TableConfig, table_text
 from loadgen.rows import read
-from tests.unit.test_evaluate import expected_table, lines_of, rows_of, section
+from tests.unit.test_evaluate import expected_table, lines_of, replay, rows_of, section
 
 FOLDER = Path(__file__).parents[2] / "loadgen" / "datasets"
 NAMES = ("congested", "paper")
@@ -37,6 +37,21 @@ def test_least_squares_equal_plain_loops(name: str, feedback: str) -> None:
     text = (FOLDER / f"{name}.csv").read_text()
     found = lines_of(table_text(FOLDER / f"{name}.csv", TableConfig(feedback=feedback)))
     assert found == expected_table(rows_of(text), PAPER_WINDOWS, feedback)
+
+
+@pytest.mark.parametrize("feedback", ["chosen", "full"])
+@pytest.mark.parametrize("name", NAMES)
+def test_predictions_equal_plain_loops(name: str, feedback: str) -> None:
+    """Every single prediction, for short and long windows and the split, to 1e-9 s."""
+    lines, rows = rows_of((FOLDER / f"{name}.csv").read_text()), read(FOLDER / f"{name}.csv")
+    evaluation = Evaluation(rows, TableConfig())
+    for window in ("5", "50", "500", "full"):
+        found = evaluation.predictions("least-squares", window, feedback)
+        assert found is not None
+        length = 800 if window == "full" else int(window)
+        steps = replay(lines, length, length, "none" if window == "full" else feedback)
+        assert found.cloud_predicted_s == pytest.approx([step.p_cloud for step in steps], rel=0, abs=1e-9)
+        assert found.onboard_predicted_s == pytest.approx([step.p_onboard for step in steps], rel=0, abs=1e-9)
 
 
 @pytest.mark.parametrize("feedback", ["chosen", "full"])
