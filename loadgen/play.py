@@ -54,7 +54,7 @@ def play_demo(out: Path) -> int:
         raise OffloadError(f"the robot ended with exit code {code}")
     text = table_text(out / TRACE, TableConfig(windows=DEMO_WINDOWS, feedback="both"))
     (out / TABLE).write_text(text)
-    print(f"\n{text}\nwritten: {out / TABLE}")
+    print(f"\n{text}\nwritten: {out / TABLE}; charts: loadgen report {out}")
     return 0
 
 
