@@ -137,7 +137,7 @@ def _file_and_config(name: str, about: str | None, cls: type[C], argv: Sequence[
 
 
 def _wan(argv: Sequence[str]) -> int:
-    """the relay between robot and cloud: delay, jitter, bandwidth, outage"""
+    """the relay between robot and cloud: delay, jitter, loss, bandwidth, outage and other faults"""
     from loadgen.wan import WanConfig, run_wan
 
     parser = CommandParser(prog="loadgen wan", description=_wan.__doc__)

@@ -13,6 +13,7 @@ from types import FrameType
 from typing import Any
 
 from common.errors import ConfigError, OffloadError
+from loadgen.flags import as_flags
 from loadgen.part import uninterrupted
 from loadgen.play import TRACE, cloud_args, make_room, robot_args
 from loadgen.scenario import Scenario
@@ -21,6 +22,7 @@ FILE = Path("docker-compose.yml")
 PROJECT = "offboard-run"
 PERIOD_US = 10_000  # as in docker-compose.yml
 MAPS = Path("/maps")
+SAMPLES = Path("/samples")
 RESULTS = Path("/out")
 ASK_S = 30
 DOWN_S = 120
@@ -72,6 +74,11 @@ def _overlay(scenario: Scenario) -> dict[str, Any]:
     """What the scenario says, as a Compose file (JSON is YAML)."""
     place = MAPS / scenario.workload.map.name
     robot = robot_args(scenario, place, RESULTS / TRACE)
+    link, samples = dict(scenario.link), []
+    for name, value in scenario.link.items():
+        if isinstance(value, Path):
+            link[name] = SAMPLES / name
+            samples.append(f"{value}:{link[name]}:ro")
     services = {
         "cloud": {
             "command": ["--listen", "tcp://*:5555", "--http", "0.0.0.0:8000", *cloud_args(scenario)],
@@ -79,9 +86,10 @@ def _overlay(scenario: Scenario) -> dict[str, Any]:
         "wan": {
             "command": [
                 *("wan", "--listen", "0.0.0.0:5555", "--to", "cloud:5555", "--http", "0.0.0.0:8001"),
-                *(f"--{name.replace('_', '-')}={value}" for name, value in scenario.link.items()),
+                *as_flags(link),
                 f"--seed={scenario.seed}",
             ],
+            "volumes": samples,
         },
         "robot": {
             "command": ["--cloud", "tcp://wan:5555", *robot],

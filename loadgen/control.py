@@ -1,15 +1,15 @@
-"""The relay's HTTP side: read the link, change it, start and end an outage.
+"""The relay's HTTP side: read the link, change it, reset its connections, play a schedule.
 
 What a change does to bytes under way is the business of `relay.py`.
 """
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import asdict
 from typing import Any, Protocol
 
 from common.errors import ConfigError, MissingExtra
-from loadgen.link import DISTRIBUTIONS, Link
+from loadgen.link import NAMES
+from loadgen.schedule import Linked, Schedule, parse_schedule
 
 try:
     import uvicorn
@@ -23,13 +23,8 @@ except ImportError as error:
 STOP_S = 1  # how long a reply in progress may take when the relay stops
 
 
-class Linked(Protocol):
-    """Has a link that can be read and replaced at any time."""
-
-    @property
-    def link(self) -> Link: ...
-
-    def set_link(self, link: Link) -> None: ...
+class Relayed(Linked, Protocol):
+    """The relay, as far as it is commanded over HTTP."""
 
     def status(self) -> dict[str, Any]:
         """What else there is to show."""
@@ -42,8 +37,17 @@ class Change(BaseModel):
 
     delay_ms: float | None = Field(None, description="delay one way")
     jitter_ms: float | None = Field(None, description="spread of the delay")
-    distribution: str | None = Field(None, description=f"one of {', '.join(DISTRIBUTIONS)}")
+    distribution: str | None = Field(None, description=f"one of {', '.join(NAMES)}")
+    correlation: float | None = Field(None, description="of the jitter of neighbouring segments")
+    samples: list[float] | None = Field(None, description="delays in ms to add in place of jitter")
     bandwidth_mbps: float | None = Field(None, description="0 is unlimited")
+    loss: float | None = Field(None, description="share of segments lost; each is a stall")
+    loss_burst: float | None = Field(None, description="mean segments lost in a row; 1 is independent loss")
+    stall_ms: float | None = Field(None, description="how much later a lost segment comes")
+    hang: bool | None = Field(None, description="take everything, answer nothing until it is set to false")
+    reset_after_ms: float | None = Field(None, description="reset connections after so long; 0 is never")
+    truncate_bytes: int | None = Field(None, description="close connections after so many bytes; 0 is never")
+    slow_close_ms: float | None = Field(None, description="how much later the end of a stream comes")
     outage: bool | None = Field(None, description="silence until it is set to false again; not a reset")
 
 
@@ -55,10 +59,9 @@ class LinkChange(Change):
 
 
 class ControlServer(uvicorn.Server):
-    """Serves the API in the relay's own event loop; signals are left to the relay."""
+    """Serves an API in the relay's own event loop; signals are left to the relay."""
 
-    def __init__(self, relay: Linked) -> None:
-        app = control_app(relay)
+    def __init__(self, app: FastAPI) -> None:
         options: dict[str, Any] = {"lifespan": "off", "log_level": "warning", "access_log": False}
         super().__init__(uvicorn.Config(app, timeout_graceful_shutdown=STOP_S, **options))
 
@@ -71,7 +74,7 @@ class ControlServer(uvicorn.Server):
         self.should_exit = True
 
 
-def control_app(relay: Linked) -> FastAPI:
+def control_app(relay: Relayed, schedule: Schedule) -> FastAPI:
     """The API over one relay."""
     app = FastAPI(
         title="Offboard relay", description="The link between robot and cloud, read and changed live."
@@ -90,8 +93,30 @@ def control_app(relay: Linked) -> FastAPI:
     @app.put("/link")
     async def change_link(change: LinkChange) -> dict[str, Any]:
         """Change some conditions for the bytes that arrive from now on; answers the whole link."""
-        relay.set_link(relay.link.changed(change.model_dump(exclude_none=True)))
+        relay.set_link(relay.link.changed(change.model_dump(exclude_none=True)), by="http")
         return _shown(relay)
+
+    @app.post("/reset")
+    async def reset() -> dict[str, int]:
+        """Reset every open connection now; answers how many there were."""
+        return {"reset": relay.reset()}
+
+    @app.get("/schedule")
+    async def read_schedule() -> dict[str, Any]:
+        """Seconds since the start, events done, and all events in order."""
+        return schedule.status()
+
+    @app.post("/schedule")
+    async def start_schedule(events: dict[str, Any]) -> dict[str, Any]:
+        """Play `{"event": [{"at_s": 5.0, "up": {"outage": true}}, ...]}` from now on, in place of another."""
+        schedule.start(parse_schedule(events, relay.link))
+        return schedule.status()
+
+    @app.delete("/schedule")
+    async def stop_schedule() -> dict[str, Any]:
+        """Forget what is left of the schedule; the link stays as it is."""
+        schedule.stop()
+        return schedule.status()
 
     @app.exception_handler(ConfigError)
     async def bad_value(_request: Request, error: ConfigError) -> JSONResponse:
@@ -104,10 +129,10 @@ def control_app(relay: Linked) -> FastAPI:
     return app
 
 
-def _shown(relay: Linked) -> dict[str, Any]:
+def _shown(relay: Relayed) -> dict[str, Any]:
     link = relay.link
     outage = link.up.outage and link.down.outage
-    return {"up": asdict(link.up), "down": asdict(link.down), "outage": outage, **relay.status()}
+    return {"up": link.up.shown(), "down": link.down.shown(), "outage": outage, **relay.status()}
 
 
 def _sentence(error: dict[str, Any]) -> str:

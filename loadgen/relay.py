@@ -1,23 +1,27 @@
-"""The relay's sockets: ordinary TCP connections, the link's conditions put on their bytes.
+"""The relay's connections: ordinary TCP, the link's conditions put on their bytes.
 
-Works in user space, without root or kernel modules. What a link does is `link.py`; who starts the relay and
-changes its link is `wan.py`. The TCP handshake itself is not delayed, only the bytes.
+Works in user space, without root or kernel modules. What a link does is `link.py`, one direction of one
+connection is `flow.py`; who starts the relay and changes its link is `wan.py`. The TCP handshake itself is
+not delayed, only the bytes.
 """
 
 import asyncio
+import contextlib
 import logging
 import select
 import selectors
+import socket
+import struct
 import time
-from collections import deque
-from collections.abc import Callable
 from typing import Any
 
-from loadgen.link import SEGMENT_BYTES, Link, LinkConditions, Pipe
+from loadgen.flow import Flow, Side
+from loadgen.link import Link, Pipe
+from loadgen.truth import Truth
 
-CHUNK_BYTES = 8 * SEGMENT_BYTES  # a long read is cut, so that its first bytes do not wait for its last
 CONNECT_S = 5.0
 SPIN_S = 0.0003
+RST_AT_CLOSE = struct.pack("ii", 1, 0)  # SO_LINGER on, of no seconds
 
 log = logging.getLogger(__name__)
 
@@ -26,25 +30,38 @@ class Relay:
     """Accepts connections, opens one to `target` (host, port) for each, and keeps the link they all share.
 
     At most `connections_max` at a time, and `buffer_bytes` under way in one direction of one of them.
+    What happens is told to `truth`.
     """
 
     def __init__(
-        self, target: tuple[str, int], link: Link, *, seed: int, connections_max: int, buffer_bytes: int
+        self,
+        target: tuple[str, int],
+        link: Link,
+        *,
+        seed: int,
+        connections_max: int,
+        buffer_bytes: int,
+        truth: Truth | None = None,
     ) -> None:
         self.target = target
         self.link = link
         self.seed = seed
         self.buffer_bytes = buffer_bytes
+        self.truth = truth
         self._connections_max = connections_max
         self._target_is_up = True
         self.connections: set[Connection] = set()  # bounded by connections_max
         self.accepted = 0
         self.refused = 0
         self.bytes = {"up": 0, "down": 0}
+        if truth is not None:
+            truth.conditions(asyncio.get_running_loop().time(), "flag", link)
 
-    def set_link(self, link: Link) -> None:
+    def set_link(self, link: Link, by: str = "http") -> None:
         """Put new conditions on all bytes that arrive from now on."""
         self.link = link
+        if self.truth is not None:
+            self.truth.conditions(asyncio.get_running_loop().time(), by, link)
         for connection in tuple(self.connections):
             connection.set_link(link)
 
@@ -70,170 +87,143 @@ class Relay:
     def abort(self) -> None:
         """Close every connection now."""
         for connection in tuple(self.connections):
-            connection.abort()
+            connection.abort("stopped")
+
+    async def ended(self, within_s: float) -> None:
+        """Return when no connection is left, or after this long."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(within_s):
+                while self.connections:
+                    await asyncio.sleep(0)
+
+    def reset(self) -> int:
+        """Close every open connection by RST, in both directions; how many there were."""
+        connections = tuple(self.connections)
+        for connection in connections:
+            connection.reset()
+        return len(connections)
 
     def status(self) -> dict[str, Any]:
         """Connections and bytes delivered, for the control API."""
         counts = {"connections": len(self.connections), "accepted": self.accepted, "refused": self.refused}
-        return counts | {f"bytes_{direction}": count for direction, count in self.bytes.items()}
-
-
-class Flow:
-    """One direction of one connection: takes bytes from the source, gives them to the target when due.
-
-    What is under way is bounded: beyond it the source is not read, and TCP makes the sender wait. In an
-    outage nothing is read and nothing delivered. The source's end is delivered like bytes, after them.
-    """
-
-    def __init__(self, relay: Relay, number: int, direction: str) -> None:
-        self._relay = relay
-        self._direction = direction
-        self._pipe = Pipe(getattr(relay.link, direction), relay.seed, number, direction)
-        self._loop = asyncio.get_running_loop()
-        self._under_way: deque[tuple[float, bytes]] = deque()  # (due, chunk); an empty chunk is the end
-        self._under_way_bytes = 0
-        self._ended = False
-        self._timer: asyncio.TimerHandle | None = None
-        self.writable = True  # the target has room
-        self.source: asyncio.Transport | None = None
-        self.target: asyncio.Transport | None = None
-
-    def take(self, data: bytes) -> None:
-        """Bytes arrived from the source."""
-        arrived_s = self._loop.time()
-        for start in range(0, len(data), CHUNK_BYTES):
-            chunk = data[start : start + CHUNK_BYTES]
-            self._under_way.append((self._pipe.due(arrived_s, len(chunk)), chunk))
-        self._under_way_bytes += len(data)
-        self.refresh()
-
-    def end(self) -> None:
-        """The source is closed, or closes its half."""
-        if not self._ended:
-            self._ended = True
-            self._under_way.append((self._pipe.due(self._loop.time(), 0), b""))
-            self.refresh()
-
-    def set_conditions(self, conditions: LinkConditions) -> None:
-        self._pipe.conditions = conditions
-        self.refresh()
-
-    def refresh(self) -> None:
-        """Deliver what is due, set the timer for the next chunk, read the source if there is room."""
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-        if self.target is not None and not self._pipe.conditions.outage:
-            self._deliver(self.target)
-        if self.source is not None and not self.source.is_closing():
-            room = self._under_way_bytes < self._relay.buffer_bytes
-            if room and self.target is not None and not self._pipe.conditions.outage:
-                self.source.resume_reading()
-            else:
-                self.source.pause_reading()
-
-    def _deliver(self, target: asyncio.Transport) -> None:
-        now_s = self._loop.time()
-        due = []
-        while self.writable and self._under_way and self._under_way[0][0] <= now_s:
-            due.append(self._under_way.popleft()[1])
-        if data := b"".join(due):
-            self._under_way_bytes -= len(data)
-            if not target.is_closing():
-                self._relay.bytes[self._direction] += len(data)
-                target.write(data)
-        if due and not due[-1]:
-            target.close()
-        elif self.writable and self._under_way:
-            self._timer = self._loop.call_at(self._under_way[0][0], self.refresh)
-
-
-class Side(asyncio.Protocol):
-    """One socket of a connection: what it receives enters `incoming`; `outgoing` is delivered to it.
-
-    TCP_NODELAY is set by asyncio itself.
-    """
-
-    def __init__(self, incoming: Flow, outgoing: Flow, on_lost: Callable[["Side"], None]) -> None:
-        self._incoming = incoming
-        self._outgoing = outgoing
-        self._on_lost = on_lost
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        self._incoming.source = self._outgoing.target = transport
-        # Not from here: Python 3.11.2 undoes a pause made inside connection_made, and ignores later ones.
-        loop = asyncio.get_running_loop()
-        loop.call_soon(self._incoming.refresh)
-        loop.call_soon(self._outgoing.refresh)
-
-    def data_received(self, data: bytes) -> None:
-        self._incoming.take(data)
-
-    def eof_received(self) -> bool:
-        self._incoming.end()
-        return True  # asyncio must not close the socket: bytes for it may still be under way
-
-    def pause_writing(self) -> None:
-        self._outgoing.writable = False
-
-    def resume_writing(self) -> None:
-        self._outgoing.writable = True
-        self._outgoing.refresh()
-
-    def connection_lost(self, _error: Exception | None) -> None:
-        self._incoming.end()
-        self._on_lost(self)
+        counts |= {f"bytes_{direction}": count for direction, count in self.bytes.items()}
+        return counts | {"truth": None if self.truth is None else self.truth.status()}
 
 
 class Connection:
     """A client's socket, the one to the cloud that belongs to it, and the two flows between them.
 
     When one side closes, what it had sent is still delivered, then the other side is closed. When the
-    cloud refuses, the client is closed at once. In an outage the client is accepted and hears nothing.
+    cloud refuses, the client is closed at once. In an outage, or where the cloud hangs, the client is
+    accepted and hears nothing.
     """
 
     def __init__(self, relay: Relay, number: int) -> None:
         self._relay = relay
-        self._up = Flow(relay, number, "up")
-        self._down = Flow(relay, number, "down")
+        self.number = number
+        self.buffer_bytes = relay.buffer_bytes
+        self.truth = relay.truth
+        self._loop = asyncio.get_running_loop()
+        self._how = ""
+        if self.truth is not None:
+            self.truth.opened(self._loop.time(), number)
+        self._up = Flow(self, "up", Pipe(relay.link.up, relay.seed, number, "up"))
+        self._down = Flow(self, "down", Pipe(relay.link.down, relay.seed, number, "down"))
         self._passable = asyncio.Event()
         self.client = Side(self._up, self._down, self._lost)
         self._open_sides = {self.client}
+        self._reset_from_s = dict.fromkeys(("up", "down"), self._loop.time())
+        self._reset_timer: asyncio.TimerHandle | None = None
+        self._link = relay.link
         self.set_link(relay.link)
-        self._opening = asyncio.get_running_loop().create_task(self._open())
+        self._opening = self._loop.create_task(self._open())
 
     def set_link(self, link: Link) -> None:
-        if link.up.outage or link.down.outage:
+        before, self._link = self._link, link
+        if link.up.outage or link.down.outage or link.up.hang:
             self._passable.clear()
         else:
             self._passable.set()
-        self._up.set_conditions(link.up)
-        self._down.set_conditions(link.down)
+        for flow, now in ((self._up, link.up), (self._down, link.down)):
+            flow.set_conditions(now)
+            if flow.swallowed and not now.hang:  # what follows a gap must not be taken for the whole
+                self.reset("hang")
+        for direction in ("up", "down"):
+            if getattr(link, direction).reset_after_ms != getattr(before, direction).reset_after_ms:
+                self._reset_from_s[direction] = self._loop.time()
+        self._await_reset()
 
-    def abort(self) -> None:
+    def abort(self, how: str = "closed") -> None:
         """Close both sockets now."""
+        self.because(how)
         for transport in (self._up.source, self._up.target):
             if transport is not None:
                 transport.abort()
+
+    def reset(self, how: str = "reset") -> None:
+        """Close both sockets by RST now."""
+        for transport in (self._up.source, self._up.target):
+            if transport is not None and not transport.is_closing():
+                transport.get_extra_info("socket").setsockopt(
+                    socket.SOL_SOCKET, socket.SO_LINGER, RST_AT_CLOSE
+                )
+        self.abort(how)
+
+    def because(self, how: str) -> None:
+        self._how = self._how or how
+
+    def cut(self) -> None:
+        """Close both sides, after what was delivered to them."""
+        for transport in (self._up.source, self._up.target):
+            if transport is not None:
+                transport.close()
+
+    def count(self, direction: str, size: int) -> None:
+        self._relay.bytes[direction] += size
+
+    def _await_reset(self) -> None:
+        """Reset when it is time, in an outage not before its end: a reset is a message too."""
+        if self._reset_timer is not None:
+            self._reset_timer.cancel()
+            self._reset_timer = None
+        times_s = [
+            self._reset_from_s[direction] + getattr(self._link, direction).reset_after_ms / 1e3
+            for direction in ("up", "down")
+            if getattr(self._link, direction).reset_after_ms
+        ]
+        if not times_s or self._link.up.outage or self._link.down.outage:
+            return
+        if min(times_s) <= self._loop.time():
+            self.reset()
+        else:
+            self._reset_timer = self._loop.call_at(min(times_s), self._await_reset)
 
     async def _open(self) -> None:
         await self._passable.wait()
         cloud = Side(self._down, self._up, self._lost)
         try:
             async with asyncio.timeout(CONNECT_S):
-                await asyncio.get_running_loop().create_connection(lambda: cloud, *self._relay.target)
+                await self._loop.create_connection(lambda: cloud, *self._relay.target)
             self._open_sides.add(cloud)
             self._relay.target_up()
         except OSError as error:  # TimeoutError is one
             self._relay.target_down(error)
-            self.abort()
+            self.abort("refused")
 
     def _lost(self, side: Side) -> None:
         self._opening.cancel()
         self._open_sides.discard(side)
         if not self._open_sides:
-            self._relay.connections.discard(self)
+            self._end()
+
+    def _end(self) -> None:
+        self._relay.connections.discard(self)
+        if self._reset_timer is not None:
+            self._reset_timer.cancel()
+        if self.truth is not None:
+            self._up.drop()
+            self._down.drop()
+            self.truth.closed(self._loop.time(), self.number, self._how)
 
 
 class Refusal(asyncio.Protocol):

@@ -10,15 +10,12 @@ from typing import Any
 
 from common.config import REQUIRED, check, from_table, read_toml, setting, unknown_key
 from common.errors import ConfigError, DataError
+from loadgen.flags import LinkFlags
 from loadgen.quota import CPUS_MAX, CPUS_MIN
 from loadgen.wan import WanConfig
 from robot_client import policies, predictors
 
-LINK_KEYS = tuple(
-    f.name
-    for f in fields(WanConfig)
-    if f.name not in ("to", "listen", "http", "seed", "connections_max", "buffer_bytes")
-)
+LINK_KEYS = tuple(f.name for f in fields(LinkFlags))
 
 
 @dataclass(frozen=True)
@@ -136,5 +133,9 @@ def _link(table: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
     for key in table:
         if key not in LINK_KEYS:
             raise unknown_key(path, key, LINK_KEYS)
+    table = {
+        key: (path.parent / str(value)).resolve() if key.endswith("samples") else value
+        for key, value in table.items()
+    }
     from_table(WanConfig, {key.replace("_", "-"): value for key, value in table.items()}, path, "link")
     return table

@@ -17,6 +17,7 @@ from types import FrameType
 from typing import Any, Self
 
 from common.errors import ConfigError, OffloadError
+from loadgen.flags import as_flags
 from loadgen.part import KILL_S, Child, Part, ask, end, launch, uninterrupted, wait_ready
 from loadgen.quota import Quota, hold
 
@@ -144,9 +145,8 @@ class LocalTestbed(Testbed):
         self.robot_cpus = robot_cpus
         self.endpoint = f"tcp://{relay}"
         self.robot_command = (*commands["robot"], "--cloud", self.endpoint)
-        conditions = [f"--{name.replace('_', '-')}={value}" for name, value in (link or {}).items()]
         cloud_flags = ("--listen", f"tcp://{cloud}", "--http", self.cloud_http, *cloud_args)
-        wan_flags = ("--listen", relay, "--to", cloud, "--http", self.wan_http, *conditions)
+        wan_flags = ("--listen", relay, "--to", cloud, "--http", self.wan_http, *as_flags(link or {}))
         self.parts = {
             "cloud": Part("cloud", (*commands["cloud"], *cloud_flags), http=self.cloud_http),
             "wan": Part("wan", (*commands["wan"], *wan_flags), http=self.wan_http, ready="/health"),

@@ -1,9 +1,7 @@
 """The relay as a process of its own: what its link does to real sockets, and how it is changed live."""
 
 import contextlib
-import http.client
 import json
-import re
 import signal
 import socket
 import statistics
@@ -11,143 +9,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import pytest
 
 from loadgen.wan import WanConfig
+from tests.relays import QUIET_S, WAIT_S, WAN, echo, quietest, receive, round_trip_s, silent, wait_until
 
 pytestmark = pytest.mark.integration
-
-WAN = """
-import sys
-from common.config import load, run_command
-from loadgen.wan import WanConfig, run_wan
-settings = dict(prog="wan", description="", environ={}, prefix="WAN")
-sys.exit(run_command("wan", lambda: run_wan(load(WanConfig, sys.argv[1:], **settings))))
-"""
-WAIT_S = 5.0
-PINGS = 50
-BATCHES = 3
-QUIET_S = 0.15
-
-
-@dataclass
-class Wan:
-    """A running relay."""
-
-    process: subprocess.Popen[str]
-    port: int
-    http_port: int
-
-    def connect(self) -> socket.socket:
-        client = socket.create_connection(("127.0.0.1", self.port), timeout=WAIT_S)
-        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        return client
-
-    def ask(self, method: str, path: str, body: Any = None) -> tuple[int, Any]:
-        connection = http.client.HTTPConnection("127.0.0.1", self.http_port, timeout=WAIT_S)
-        with contextlib.closing(connection):
-            text = body if isinstance(body, str) else json.dumps(body)
-            connection.request(
-                method, path, None if body is None else text, {"Content-Type": "application/json"}
-            )
-            reply = connection.getresponse()
-            return reply.status, json.loads(reply.read())
-
-    def change(self, **changes: Any) -> Any:
-        status, link = self.ask("PUT", "/link", changes)
-        assert status == 200, link
-        return link
-
-
-@pytest.fixture
-def cloud() -> Iterator[Callable[[Callable[[socket.socket], None]], int]]:
-    """Factory: a TCP server whose connections are given to a function, each in a thread; returns the port."""
-    listeners = []
-    threads = []
-
-    def serve(talk: Callable[[socket.socket], None]) -> int:
-        listener = socket.create_server(("127.0.0.1", 0))
-        listeners.append(listener)
-
-        def run(connection: socket.socket) -> None:
-            with connection, contextlib.suppress(OSError):
-                connection.settimeout(WAIT_S)
-                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                talk(connection)
-
-        def accept() -> None:
-            with contextlib.suppress(OSError):
-                while True:
-                    threads.append(threading.Thread(target=run, args=(listener.accept()[0],)))
-                    threads[-1].start()
-
-        threads.append(threading.Thread(target=accept))
-        threads[-1].start()
-        return int(listener.getsockname()[1])
-
-    yield serve
-    for listener in listeners:
-        listener.shutdown(socket.SHUT_RDWR)
-        listener.close()
-    for thread in threads:
-        thread.join(WAIT_S)
-        assert not thread.is_alive()
-
-
-@pytest.fixture
-def wan() -> Iterator[Callable[..., Wan]]:
-    """Factory: a relay process to a port, with more flags."""
-    with contextlib.ExitStack() as stack:
-
-        def start(to: int, *flags: str) -> Wan:
-            command = [sys.executable, "-c", WAN, "--to", f"127.0.0.1:{to}", "--listen", "127.0.0.1:0"]
-            command += ["--http", "127.0.0.1:0", *flags]
-            process = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
-            stack.callback(process.kill)
-            assert process.stdout is not None
-            ports = re.findall(r":(\d+)", process.stdout.readline())
-            return Wan(process, int(ports[0]), int(ports[-1]))
-
-        yield start
-
-
-def echo(connection: socket.socket) -> None:
-    while data := connection.recv(65536):
-        connection.sendall(data)
-
-
-def round_trip_s(client: socket.socket) -> float:
-    start = time.perf_counter()
-    client.sendall(b"ping")
-    assert receive(client, 4) == b"ping"
-    return time.perf_counter() - start
-
-
-def quietest(measure: Callable[[], float]) -> float:
-    """The least of three medians: other load on the machine only ever adds."""
-    return min(statistics.median(measure() for _ in range(PINGS)) for _ in range(BATCHES))
-
-
-def receive(client: socket.socket, size: int) -> bytes:
-    data = b""
-    while len(data) < size and (part := client.recv(size - len(data))):
-        data += part
-    return data
-
-
-def silent(client: socket.socket) -> bool:
-    """Nothing comes, not even an end, for a while."""
-    client.settimeout(QUIET_S)
-    try:
-        return client.recv(1) is None
-    except TimeoutError:
-        return True
-    finally:
-        client.settimeout(WAIT_S)
 
 
 def test_delay_is_added_to_each_direction(cloud: Any, wan: Any) -> None:
@@ -387,10 +256,3 @@ def test_defaults_are_those_of_the_paper() -> None:
     link = WanConfig().link
     assert link.up == link.down
     assert (link.up.delay_ms, link.up.jitter_ms, link.up.bandwidth_mbps) == (15, 0, 400)
-
-
-def wait_until(fact: Callable[[], Any]) -> None:
-    end = time.monotonic() + WAIT_S
-    while not fact():
-        assert time.monotonic() < end, "not within the wait"
-        time.sleep(0.01)

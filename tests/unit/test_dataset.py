@@ -101,7 +101,7 @@ def test_containers_are_told_the_scenario(name: str) -> None:
         WanConfig, services["wan"]["command"][1:], prog="", description="", environ=environ, prefix="WAN"
     )
     assert wan.delay_ms == scenario.link["delay_ms"]
-    assert wan.distribution == scenario.link.get("distribution", "normal")
+    assert wan.distribution == scenario.link.get("distribution")
     assert wan.seed == scenario.seed
 
 

@@ -1,0 +1,47 @@
+"""Random numbers that belong to the segments of a stream, whichever of them were asked for before."""
+
+import math
+import random
+
+REPLAY_MAX = 100_000  # segments gone back at most: they take some 40 ms
+_SKIP = 1 << 16  # numbers skipped at a time
+_FLOAT_BITS = 64  # what one float takes from the generator
+
+
+class Draws:
+    """One uniform number in (0, 1) a segment, from a stream of its own that `origin` names."""
+
+    def __init__(self, origin: str) -> None:
+        self._origin = origin
+        self._random: random.Random | None = None  # many connections never need theirs
+        self._number = -1
+        self._value = 0.5
+
+    def at(self, number: int) -> float:
+        """The number of this segment; going on is quick, going back starts again from the seed."""
+        if self._random is None or number < self._number:
+            self._random, self._number = random.Random(self._origin), -1
+        if number != self._number:
+            self._skip(self._random, number - self._number - 1)
+            # Quantiles of 0 and 1 are infinite.
+            self._value, self._number = min(1 - self._random.random(), 1 - 2**-53), number
+        return self._value
+
+    @staticmethod
+    def _skip(generator: random.Random, count: int) -> None:
+        while count:
+            part = min(count, _SKIP)
+            generator.getrandbits(_FLOAT_BITS * part)
+            count -= part
+
+
+def replay_from(number: int, memory: float) -> int:
+    """The segment to replay a process from that has to be known at `number`, and keeps the share `memory`
+    of its state from one segment to the next: what was before weighs less than a rounding error.
+
+    Only a memory above 0.9996 is cut short, by REPLAY_MAX.
+    """
+    if memory <= 0:
+        return number
+    steps = REPLAY_MAX if memory >= 1 else min(REPLAY_MAX, math.ceil(math.log(2**-53) / math.log(memory)))
+    return max(0, number - steps)

@@ -1,0 +1,362 @@
+"""What the relay's further effects do to real sockets, its schedule, and its record of the truth."""
+
+import contextlib
+import json
+import socket
+import statistics
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import scipy.stats
+
+from loadgen.link import SEGMENT_BYTES
+from tests.relays import WAIT_S, WAN, echo, quietest, receive, round_trip_s, silent, wait_until
+
+pytestmark = pytest.mark.integration
+
+BARE = ("--delay-ms", "0", "--bandwidth-mbps", "0")
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def stop(relay: Any) -> None:
+    relay.process.terminate()
+    assert relay.process.wait(WAIT_S) == 0
+
+
+def is_reset(client: socket.socket) -> bool:
+    try:
+        return client.recv(1) is None
+    except ConnectionResetError:
+        return True
+
+
+def test_a_hung_cloud_takes_everything_and_says_nothing(cloud: Any, wan: Any) -> None:
+    """Old and new connections are open, take more than any buffer, hear nothing; the cloud hears nothing new.
+
+    When it wakes, connections that lost bytes are reset, one that lost none goes on, new ones work.
+    """
+    heard: list[bytes] = []
+
+    def talk(connection: socket.socket) -> None:
+        while data := connection.recv(65536):
+            heard.append(data)
+            connection.sendall(data)
+
+    relay = wan(cloud(talk), *BARE, "--buffer-bytes", "65536")
+    with relay.connect() as old, relay.connect() as quiet:
+        round_trip_s(old)
+        round_trip_s(quiet)
+        relay.change(hang=True)
+        with relay.connect() as new:
+            for client in (old, new):
+                client.sendall(bytes(30_000_000))  # returns: it is read and lost
+                assert silent(client)
+            assert heard == [b"ping", b"ping"]
+            relay.change(hang=False)
+            assert is_reset(old)
+            assert is_reset(new)
+        round_trip_s(quiet)
+        with relay.connect() as after:
+            round_trip_s(after)
+
+
+def test_a_hang_can_be_one_way(cloud: Any, wan: Any) -> None:
+    """With only the way down hung the cloud hears the robot; its answer is lost."""
+    heard: list[bytes] = []
+
+    def talk(connection: socket.socket) -> None:
+        heard.append(receive(connection, 4))
+        connection.sendall(b"answ")
+        connection.recv(1)
+
+    relay = wan(cloud(talk), *BARE, "--down-hang")
+    with relay.connect() as client:
+        client.sendall(b"ping")
+        wait_until(lambda: heard == [b"ping"])
+        assert silent(client)
+        relay.change(hang=False)
+        assert is_reset(client)
+
+
+def test_connections_are_reset_after_a_time(cloud: Any, wan: Any) -> None:
+    """With reset_after_ms both sides see ECONNRESET, not before the time and at most 100 ms after it."""
+    ends: list[bool] = []
+
+    def talk(connection: socket.socket) -> None:
+        ends.append(is_reset(connection))
+
+    relay = wan(cloud(talk), *BARE, "--up-reset-after-ms", "200")
+    start = time.perf_counter()
+    with relay.connect() as client:
+        assert is_reset(client)
+        taken_s = time.perf_counter() - start
+    print(f"reset after {taken_s:.4f} s")
+    assert 0.2 <= taken_s <= 0.3
+    wait_until(lambda: ends == [True])
+
+
+def test_the_time_of_a_reset_counts_from_the_change(cloud: Any, wan: Any) -> None:
+    """Set on an open connection, it is reset so long after the change; in an outage after its end."""
+    relay = wan(cloud(echo), *BARE)
+    with relay.connect() as client:
+        round_trip_s(client)
+        relay.change(outage=True, reset_after_ms=1)
+        assert silent(client)
+        relay.change(outage=False)
+        assert is_reset(client)
+
+
+def test_reset_now(cloud: Any, wan: Any) -> None:
+    """POST /reset resets every open connection, once: a new one works."""
+    relay = wan(cloud(echo), *BARE)
+    with relay.connect() as first, relay.connect() as second:
+        round_trip_s(first)
+        round_trip_s(second)
+        assert relay.ask("POST", "/reset") == (200, {"reset": 2})
+        assert is_reset(first)
+        assert is_reset(second)
+    with relay.connect() as third:
+        round_trip_s(third)
+
+
+@pytest.mark.parametrize("size", [1, SEGMENT_BYTES, 100_001])
+def test_a_stream_is_truncated_at_the_byte(cloud: Any, wan: Any, size: int) -> None:
+    """The cloud gets exactly so many bytes, then the end; the client's connection is closed."""
+    got: list[bytes] = []
+    relay = wan(
+        cloud(lambda connection: got.append(receive(connection, 1 << 30))),
+        *("--delay-ms", "5", "--up-truncate-bytes", str(size)),
+    )
+    data = bytes(range(256)) * 1000
+    with relay.connect() as client:
+        with contextlib.suppress(ConnectionError):
+            client.sendall(data)
+            assert client.recv(1) == b""
+        wait_until(lambda: got)
+    assert got == [data[:size]]
+    wait_until(lambda: relay.ask("GET", "/link")[1]["connections"] == 0)
+
+
+def test_an_answer_is_truncated_at_the_byte(cloud: Any, wan: Any) -> None:
+    """On the way down too: the client gets exactly so many bytes of each connection."""
+    relay = wan(cloud(echo), *BARE, "--down-truncate-bytes", "7")
+    for _ in range(2):
+        with relay.connect() as client:
+            client.sendall(b"ping")
+            assert receive(client, 4) == b"ping"
+            client.sendall(b"pong")
+            assert receive(client, 9) == b"pon"
+
+
+def test_the_end_comes_late(cloud: Any, wan: Any) -> None:
+    """With slow_close_ms the last bytes come as ever, the end 300 ms later, at most 100 ms more."""
+    relay = wan(cloud(lambda connection: connection.sendall(b"bye")), *BARE, "--slow-close-ms", "300")
+    with relay.connect() as client:
+        assert receive(client, 3) == b"bye"
+        start = time.perf_counter()
+        assert client.recv(1) == b""
+        taken_s = time.perf_counter() - start
+    print(f"end after {taken_s:.4f} s")
+    assert 0.29 <= taken_s <= 0.4  # the end was sent a moment before the bytes were received here
+
+
+def test_a_lost_segment_is_a_stall(cloud: Any, wan: Any) -> None:
+    """With all segments lost the first answer takes all six timers both ways; it does come."""
+    relay = wan(cloud(echo), *BARE, "--loss", "1", "--stall-ms", "2")
+    with relay.connect() as client:
+        first_ms = 1e3 * round_trip_s(client)
+        later_ms = 1e3 * statistics.median(round_trip_s(client) for _ in range(9))
+    print(f"first {first_ms:.1f} ms, later {later_ms:.1f} ms")
+    assert 2 * 126 <= first_ms <= 2 * 126 + 100
+    assert later_ms <= 20  # the same segment is lost once
+
+
+def test_lost_segments_do_not_change_the_bytes(cloud: Any, wan: Any) -> None:
+    """3 MB with loss in bursts, correlated jitter and small buffers come back byte for byte."""
+    flags = ("--loss", "0.02", "--loss-burst", "5", "--stall-ms", "1", "--jitter-ms", "0.2")
+    relay = wan(cloud(echo), *BARE, *flags, "--correlation", "0.5", "--buffer-bytes", "65536")
+    data = b"".join(n.to_bytes(4, "big") for n in range(750_000))
+    with relay.connect() as client:
+        sender = threading.Thread(target=client.sendall, args=(data,))
+        sender.start()
+        assert receive(client, len(data)) == data
+        sender.join()
+
+
+def test_samples_over_http(cloud: Any, wan: Any) -> None:
+    """A list of delays put on an open connection is drawn from at once; the link shows how many there are."""
+    relay = wan(cloud(echo), *BARE)
+    with relay.connect() as client:
+        round_trip_s(client)
+        link = relay.change(samples=[20, 20.5], distribution="samples")
+        assert (link["up"]["samples"], link["down"]["samples"]) == (2, 2)
+        median_ms = 1e3 * statistics.median(round_trip_s(client) for _ in range(9))
+    print(f"round trip {median_ms:.3f} ms")
+    assert 40 <= median_ms <= 46
+    status, reply = relay.ask("PUT", "/link", {"samples": [-1]})
+    assert (status, reply) == (422, {"detail": "up.samples: -1.0 is not a number from 0 to 60000"})
+
+
+def test_a_schedule_fires_in_order(cloud: Any, wan: Any, tmp_path: Path) -> None:
+    """Events of a file come in order of time, each at most 100 ms late, and GET /schedule counts them."""
+    file = tmp_path / "events.toml"
+    file.write_text(
+        "[[event]]\nat_s = 0.4\ndelay_ms = 3\n[[event]]\nat_s = 0.2\nup = {delay_ms = 2}\n"
+        "[[event]]\nat_s = 0.6\nreset = true\n[[event]]\nat_s = 1000\nhang = true\n"
+    )
+    truth = tmp_path / "link.jsonl"
+    relay = wan(cloud(echo), *BARE, "--schedule", str(file), "--truth", str(truth))
+    with relay.connect() as client:
+        assert is_reset(client)
+    wait_until(lambda: relay.ask("GET", "/schedule")[1]["done"] == 3)
+    stop(relay)
+    found = [line for line in read(truth) if line["what"] == "conditions"]
+    shown = [(line["by"], line["up"]["delay_ms"], line["down"]["delay_ms"]) for line in found]
+    assert shown == [("flag", 0, 0), ("schedule", 2, 0), ("schedule", 3, 3)]
+    gaps_s = [found[1]["at_s"], found[2]["at_s"]]
+    print(f"fired at {gaps_s}")
+    start_s = gaps_s[0] - 0.2  # the schedule starts when the relay is ready, the truth a moment before
+    assert 0 <= start_s <= 1
+    assert gaps_s[1] - start_s == pytest.approx(0.4, abs=0.1)
+
+
+def test_a_schedule_over_http(cloud: Any, wan: Any) -> None:
+    """POST plays events, GET shows them, DELETE forgets those left; a bad one is named."""
+    relay = wan(cloud(echo), *BARE)
+    events = [{"at_s": 0, "up": {"delay_ms": 4}}, {"at_s": 500, "hang": True}]
+    status, reply = relay.ask("POST", "/schedule", {"event": events[::-1]})
+    assert (status, reply["done"], reply["event"]) == (200, 1, events)
+    assert relay.ask("GET", "/link")[1]["up"]["delay_ms"] == 4
+    bad = relay.ask("POST", "/schedule", {"event": [{"at_s": 0, "delay": 4}]})
+    assert bad == (422, {"detail": "event 1: unknown key 'delay'; did you mean 'delay_ms'?"})
+    assert relay.ask("GET", "/schedule")[1]["event"] == events
+    assert relay.ask("DELETE", "/schedule") == (200, {"now_s": 0, "done": 0, "event": []})
+    assert relay.ask("GET", "/link")[1]["up"]["delay_ms"] == 4
+
+
+@pytest.mark.parametrize(
+    ("flag", "text", "message"),
+    [
+        ("--schedule", "[[event]]\nat_s = 1\nup = {outge = true}\n", ":3: unknown key 'outge'; did you mean"),
+        ("--samples", "1\n2\nfast\n", ":3: 'fast' is not a delay in ms from 0 to 60000"),
+    ],
+)
+def test_a_bad_file_is_a_mistake_of_the_user(tmp_path: Path, flag: str, text: str, message: str) -> None:
+    """A file that is wrong: one line with file, line and value, exit code 2."""
+    file = tmp_path / "file"
+    file.write_text(text)
+    command = [sys.executable, "-c", WAN, "--listen", "127.0.0.1:0", "--http", "127.0.0.1:0", flag, str(file)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"wan: {file}{message}")
+    assert done.stderr.count("\n") == 1
+
+
+def test_the_truth_is_whole(cloud: Any, wan: Any, tmp_path: Path) -> None:
+    """All that was sent is in the truth: bytes of each direction, no segment missing, none early."""
+    truth = tmp_path / "link.jsonl"
+    flags = ("--delay-ms", "2", "--jitter-ms", "1", "--loss", "0.05", "--stall-ms", "3")
+    relay = wan(cloud(echo), *flags, "--bandwidth-mbps", "0", "--truth", str(truth))
+    data = bytes(range(256)) * 1200
+    for _ in range(2):
+        with relay.connect() as client:
+            client.sendall(data)
+            assert receive(client, len(data)) == data
+    wait_until(lambda: relay.ask("GET", "/link")[1]["connections"] == 0)
+    relay.change(delay_ms=0)
+    counted = relay.ask("GET", "/link")[1]
+    stop(relay)
+    lines = read(truth)
+    assert counted["truth"]["dropped"] == 0
+    assert lines[-1]["what"] == "end"
+    assert lines[-1]["lines"] == counted["truth"]["lines"] == len(lines) - 1
+    assert [line["by"] for line in lines if line["what"] == "conditions"] == ["flag", "http"]
+    for what, more in (("opened", {}), ("closed", {"how": "client"})):
+        found = [line for line in lines if line["what"] == what]
+        assert [line["connection"] for line in found] == [1, 2]
+        assert all(line.items() >= more.items() for line in found)
+    chunks = [line for line in lines if line["what"] == "chunk"]
+    for direction in ("up", "down"):
+        for connection in (1, 2):
+            check_stream(
+                [c for c in chunks if (c["connection"], c["direction"]) == (connection, direction)], len(data)
+            )
+        assert counted[f"bytes_{direction}"] == 2 * len(data)
+
+
+def check_stream(chunks: list[dict[str, Any]], size: int) -> None:
+    """Chunks of one stream, in order: all bytes, then the end; none before it is due."""
+    at = 0
+    for chunk in chunks:
+        assert chunk["segment"] == at // SEGMENT_BYTES
+        at += chunk["bytes"]
+        late_s = (chunk["drawn_ms"] + chunk["stall_ms"]) / 1e3
+        assert chunk["due_s"] >= chunk["arrived_s"] + late_s - 2e-6
+        assert chunk["delivered_s"] >= chunk["due_s"] - 2e-6
+    assert at == size
+    assert chunks[-1]["bytes"] == 0
+    assert any(chunk["stall_ms"] for chunk in chunks)
+    assert [c["delivered_s"] for c in chunks] == sorted(c["delivered_s"] for c in chunks)
+
+
+@pytest.mark.parametrize("distribution", ["normal", "lognormal"])
+def test_drawn_delays_have_the_named_distribution(
+    cloud: Any, wan: Any, tmp_path: Path, distribution: str
+) -> None:
+    """The delays in the truth, one a segment, pass the Kolmogorov-Smirnov test against the distribution."""
+    truth = tmp_path / "link.jsonl"
+    shape = ("--delay-ms", "30", "--jitter-ms", "4", "--distribution", distribution, "--seed", "11")
+    relay = wan(cloud(echo), *shape, "--bandwidth-mbps", "0", "--truth", str(truth))
+    with relay.connect() as client:
+        sender = threading.Thread(target=client.sendall, args=(bytes(4000 * SEGMENT_BYTES),))
+        sender.start()
+        receive(client, 4000 * SEGMENT_BYTES)
+        sender.join()
+    stop(relay)
+    drawn = {
+        (line["direction"], line["segment"]): line["drawn_ms"]
+        for line in read(truth)
+        if line["what"] == "chunk" and line["bytes"]
+    }
+    theory = {
+        "normal": scipy.stats.norm(30, 4),
+        "lognormal": scipy.stats.lognorm(1, loc=30, scale=4 / 2.1611974158950877),
+    }
+    assert len(drawn) == 8000
+    for direction in ("up", "down"):
+        delays = [drawn[direction, n] for n in range(4000)]
+        p = scipy.stats.kstest(delays, theory[distribution].cdf).pvalue
+        print(f"{direction}: p = {p:.3f}")
+        assert p > 0.001
+
+
+def test_what_was_never_delivered_says_so(cloud: Any, wan: Any, tmp_path: Path) -> None:
+    """Bytes under way when the relay is stopped are in the truth with a delivery of null."""
+    truth = tmp_path / "link.jsonl"
+    relay = wan(cloud(echo), "--delay-ms", "30000", "--truth", str(truth))
+    with relay.connect() as client:
+        client.sendall(b"lost")
+        wait_until(lambda: relay.ask("GET", "/link")[1]["connections"] == 1)
+        time.sleep(0.05)
+        stop(relay)
+    lines = read(truth)
+    chunks = [(line["bytes"], line["delivered_s"]) for line in lines if line["what"] == "chunk"]
+    assert chunks[0] == (4, None)
+    assert [line["how"] for line in lines if line["what"] == "closed"] == ["stopped"]
+
+
+def test_the_truth_keeps_the_delay(cloud: Any, wan: Any, tmp_path: Path) -> None:
+    """With the truth on, 15 ms each way are still 30 ms at the median, at most 1.5 ms more."""
+    relay = wan(cloud(echo), "--delay-ms", "15", "--truth", str(tmp_path / "link.jsonl"))
+    with relay.connect() as client:
+        median_ms = 1e3 * quietest(lambda: round_trip_s(client))
+    print(f"round trip {median_ms:.3f} ms")
+    assert 30.0 <= median_ms <= 31.5

@@ -1,0 +1,104 @@
+"""The link's conditions as flags, in a scenario and over HTTP: all there, under the same names."""
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from common.config import load
+from common.errors import ConfigError, DataError
+from loadgen.control import Change
+from loadgen.flags import LinkFlags, as_flags
+from loadgen.link import Link, LinkConditions
+from loadgen.scenario import read_scenario
+
+NAMES = {field.name for field in fields(LinkConditions)}
+SCENARIO = """
+name = "rough"
+
+[workload]
+map = "{map}"
+
+[link]
+hang = true
+up_loss = 0.02
+down_hang = false
+down_samples = "delays.txt"
+"""
+
+
+def flags(*argv: str) -> LinkFlags:
+    return load(LinkFlags, argv, prog="wan", description="", environ={}, prefix="WAN")
+
+
+def test_every_condition_has_its_flags() -> None:
+    """All but the outage, which is for a running relay, can be set for both directions and for each."""
+    both = NAMES - {"outage"}
+    wanted = both | {f"up_{name}" for name in both} | {f"down_{name}" for name in both}
+    assert {field.name for field in fields(LinkFlags)} == wanted
+    assert set(Change.model_fields) == NAMES
+
+
+def test_without_flags_the_effects_are_off() -> None:
+    """The link at start is the paper's, with none of the other effects."""
+    conditions = LinkConditions(delay_ms=15, bandwidth_mbps=400)
+    assert flags().link == Link(conditions, conditions)
+
+
+def test_a_direction_has_its_own() -> None:
+    """A flag of one direction wins over that of both, off over on too."""
+    link = flags("--loss=0.1", "--up-loss=0.2", "--hang", "--no-down-hang", "--down-truncate-bytes=9").link
+    assert (link.up.loss, link.down.loss) == (0.2, 0.1)
+    assert (link.up.hang, link.down.hang) == (True, False)
+    assert (link.up.truncate_bytes, link.down.truncate_bytes) == (0, 9)
+
+
+def test_samples_are_the_distribution_unless_another_is_named(tmp_path: Path) -> None:
+    """--samples alone draws from the file; with --distribution they are there to switch to."""
+    file = tmp_path / "delays.txt"
+    file.write_text("3\n1\n")
+    link = flags("--up-samples", str(file)).link
+    assert (link.up.distribution, link.up.samples) == ("samples", (1.0, 3.0))
+    assert (link.down.distribution, link.down.samples) == ("normal", ())
+    assert flags("--samples", str(file), "--distribution", "uniform").link.up.distribution == "uniform"
+    with pytest.raises(ConfigError, match="samples: none are given"):
+        flags("--distribution", "samples")
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["--loss", "2"], "--loss: 2.0 is above 1, the most allowed"),
+        (["--up-loss-burst", "0.5"], "--up-loss-burst: 0.5 is below 1, the least allowed"),
+        (["--distribution", "gamma"], "--distribution: 'gamma' is not one of constant, uniform"),
+        (["--truncate-bytes", "1.5"], "--truncate-bytes: '1.5' is not a whole number"),
+    ],
+)
+def test_a_bad_flag_is_named(argv: list[str], message: str) -> None:
+    """A value that cannot be is refused with flag and value."""
+    with pytest.raises(ConfigError) as caught:
+        flags(*argv)
+    assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize(
+    "settings", [{"hang": True}, {"up_hang": False}, {"loss": 0.02, "distribution": "pareto", "up_loss": 0.0}]
+)
+def test_settings_become_flags(settings: dict[str, Any]) -> None:
+    """A command line made of settings is read as the same settings."""
+    assert flags(*as_flags(settings)) == LinkFlags(**settings)
+
+
+def test_a_scenario_has_all_conditions(tmp_path: Path) -> None:
+    """[link] takes facts, numbers and files, these relative to the scenario's own."""
+    grid = Path(__file__).parents[1] / "samples" / "32room_000-crop.map"
+    (tmp_path / "delays.txt").write_text("5\n")
+    file = tmp_path / "rough.toml"
+    file.write_text(SCENARIO.format(map=grid))
+    link = flags(*as_flags(read_scenario(file).link)).link
+    assert (link.up.hang, link.up.loss, link.up.samples) == (True, 0.02, ())
+    assert (link.down.hang, link.down.loss, link.down.samples) == (False, 0, (5.0,))
+    (tmp_path / "delays.txt").write_text("five\n")
+    with pytest.raises(DataError, match=r"delays.txt:1: 'five' is not a delay in ms"):
+        read_scenario(file)

@@ -1,0 +1,11 @@
+"""The relay under toxics, as far as it needs no sockets."""
+
+from loadgen.relay import Refusal
+from loadgen.toxic_relay import ToxicRelay
+
+
+def test_what_comes_after_the_close_is_refused() -> None:
+    """A connection that the kernel had accepted when the proxy was disabled is closed, not served."""
+    relay = ToxicRelay(("127.0.0.1", 1), seed=0, connections_max=1, buffer_bytes=1 << 20)
+    assert isinstance(relay.accept(), Refusal)
+    assert not relay.connections
