@@ -19,12 +19,11 @@ from toxiproxy.exceptions import InvalidToxic, NotFound, ProxyExists
 
 from loadgen.proxies import PROXIES_MAX, TOXICS_MAX
 from loadgen.toxiproxy import BODY_BYTES_MAX
+from tests.relays import WAIT_S, receive, round_trip_s, silent
 
 pytestmark = pytest.mark.integration
 
 WAN = [sys.executable, "-m", "loadgen", "wan", "--listen", "127.0.0.1:0", "--http", "127.0.0.1:0"]
-WAIT_S = 5.0
-QUIET_S = 0.15
 CONNECTIONS = 16
 
 
@@ -114,37 +113,12 @@ def connect(proxy: Any) -> socket.socket:
     return connection
 
 
-def receive(connection: socket.socket, size: int) -> bytes:
-    data = b""
-    while len(data) < size and (part := connection.recv(size - len(data))):
-        data += part
-    return data
-
-
-def round_trip_s(connection: socket.socket) -> float:
-    start = time.perf_counter()
-    connection.sendall(b"ping")
-    assert receive(connection, 4) == b"ping"
-    return time.perf_counter() - start
-
-
 def ended(connection: socket.socket) -> bool:
     """The end comes, without a byte before it."""
     try:
         return connection.recv(1) == b""
     except ConnectionResetError:
         return True
-
-
-def silent(connection: socket.socket) -> bool:
-    """Nothing comes, not even an end, for a while."""
-    connection.settimeout(QUIET_S)
-    try:
-        return connection.recv(1) is None
-    except TimeoutError:
-        return True
-    finally:
-        connection.settimeout(WAIT_S)
 
 
 def test_the_client_makes_lists_and_removes_a_proxy(client: Any, upstream: Any) -> None:
