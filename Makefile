@@ -10,7 +10,7 @@ PACKAGES := common robot_client cloud_server loadgen
 BENCH_READY := $(VENV)/.bench-ready
 DEV_READY := $(VENV)/.dev-ready
 
-.PHONY: help demo install format lint type test unit integration compose browser torch up down table lock wheel clean
+.PHONY: help demo install format lint type test unit integration compose chaos browser torch up down table lock wheel clean
 
 help: ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -42,6 +42,10 @@ integration: $(DEV_READY) ## tests with real sockets and processes
 
 compose: $(DEV_READY) ## tests with real containers; needs a Docker engine
 	$(BIN)/pytest tests/compose
+
+chaos: $(DEV_READY) ## every fault 20 times and 3 times in containers, every scenario, then half an hour of faults
+	CHAOS=1 $(BIN)/pytest tests/chaos
+	$(BIN)/loadgen run soak --out out/soak
 
 browser: $(DEV_READY) ## tests in a real browser; needs Chromium
 	$(BIN)/pytest tests/browser

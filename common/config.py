@@ -7,6 +7,7 @@ import argparse
 import dataclasses
 import difflib
 import os
+import re
 import sys
 import tomllib
 import types
@@ -82,8 +83,11 @@ def resolve(cls: type[C], flags: argparse.Namespace, *, environ: Mapping[str, st
 
 
 def from_table(cls: type[C], table: Mapping[str, Any], path: Path, section: str) -> C:
-    """Fill `cls` from one table of a TOML file; unknown keys and wrong values name file and key."""
-    fields = {_flag(field): field for field in _settings(cls)}
+    """Fill `cls` from one table of a TOML file, whose keys are the flags with _ for -.
+
+    Unknown keys and wrong values name file and key.
+    """
+    fields = {_flag(field).replace("-", "_"): field for field in _settings(cls)}
     for key in table:
         if key not in fields:
             raise unknown_key(path, key, list(fields))
@@ -125,9 +129,24 @@ def unknown_key(path: Path, key: str, known: Sequence[str]) -> DataError:
     starts = (key, f"[{key}", f"[[{key}")
     lines = enumerate(path.read_text().splitlines(), 1)
     line = next((number for number, text in lines if text.strip().startswith(starts)), 1)
-    near = difflib.get_close_matches(key, known, n=1)
+    return DataError(f"{path}:{line}: {unknown('key', key, known)}")
+
+
+def unknown(what: str, name: str, known: Sequence[str]) -> str:
+    """What to say of a name nobody knows: the nearest that is known, or all of them."""
+    near = difflib.get_close_matches(name, known, n=1)
     hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(sorted(known))}"
-    return DataError(f"{path}:{line}: unknown key {key!r}; {hint}")
+    return f"unknown {what} {name!r}; {hint}"
+
+
+def line_of(lines: Sequence[str], table: str, number: int, key: str) -> int:
+    """Line of a key of the n-th [[table]] of a TOML file; of that table where it is not found in it."""
+    starts = [n for n, text in enumerate(lines, 1) if re.match(rf"\s*\[\[\s*{table}\s*\]\]", text)]
+    first = starts[number - 1] if 0 < number <= len(starts) else 1
+    tables = [n for n, text in enumerate(lines, 1) if re.match(r"\s*\[", text) and n > first]
+    named = re.compile(rf"(?<![\w-])[\"']?{re.escape(key)}[\"']?\s*[=.\]]")
+    last = min(tables, default=len(lines) + 1) - 1
+    return next((n for n in range(first, last + 1) if named.search(lines[n - 1])), first)
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -7,10 +7,12 @@ import contextlib
 import os
 import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 SELF = Path("/proc/self")
 READ_BYTES_MAX = 4096
+UNLIMITED = ("max", "-1")  # in place of a quota
 # Where the quota and the CPU time of a group are: controller (version 2 names none) and file.
 _VERSIONS = ((("", "cpu.max"), ("", "cpu.stat")), (("cpu", "cpu.cfs_quota_us"), ("cpuacct", "cpuacct.usage")))
 
@@ -72,6 +74,30 @@ def parse_usage(text: bytes) -> float:
 
 def usage_file(proc: Path) -> Path | None:
     """The usage file of the innermost cgroup with a CPU quota around the process at `proc` (/proc/PID)."""
+    group = quota_group(proc)
+    return group.usage if group else None
+
+
+@dataclass(frozen=True, slots=True)
+class QuotaGroup:
+    """A cgroup with a CPU quota: its folder, the name of the quota's file there, and the file of its use."""
+
+    folder: Path
+    quota: str
+    usage: Path | None
+
+    def cpus(self) -> float | None:
+        """The quota in CPUs; None where there is none any more."""
+        try:
+            limit, *period = (self.folder / self.quota).read_text().split()
+            period_us = period[0] if period else (self.folder / "cpu.cfs_period_us").read_text()
+            return None if limit in UNLIMITED else int(limit) / int(period_us)
+        except (OSError, ValueError, IndexError):
+            return None
+
+
+def quota_group(proc: Path) -> QuotaGroup | None:
+    """The innermost cgroup with a CPU quota around the process at `proc` (/proc/PID)."""
     try:
         own = _own_groups((proc / "cgroup").read_text())
         folders = _folders((proc / "mountinfo").read_text(), own)
@@ -79,11 +105,11 @@ def usage_file(proc: Path) -> Path | None:
         return None
     for (limiting, quota), (counting, usage) in _VERSIONS:
         # In two hierarchies of version 1 only groups of one path hold the same processes.
-        if own.get(limiting) == own.get(counting):
-            pairs = zip(folders.get(limiting, []), folders.get(counting, []), strict=False)
-            for limited, counted in pairs:
-                if _has_quota(limited / quota):
-                    return counted / usage
+        same = own.get(limiting) == own.get(counting)
+        counted = folders.get(counting, []) if same else []
+        for n, limited in enumerate(folders.get(limiting, [])):
+            if _has_quota(limited / quota):
+                return QuotaGroup(limited, quota, counted[n] / usage if n < len(counted) else None)
     return None
 
 
@@ -113,7 +139,7 @@ def _folders(text: str, own: dict[str, PurePosixPath]) -> dict[str, list[Path]]:
 def _has_quota(file: Path) -> bool:
     """Whether `cpu.max` or `cpu.cfs_quota_us` sets one."""
     try:
-        return file.read_text().split()[0] not in ("max", "-1")
+        return file.read_text().split()[0] not in UNLIMITED
     except (OSError, IndexError):
         return False
 

@@ -56,6 +56,10 @@ class CloudBusy(CloudError):
     """The server's queue was full, or the budget was over before the task could start."""
 
 
+class Overtaken(CloudError):
+    """Another site answered first; how long this one would have taken is not known."""
+
+
 class CloudBroken(CloudError):
     """The connection was lost, or the server cannot run this task."""
 

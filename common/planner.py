@@ -81,7 +81,12 @@ def warm() -> None:
         plan_path(grid, scan, Pose(4.5, 4.5), Point(0.5, 0.5), 1.0, costs)
 
 
-@task("plan_path", size=size_of_plan, types=(GridMap, Scan, Pose, Point, Plan), warm=warm)
+def work_of_plan(plan: Plan) -> float:
+    """The cells that the search settled."""
+    return plan.expanded
+
+
+@task("plan_path", size=size_of_plan, types=(GridMap, Scan, Pose, Point, Plan), warm=warm, work=work_of_plan)
 def plan_path(
     grid: GridMap,
     scan: Scan | None,

@@ -27,7 +27,8 @@ class Kind:
 
     `size` maps the function's arguments to the input size d (finite, >= 0); `types` are the dataclasses
     that its arguments and result may hold; `warm` is called once a process before the first task; a kind
-    with `duplicate=False` is never run on two sites.
+    with `duplicate=False` is never run on two sites; `work` tells from a result how much work it was, in any
+    unit.
     """
 
     name: str
@@ -37,9 +38,13 @@ class Kind:
     types: tuple[type, ...] = ()
     warm: Callable[[], None] | None = None
     source_hash: str = ""
+    work: Callable[[Any], float] | None = None
+    positional: int | None = None  # arguments of a call that needs no binding: all, by place
 
     def bind(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:
         """The call as positional arguments, defaults filled in; TypeError as Python itself would say it."""
+        if not kwargs and self.positional is not None and len(args) == self.positional:
+            return args
         bound = inspect.signature(self.function).bind(*args, **kwargs)
         bound.apply_defaults()
         return bound.args
@@ -50,6 +55,13 @@ class Kind:
         if not (math.isfinite(size) and size >= 0):
             raise BadValue(f"task {self.name}: input size {size} is not a finite number >= 0")
         return size
+
+    def work_of(self, result: Any) -> float | None:
+        """The work that a result says it was; None where that is not told, or is no number above 0."""
+        if self.work is None:
+            return None
+        work = float(self.work(result))
+        return work if math.isfinite(work) and work > 0 else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +84,7 @@ def task(
     duplicate: bool = True,
     types: tuple[type, ...] = (),
     warm: Callable[[], None] | None = None,
+    work: Callable[[Any], float] | None = None,
 ) -> Callable[[F], F]:
     """Register a function as a kind of task; it stays an ordinary function.
 
@@ -83,10 +96,13 @@ def task(
         raise ConfigError(f"task {name}: {KINDS_MAX} tasks are registered already")
 
     def register(function: F) -> F:
-        for parameter in inspect.signature(function).parameters.values():
+        parameters = inspect.signature(function).parameters.values()
+        for parameter in parameters:
             if parameter.kind in (parameter.KEYWORD_ONLY, parameter.VAR_KEYWORD):
                 raise ConfigError(f"task {name}: parameter {parameter.name!r} can only be given by keyword")
-        kind = Kind(name, function, size, duplicate, types, warm, _source_hash(function))
+        fixed = all(parameter.kind != parameter.VAR_POSITIONAL for parameter in parameters)
+        count = len(parameters) if fixed else None
+        kind = Kind(name, function, size, duplicate, types, warm, _source_hash(function), work, count)
         known = _kinds.get(name)
         if known is not None and known.source_hash != kind.source_hash:
             raise ConfigError(f"task {name} is registered twice, with different source")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from common.config import CommandParser, add_flags, check, resolve, run_command, setting
+from robot_client import policies, predictors
 
 C = TypeVar("C")
 
@@ -33,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 class RunConfig:
     """How a scenario is played."""
 
-    out: Path = setting(Path("out/run"), "folder for the trace and logs", metavar="DIR")
+    out: Path = setting(Path("out/run"), "folder for all that the run writes", metavar="DIR")
     testbed: str = setting(
         "local", "where it is played: processes, or containers", choices=("local", "docker")
     )
@@ -42,6 +43,10 @@ class RunConfig:
     )
     seed: int | None = setting(None, "instead of the scenario's own", minimum=0)
     tasks: int | None = setting(None, "instead of the scenario's own", minimum=1)
+    policy: str | None = setting(None, f"instead of the scenario's own: {policies.HELP}", metavar="NAME")
+    predictor: str | None = setting(
+        None, f"instead of the scenario's or the policy's own: {predictors.HELP}", metavar="NAME"
+    )
 
     def __post_init__(self) -> None:
         check(self)
@@ -65,20 +70,43 @@ def _demo(argv: Sequence[str]) -> int:
 
 
 def _run(argv: Sequence[str]) -> int:
-    """play a scenario and write its trace"""
+    """play a scenario: its trace, the truth about its link, its events and the verdict of its checks"""
+    from loadgen.scenario import find_scenario, read_scenario, shipped
+
     parser = CommandParser(prog="loadgen run", description=_run.__doc__)
-    parser.add_argument(
-        "scenario", metavar="SCENARIO", help="TOML file, or a shipped one: demo, paper, congested"
-    )
+    help = f"TOML file, or a shipped one: {', '.join(shipped())}"
+    parser.add_argument("scenario", metavar="SCENARIO", help=help)
     add_flags(parser, RunConfig, ENVIRONMENT)
     flags = parser.parse_args(argv)
     config = resolve(RunConfig, flags, environ=os.environ, prefix=ENVIRONMENT)
-    from loadgen.dataset import PLAYERS
-    from loadgen.scenario import find_scenario, read_scenario
+    from loadgen.play import play
 
-    scenario = read_scenario(find_scenario(flags.scenario))
-    scenario = scenario.changed(seed=config.seed, tasks=config.tasks, measure_all=config.measure == "both")
-    return PLAYERS[config.testbed](scenario, config.out)
+    _find_modules_here()
+    scenario = read_scenario(find_scenario(flags.scenario)).changed(
+        seed=config.seed,
+        tasks=config.tasks,
+        measure_all=config.measure == "both",
+        policy=config.policy,
+        predictor=config.predictor,
+    )
+    played = play(scenario, config.out, config.testbed)
+    played.check_robots()
+    played.check_verdicts()
+    return 0
+
+
+def _compare(argv: Sequence[str]) -> int:
+    """play scenarios once per policy and seed, in turn, and compare the policies with intervals"""
+    from loadgen.compare import CompareConfig, run_compare
+    from loadgen.scenario import shipped
+
+    parser = CommandParser(prog="loadgen compare", description=_compare.__doc__)
+    help = f"TOML files, or shipped ones: {', '.join(shipped())}"
+    parser.add_argument("scenarios", metavar="SCENARIO", nargs="+", help=help)
+    add_flags(parser, CompareConfig, ENVIRONMENT)
+    flags = parser.parse_args(argv)
+    _find_modules_here()
+    return run_compare(flags.scenarios, resolve(CompareConfig, flags, environ=os.environ, prefix=ENVIRONMENT))
 
 
 def _table(argv: Sequence[str]) -> int:
@@ -136,9 +164,14 @@ def _file_and_config(name: str, about: str | None, cls: type[C], argv: Sequence[
     return flags.trace, resolve(cls, flags, environ=os.environ, prefix=ENVIRONMENT)
 
 
+def _find_modules_here() -> None:
+    """As `python -m` does, so that a scenario's task may be a module of the user's."""
+    sys.path.insert(0, str(Path.cwd()))
+
+
 def _wan(argv: Sequence[str]) -> int:
     """the relay between robot and cloud: delay, jitter, loss, bandwidth, outage and other faults"""
-    from loadgen.wan import WanConfig, run_wan
+    from loadgen.relay.wan import WanConfig, run_wan
 
     parser = CommandParser(prog="loadgen wan", description=_wan.__doc__)
     add_flags(parser, WanConfig, "WAN")
@@ -148,6 +181,7 @@ def _wan(argv: Sequence[str]) -> int:
 COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "demo": _demo,
     "run": _run,
+    "compare": _compare,
     "table": _table,
     "replay": _replay,
     "report": _report,

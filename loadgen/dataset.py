@@ -15,14 +15,12 @@ from typing import Any
 
 from common import VERSION
 from common.config import REQUIRED, check, setting
-from common.errors import OffloadError
-from loadgen.compose import play_in_containers
 from loadgen.notes import disturbance, read_noted
-from loadgen.play import TRACE, play
+from loadgen.play import TESTBEDS, play
+from loadgen.player import TRACE
 from loadgen.rows import read, write_csv, write_whole
-from loadgen.scenario import Scenario, find_scenario, read_scenario
+from loadgen.scenario import Scenario, Workload, find_scenario, read_scenario
 
-PLAYERS = {"docker": play_in_containers, "local": play}
 ASK_S = 10
 
 
@@ -32,7 +30,7 @@ class DatasetConfig:
 
     out: Path = setting(Path("out/datasets"), "folder for NAME.csv and NAME.json", metavar="DIR")
     run: Path = setting(Path("out/dataset"), "folder for the run itself: NAME/trace.jsonl", metavar="DIR")
-    testbed: str = setting("docker", "where it is measured", choices=tuple(PLAYERS))
+    testbed: str = setting("docker", "where it is measured", choices=tuple(TESTBEDS))
     rows: int = setting(1000, "plans, each on both sites", minimum=1)
     alone: int = setting(100, "further plans that tell how much the two sites disturb each other", minimum=0)
     seed: int | None = setting(None, "instead of the scenario's own", minimum=0)
@@ -47,9 +45,7 @@ def run_dataset(name: str, config: DatasetConfig, command: Sequence[str]) -> int
     scenario = scenario.changed(seed=config.seed, tasks=config.rows, measure_all=True, alone=config.alone)
     run = config.run / scenario.name
     started_at, commit = datetime.now(UTC), _commit()
-    code = PLAYERS[config.testbed](scenario, run)
-    if code != 0:
-        raise OffloadError(f"the robot ended with exit code {code}; what it did is in {run}")
+    play(scenario, run, config.testbed).check_robots()
     rows, disturbed = read_noted(run / TRACE), disturbance(run / TRACE)
     about = {
         "name": scenario.name,
@@ -96,14 +92,21 @@ def _conditions(scenario: Scenario, testbed: str) -> str:
     """Where and how the rows were measured, in one line."""
     workload, link = scenario.workload, ", ".join(f"{key} {value}" for key, value in scenario.link.items())
     return (
-        f"Measured on the {testbed} testbed: {workload.map.name} at {workload.resolution:g} m, "
+        f"Measured on the {testbed} testbed: {_asked(workload)}, "
         f"seed {scenario.seed}, robot {scenario.robot.cpus:g} CPU, link {link or 'direct'}."
     )
 
 
+def _asked(workload: Workload) -> str:
+    if workload.map is None:
+        return f"task {workload.task}, sizes {','.join(workload.sizes)}"
+    return f"{workload.map.name} at {workload.resolution:g} m"
+
+
 def _settings(scenario: Scenario) -> dict[str, Any]:
     settings = asdict(scenario)
-    settings["workload"]["map"] = scenario.workload.map.name
+    if scenario.workload.map:
+        settings["workload"]["map"] = scenario.workload.map.name
     return settings
 
 

@@ -1,6 +1,6 @@
 """One process of a testbed: started so that it cannot outlive us, waited for, ended.
 
-Which processes there are is the business of `testbed`.
+Which processes there are is the business of `processes`.
 """
 
 import contextlib
@@ -14,13 +14,14 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import FrameType
+from typing import Any, NoReturn
 
 from common.errors import ConfigError, OffloadError
 from loadgen.quota import Quota
+from loadgen.relay.client import ask
 
 LAUNCH_S = 10.0
-ASK_S = 2.0
 POLL_S = 0.05
 TERMINATE_S = 5.0
 KILL_S = 5.0
@@ -49,14 +50,14 @@ except OSError as error:
 @dataclass(frozen=True, slots=True)
 class Part:
     """One process: its command, the address (host:port) and path that answer 200 once it is ready, and
-    the CPUs it is held to. Its output goes to logs/NAME.log, or where ours goes if `inherit`."""
+    the CPUs it is held to. Its output goes to logs/NAME.log, or where ours goes if `shown`."""
 
     name: str
     command: tuple[str, ...]
     http: str | None = None
     ready: str = "/ready"
     cpus: float | None = None
-    inherit: bool = False
+    shown: bool = False
 
 
 @dataclass(slots=True)
@@ -113,7 +114,7 @@ def launch(part: Part, log: Path, *, again: bool) -> Child:
             str(launching),
             *part.command,
         ]
-        output: Any = {} if part.inherit else {"stdout": file, "stderr": subprocess.STDOUT}
+        output: Any = {} if part.shown else {"stdout": file, "stderr": subprocess.STDOUT}
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, start_new_session=True, pass_fds=[launching], **output
         )
@@ -154,16 +155,9 @@ def end(child: Child) -> None:
     child.process.wait(KILL_S)
 
 
-def ask(address: str, method: str, path: str, body: str | None = None) -> tuple[int, str]:
-    connection = http.client.HTTPConnection(address, timeout=ASK_S)
-    headers = {} if body is None else {"Content-Type": "application/json"}
-    try:
-        with contextlib.closing(connection):
-            connection.request(method, path, body, headers)
-            reply = connection.getresponse()
-            return reply.status, reply.read().decode()
-    except (OSError, http.client.HTTPException) as error:
-        raise OffloadError(f"http://{address}{path} does not answer: {error}") from error
+def leave(number: int, _frame: FrameType | None) -> NoReturn:
+    """A handler of SIGTERM: leave by an exception, so that what was started is ended."""
+    raise SystemExit(128 + number)
 
 
 @contextlib.contextmanager

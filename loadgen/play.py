@@ -1,96 +1,164 @@
-"""Plays a scenario on the local testbed: starts the parts, drives the robot, prints and keeps the table."""
+"""Plays a scenario on a testbed: starts the parts, makes the events happen, keeps what was seen, judges.
 
-from collections.abc import Sequence
+Which machines these are is the testbed's business, what the tasks are the robot's.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
-from common.errors import ConfigError, OffloadError
-from loadgen.disturbance import WAYS
+from common import VERSION
+from common.errors import OffloadError
+from loadgen.check import Verdict
+from loadgen.digest import digests
 from loadgen.evaluate import TableConfig, table_text
+from loadgen.outcome import FIGURES, Answered, Outcome, read_answered, read_readings, read_references
+from loadgen.player import EVENTS, READINGS, TRACE, Files, Player, make_room, setups
+from loadgen.processes import LocalTestbed
+from loadgen.recovery import read_outage
+from loadgen.rows import write_whole
 from loadgen.scenario import Scenario, find_scenario, read_scenario
-from loadgen.testbed import LocalTestbed
-from robot_client.trace import alone_path
+from loadgen.testbed import Setup, Testbed
+from loadgen.verify import verified
+from robot_client.trace import alone_path, reference_path
 
-TRACE = "trace.jsonl"
+SUMMARY = "summary.json"
 TABLE = "table.md"
 DEMO_WINDOWS = ("5", "10", "20", "30", "40", "50")
-ROBOT_S_A_TASK = 10.0  # a run that takes longer than this for each of its tasks has hung
-ROBOT_S_AT_LEAST = 300.0
 
 
-def play(scenario: Scenario, out: Path) -> int:
-    """Play to the end; the robot's exit code. The trace is OUT/trace.jsonl, an earlier one is replaced.
+def _local(out: Path, setups: Mapping[str, Setup]) -> Testbed:
+    return LocalTestbed(out, setups)
 
-    Where the workload asks for it, the plans measured alone are in OUT/trace.alone.jsonl.
+
+def _docker(out: Path, setups: Mapping[str, Setup]) -> Testbed:
+    from loadgen.containers import DockerTestbed
+
+    return DockerTestbed(out, setups)
+
+
+TESTBEDS: dict[str, Callable[[Path, Mapping[str, Setup]], Testbed]] = {"local": _local, "docker": _docker}
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """A run that came to its end: its outcome, the verdict of every check, each robot's exit code."""
+
+    scenario: Scenario
+    outcome: Outcome
+    verdicts: Sequence[Verdict]
+    exit_codes: Mapping[str, int]
+
+    def check_robots(self) -> None:
+        """OffloadError where a robot ended badly of itself."""
+        ended = {
+            event.value for event in self.scenario.timeline() if event.action in ("kill", "stop", "restart")
+        }
+        for robot, code in self.exit_codes.items():
+            if code != 0 and robot not in ended:
+                how = f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
+                raise OffloadError(f"{robot} {how}")
+
+    def check_verdicts(self) -> None:
+        """OffloadError where a check did not hold."""
+        failed = [verdict for verdict in self.verdicts if not verdict.holds]
+        if failed:
+            raise OffloadError(f"{len(failed)} of {len(self.verdicts)} checks of {self.scenario.name} failed")
+
+
+def play(scenario: Scenario, out: Path, testbed: str = "local", *, quiet: bool = False) -> Played:
+    """Play to the end. What an earlier run left in `out` is replaced; docs/formats.md names the files.
+
+    Unless `quiet`, the first robot's output, and what is done, go to stdout.
     """
-    trace = make_room(out)
-    quota = f"{scenario.robot.cpus:g} CPU"
-    with LocalTestbed(
-        out,
-        link={**scenario.link, "seed": scenario.seed},
-        cloud_args=cloud_args(scenario),
-        robot_cpus=scenario.robot.cpus,
-    ) as testbed:
-        print(f"starting the cloud server and the relay (logs in {out / 'logs'})", flush=True)
-        testbed.start()
-        print(f"starting the robot, held to {quota}: {scenario.workload.tasks} plans", flush=True)
-        testbed.start_robot(robot_args(scenario, scenario.workload.map, trace))
-        held = testbed.quota("robot")
-        if held is not None:
-            print(f"quota: {held.cpus:g} CPU over {held.period_s * 1e3:g} ms by {held.kind}", flush=True)
-        tasks = scenario.workload.tasks + len(WAYS) * scenario.workload.alone
-        code = testbed.wait("robot", max(ROBOT_S_AT_LEAST, ROBOT_S_A_TASK * tasks))
-    if code < 0:
-        raise OffloadError(f"the robot was ended by signal {-code}")
-    print(f"written: {trace}", flush=True)
-    if scenario.workload.alone:
-        print(f"written: {alone_path(trace)}", flush=True)
-    return code
+    say = _unsaid if quiet else _say
+    started_at, workload = datetime.now(UTC), scenario.workload
+    played_from = digests(scenario)  # of what the parts load now
+    with TESTBEDS[testbed](out, setups(scenario, out, shown=not quiet)) as bed:
+        make_room(out)
+        say(f"starting the cloud server and the relay (logs in {out / 'logs'})")
+        bed.start()
+        many = "the robot" if workload.robots == 1 else f"{workload.robots} robots"
+        tasks = f"{workload.tasks} {'plans' if workload.map else 'tasks'}"
+        say(f"starting {many}, held to {scenario.robot.cpus:g} CPU: {tasks}")
+        exit_codes = Player(scenario, bed, say).play()
+    played = judge(scenario, out, exit_codes)
+    about = {"testbed": testbed, "started_at": started_at.isoformat(timespec="seconds"), **played_from}
+    write_summary(out, played, about)
+    for verdict in played.verdicts:
+        say(str(verdict))
+    for path in (out / TRACE, alone_path(out / TRACE), out / SUMMARY):
+        if path.exists():
+            say(f"written: {path}")
+    return played
 
 
 def play_demo(out: Path) -> int:
     """The shipped demo scenario, then Table II of the plans that were measured on both sites."""
-    code = play(read_scenario(find_scenario("demo")), out)
-    if code != 0:
-        raise OffloadError(f"the robot ended with exit code {code}")
+    play(read_scenario(find_scenario("demo")), out).check_robots()
     text = table_text(out / TRACE, TableConfig(windows=DEMO_WINDOWS, feedback="both"))
     (out / TABLE).write_text(text)
     print(f"\n{text}\nwritten: {out / TABLE}; charts: loadgen report {out}")
     return 0
 
 
-def make_room(out: Path) -> Path:
-    """The trace to be written in `out`, which is made; what an earlier run left there is removed."""
-    trace = out / TRACE
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        for left in (trace, alone_path(trace)):
-            left.unlink(missing_ok=True)
-    except OSError as error:
-        raise ConfigError(f"--out: {out} cannot be written to: {error.strerror}") from error
-    return trace
+def judge(scenario: Scenario, out: Path, exit_codes: Mapping[str, int]) -> Played:
+    """The outcome of the run in `out`, its answers verified, and what the checks say."""
+    workload, asked = scenario.workload, {}
+    answered: list[Answered] = []
+    stopped = {event.value for event in scenario.timeline() if event.action == "stop"}
+    for files in Files.of(scenario, out):
+        answers = read_answered(files.answers, files.trace, files.robot)
+        answered += verified(answers, workload, files.seed)
+        # One that was stopped asked for no more than it got; one that was killed still owes the others.
+        last = max((one.i for one in answers), default=-1)
+        asked[files.robot] = last + 1 if files.robot in stopped else workload.tasks
+    outcome = Outcome(
+        asked=asked,
+        answered=answered,
+        references=read_references(reference_path(out / TRACE)),
+        readings=read_readings(out / READINGS),
+        deadline_s=None if workload.deadline_ms is None else workload.deadline_ms / 1e3,
+        outage=read_outage(out / EVENTS),
+    )
+    verdicts = [check.judge(outcome) for check in scenario.checks]
+    return Played(scenario, outcome, verdicts, exit_codes)
 
 
-def cloud_args(scenario: Scenario) -> Sequence[str]:
-    """Flags of `cloud-server`, but for where it listens."""
-    return ["--executor", scenario.cloud.executor, "--workers", str(scenario.cloud.workers)]
-
-
-def robot_args(scenario: Scenario, map: Path, trace: Path) -> Sequence[str]:
-    """Flags of `robot-client`, but for where the cloud is; the map and the trace as the robot sees them."""
-    workload, robot = scenario.workload, scenario.robot
-    flags = {
-        "map": map,
-        "resolution": workload.resolution,
-        "tasks": workload.tasks,
-        "measure": workload.measure,
-        "alone": workload.alone,
-        "obstacles": workload.obstacles,
-        "radius": workload.radius_m,
-        "policy": robot.policy,
-        "predictor": robot.predictor,
-        "window": robot.window,
-        "timeout": robot.timeout_s,
+def write_summary(out: Path, played: Played, about: Mapping[str, Any]) -> None:
+    """The last file of a run; `about` is what its other files do not tell."""
+    scenario = played.scenario
+    summary = {
+        "name": scenario.name,
         "seed": scenario.seed,
-        "trace": trace,
+        "policy": scenario.robot.policy,
+        "predictor": scenario.robot.predictor,
+        "tasks": scenario.workload.tasks * scenario.workload.robots,
+        "software": VERSION,
+        **about,
+        "exit_codes": dict(played.exit_codes),
+        "figures": figures(played.outcome, scenario),
+        "checks": [verdict.as_dict() for verdict in played.verdicts],
     }
-    return [part for flag, value in flags.items() for part in (f"--{flag}", str(value))]
+    write_whole(out / SUMMARY, json.dumps(summary, indent=2, ensure_ascii=False) + "\n")
+
+
+def figures(outcome: Outcome, scenario: Scenario) -> dict[str, float | None]:
+    """All figures of the whole run that its workload has."""
+    known = scenario.workload.known()
+    return {
+        name: figure.compute(outcome)
+        for name, figure in FIGURES.items()
+        if figure.needs is None or known[figure.needs]
+    }
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)
+
+
+def _unsaid(_text: str) -> None:
+    pass

@@ -37,6 +37,14 @@ class Quota:
         self._process = os.pidfd_open(pid)  # names this process for good: its number may be used again
         atexit.register(self.close)
 
+    def set(self, cpus: float) -> None:
+        """Hold it to so many CPUs from now on."""
+        raise NotImplementedError
+
+    def add(self, pid: int) -> None:
+        """Let another process share the quota, until this is closed."""
+        raise NotImplementedError
+
     def pause(self) -> None:
         """Stop the process until `resume`."""
         self._signal(signal.SIGSTOP)
@@ -65,8 +73,7 @@ class Quota:
 
 def hold(pid: int, cpus: float) -> Quota:
     """Hold the process, all its threads together, to `cpus` CPUs from now on."""
-    if not CPUS_MIN <= cpus <= CPUS_MAX:
-        raise ConfigError(f"CPU quota {cpus} is not a number from {CPUS_MIN} to {CPUS_MAX:g}")
+    check_cpus(cpus)
     for version, home, parent in _places(pid):
         try:
             return CgroupQuota(pid, cpus, version, home, parent)
@@ -75,23 +82,36 @@ def hold(pid: int, cpus: float) -> Quota:
     return SignalQuota(pid, cpus)
 
 
+def check_cpus(cpus: float) -> None:
+    if not CPUS_MIN <= cpus <= CPUS_MAX:
+        raise ConfigError(f"CPU quota {cpus} is not a number from {CPUS_MIN} to {CPUS_MAX:g}")
+
+
 class CgroupQuota(Quota):
     """The kernel's own quota, in a group made under `parent`; the process goes back `home` at close."""
 
     def __init__(self, pid: int, cpus: float, version: int, home: Path, parent: Path) -> None:
         self.kind = f"cgroup v{version}"
+        self._version = version
         self._home = home
         self._group = parent / f"offboard-{os.getpid()}-{pid}"
         _remove_left_behind(parent)
         self._group.mkdir()
         try:
-            self._write(version, cpus)
-            (self._group / "cgroup.procs").write_text(str(pid))
-            self.cpus, self.period_s = self._read(version)
+            self.set(cpus)
+            self.add(pid)
             super().__init__(pid)
         except OSError:
             self._remove()
             raise
+
+    def set(self, cpus: float) -> None:
+        check_cpus(cpus)
+        self._write(self._version, cpus)
+        self.cpus, self.period_s = self._read(self._version)
+
+    def add(self, pid: int) -> None:
+        (self._group / "cgroup.procs").write_text(str(pid))
 
     def close(self) -> None:
         if self._process >= 0:
@@ -142,13 +162,25 @@ class SignalQuota(Quota):
     def __init__(self, pid: int, cpus: float) -> None:
         super().__init__(pid)
         self.cpus = cpus
-        self._clock = (~pid << 3) | 2  # the kernel's number for a process's CPU clock
+        self._used_s = {pid: 0.0}  # CPU time of every process that shares the quota, as last seen
+        self._sharing: list[int] = []  # what names the others for good
         self._lock = threading.Lock()
         self._spent = False
         self._paused = False
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._control, name=f"quota-{pid}", daemon=True)
         self._thread.start()
+
+    def set(self, cpus: float) -> None:
+        check_cpus(cpus)
+        self.cpus = cpus
+
+    def add(self, pid: int) -> None:
+        with self._lock:
+            self._sharing.append(os.pidfd_open(pid))
+            self._used_s[pid] = 0.0
+            if self._spent or self._paused:
+                signal.pidfd_send_signal(self._sharing[-1], signal.SIGSTOP)
 
     def pause(self) -> None:
         self._set(paused=True)
@@ -160,10 +192,12 @@ class SignalQuota(Quota):
         self._closing.set()
         self._thread.join(CLOSE_WAIT_S)
         super().close()
+        while self._sharing:
+            os.close(self._sharing.pop())
 
     def _control(self) -> None:
         with contextlib.suppress(OSError):  # the process is gone
-            credit_s, used_s, filled_s = 0.0, time.clock_gettime(self._clock), time.monotonic()
+            credit_s, used_s, filled_s = 0.0, self._used(), time.monotonic()
             while not self._closing.is_set():
                 now_s = time.monotonic()
                 elapsed_s = min(now_s - filled_s, PERIODS_MADE_UP * SIGNAL_PERIOD_S)  # more than one if late
@@ -173,10 +207,20 @@ class SignalQuota(Quota):
                     left_s := now_s + SIGNAL_PERIOD_S - time.monotonic()
                 ) > 0 and not self._closing.is_set():
                     self._closing.wait(left_s if self._spent else min(left_s, max(credit_s, SIGNAL_STEP_S)))
-                    used_before_s, used_s = used_s, time.clock_gettime(self._clock)
+                    used_before_s, used_s = used_s, self._used()
                     credit_s -= used_s - used_before_s
                     if credit_s <= 0:
                         self._set(spent=True)
+
+    def _used(self) -> float:
+        """CPU seconds of all that share the quota; OSError once the held process is gone."""
+        for pid in tuple(self._used_s):
+            try:
+                self._used_s[pid] = time.clock_gettime((~pid << 3) | 2)  # the number of its CPU clock
+            except OSError:
+                if pid == self.pid:
+                    raise
+        return sum(self._used_s.values())
 
     def _set(self, spent: bool | None = None, paused: bool | None = None) -> None:
         """Change why the process is stopped, and stop or continue it where that makes a difference."""
@@ -186,6 +230,12 @@ class SignalQuota(Quota):
             self._paused = self._paused if paused is None else paused
             if stopped != (self._spent or self._paused):
                 self._signal(signal.SIGCONT if stopped else signal.SIGSTOP)
+
+    def _signal(self, number: signal.Signals) -> None:
+        super()._signal(number)
+        for process in self._sharing:
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(process, number)
 
 
 def _places(pid: int) -> Iterator[tuple[int, Path, Path]]:

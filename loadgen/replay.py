@@ -23,7 +23,7 @@ from loadgen.score import Scored, Sides
 from robot_client import policies, predictors
 from robot_client.offloader import WINDOW, Offloader
 from robot_client.policies import Decision, Forecast, Policy
-from robot_client.runner import CLOUD, ONBOARD, Execution
+from robot_client.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
 from robot_client.window import WINDOW_MAX
 
 ORACLE = "oracle"
@@ -35,14 +35,19 @@ class ReplayConfig(Asked):
     """Which policies to replay, and what they predict with."""
 
     policies: tuple[str, ...] = setting(
-        policies.names(), "policies to replay", choices=policies.names(), metavar="NAME,NAME,.."
+        (*policies.names(), policies.DEFAULT), f"policies to replay: {policies.HELP}", metavar="NAME,NAME,.."
     )
-    predictor: str = setting(predictors.LEAST_SQUARES, predictors.HELP, metavar="NAME")
+    predictor: str | None = setting(
+        None, f"for all of them, instead of each one's own: {predictors.HELP}", metavar="NAME"
+    )
     window: int = setting(WINDOW, "rows of warm-up, not scored", minimum=2, maximum=WINDOW_MAX)
 
     def __post_init__(self) -> None:
         check(self)
-        predictors.check_name(self.predictor, "--predictor")
+        for policy in self.policies:
+            policies.check_name(policy, "--policies")
+        if self.predictor is not None:
+            predictors.check_name(self.predictor, "--predictor")
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,24 +109,32 @@ def tables(path: Path, config: ReplayConfig) -> list[Table]:
     return [_table(path, rows, config, mode, recorded) for mode in config.modes()]
 
 
-def replay(rows: Rows, policy: str, *, predictor: str, window: int, feedback: str, seed: int = 1) -> Played:
+def replay(
+    rows: Rows, policy: str, *, predictor: str | None, window: int, feedback: str, seed: int = 1
+) -> Played:
     """Offer every row to `policy`, in order; what it did with those after the first `window`.
 
     The warm-up runs on both sites whatever the policy, so that all are scored on the same rows.
     """
-    chooser = _Chooser(policies.make(policy), every=feedback == FULL)
+    chooser = _Chooser(policies.make(policy, seed), every=feedback == FULL)
+    name = policies.predictor_of(policy) if predictor is None else predictor
     to_cloud, both = np.zeros((2, len(rows)), dtype=bool)
     with Offloader(
         [_Replaying(ONBOARD, rows.onboard_s), _Replaying(CLOUD, rows.cloud_s)],
         policy=chooser,
-        predictor=lambda: predictors.make(predictor, window, seed),
+        predictor=lambda: predictors.make(name, window, seed),
     ) as offload:
         for row, size in enumerate(rows.size.tolist()):
             offload(_replayed, size, row, where=BOTH if row < window else None)
             if row >= window:
-                to_cloud[row], both[row] = chooser.last.site == CLOUD, chooser.last.both
+                to_cloud[row], both[row] = chooser.last.site == CLOUD, _ran_both(chooser.last)
     first = rows.cloud_s < rows.onboard_s
     return Played(np.where(both, first, to_cloud)[window:], both[window:])
+
+
+def _ran_both(decision: Decision) -> bool:
+    """A probe runs both at once; a hedge waits for a time that a replayed task does not have."""
+    return decision.both or (decision.second is not None and decision.second_after_s == 0)
 
 
 class _Chooser:
@@ -154,6 +167,12 @@ class _Replaying:
         future.set_result(Execution(self.site, self._seconds[row]))
         return future
 
+    def cancel(self, task: Task) -> None:
+        pass
+
+    def condition(self) -> Condition:
+        return UNMEASURED
+
     def close(self) -> None:
         pass
 
@@ -168,7 +187,8 @@ def _table(path: Path, rows: Rows, config: ReplayConfig, feedback: str, recorded
     for name in (*config.policies, ORACLE):
         lines.extend(_lines(rows, name, config, feedback))
     left_out = f" ({rows.left_out} tasks without both times left out)" if rows.left_out else ""
-    about = f"predictor {config.predictor}, window {config.window}, feedback {feedback}"
+    predictor = config.predictor or "each policy's own"
+    about = f"predictor {predictor}, window {config.window}, feedback {feedback}"
     return Table(
         caption=f"{path}: {len(rows)} rows{left_out}, {about}.",
         about={
@@ -176,7 +196,7 @@ def _table(path: Path, rows: Rows, config: ReplayConfig, feedback: str, recorded
             "rows": len(rows),
             "left_out": rows.left_out,
             "feedback": feedback,
-            "predictor": config.predictor,
+            "predictor": predictor,
             "window": config.window,
         },
         headings={name: of for name, of in HEADINGS.items() if name != "bound" or config.bootstrap},

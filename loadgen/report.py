@@ -15,7 +15,7 @@ from loadgen import paper
 from loadgen.evaluate import ALL, BOTH, CHOSEN, FULL, TableConfig
 from loadgen.findings import Findings
 from loadgen.page import Panel, page
-from loadgen.play import TRACE
+from loadgen.player import TRACE
 from loadgen.replay import ORACLE, RECORDED, ReplayConfig
 from loadgen.rows import write_whole
 from loadgen.series import POINTS_MAX, Times
@@ -43,9 +43,8 @@ class ReportConfig:
         (), f"further predictors, in the tables and against N; or {ALL}", metavar="NAME,NAME,.."
     )
     policies: tuple[str, ...] = setting(
-        policies.names(),
-        "policies to replay; the decisions drawn are those of the first",
-        choices=policies.names(),
+        ("paper", ONBOARD, CLOUD),
+        f"policies to replay: {policies.HELP}; the decisions drawn are those of the first",
         metavar="NAME,NAME,..",
     )
     feedback: str = setting(
@@ -59,6 +58,7 @@ class ReportConfig:
     def __post_init__(self) -> None:
         check(self)
         predictors.check_name(self.predictor, "--predictor")
+        self.replay()
         self.table()
 
     def table(self) -> TableConfig:

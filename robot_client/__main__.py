@@ -1,17 +1,21 @@
-"""`robot-client`: a simulated robot that plans on a real map, each plan where its policy says."""
+"""`robot-client`: a simulated robot that plans on a real map, or calls of a task; where its policy says."""
 
 import logging
 import os
 import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from functools import partial
+from pathlib import Path
 from typing import NoReturn
 
 from common.config import as_dict, load, run_command
 from common.errors import ConfigError, OffloadError
+from robot_client.answers import Answers
 from robot_client.config import RobotConfig
-from robot_client.runner import ONBOARD, PORT_MAX
+from robot_client.lines import Lines
+from robot_client.runner import CLOUD, ONBOARD, PORT_MAX
 from robot_client.trace import Record
 
 log = logging.getLogger("robot_client")
@@ -27,7 +31,7 @@ def _run(argv: Sequence[str]) -> int:
         RobotConfig,
         argv,
         prog="robot-client",
-        description="Drive a simulated robot over a map; each plan runs onboard or in the cloud.",
+        description="Drive a simulated robot over a map, or call a task; each runs onboard or in the cloud.",
         environ=os.environ,
         prefix="ROBOT",
     )
@@ -39,42 +43,72 @@ def _run(argv: Sequence[str]) -> int:
 
 def _drive(config: RobotConfig) -> int:
     # Loaded after the flags are read: --help answers without compiling anything.
-    from common.planner import plan_path
-    from robot_client.drive import Drive, read_prior
+    from robot_client.drive import Drive, OwnRecord
     from robot_client.offloader import Offloader
-    from robot_client.trace import Trace, alone_path
+    from robot_client.references import References
+    from robot_client.trace import Trace, alone_path, reference_path
+    from robot_client.work import make_work
 
-    prior = read_prior(config.map, config.resolution)
+    if config.task is not None:
+        sys.path.insert(0, str(Path.cwd()))  # as `python -m` does, so that --task finds the user's modules
+    own = OwnRecord()
+    connect = partial(Offloader.connect, config.cloud, timeout_s=config.timeout_s)
+    answers = Answers(config.answers) if config.answers else None
+    if answers and answers.done and config.map and not config.jump:
+        raise ConfigError(
+            f"--answers: {answers.path} holds {len(answers.done)} answers; going on needs --jump"
+        )
     trace = Trace(config.trace) if config.trace else None
     alone = Trace(alone_path(config.trace)) if config.trace and config.alone else None
-    observers = ([trace.write] if trace else []) + _metrics(config)
-    connect = partial(Offloader.connect, config.cloud, timeout_s=config.timeout_s)
+    files: list[Answers | Lines] = [file for file in (answers, trace, alone) if file]
+    observers: list[Callable[[Record], None]] = [own, *([trace.write] if trace else []), *_metrics(config)]
     try:
-        with connect(
-            sites=config.sites(),
-            policy=config.policy,
-            predictor=config.predictor,
-            window=config.window,
-            seed=config.seed,
-            observers=observers,
-        ) as offload:
-            drive = Drive(config, prior, offload, print)
+        work = make_work(config)
+        with ExitStack() as stack:
+            offload = stack.enter_context(
+                connect(
+                    sites=config.sites(),
+                    policy=config.policy,
+                    predictor=config.predictor,
+                    window=config.window,
+                    seed=config.seed,
+                    objective=config.goal(),
+                    energy=config.energy(),
+                    allowance=config.allowance(),
+                    memory=config.memory,
+                    observers=observers,
+                )
+            )
+            again, references = None, None
+            if config.trace and config.reference:
+                again = stack.enter_context(connect(sites=config.sites()))
+                sites = [ONBOARD, CLOUD, *config.sites()]
+                path, every = reference_path(config.trace), config.reference
+                references = References(path, again, sites, every=every, tasks=config.tasks, seed=config.seed)
+                files.append(references)
+            for file in files:
+                if file is not alone:  # closed before the sites are: what is given up then has no record
+                    stack.callback(file.close)
+            drive = Drive(config, work, offload, own, print, answers=answers, references=references)
             with connect(sites=config.sites()) as unseen:
-                absent = unseen.wait_for_sites(plan_path, config.connect_s)
+                absent = unseen.wait_for_sites(work.function, config.connect_s)
                 drive.warm(unseen)
-            _say_absent("starting", absent or offload.wait_for_sites(plan_path, config.connect_s))
+            absent = absent or offload.wait_for_sites(work.function, config.connect_s)
+            if again:
+                absent = absent or again.wait_for_sites(work.function, config.connect_s)
+                drive.warm(again)
+            _say_absent("starting", absent)
             drive.run()
         if alone:
             # An offloader of its own: what the run learnt, wrote and counted is of the run alone.
             with connect(observers=[alone.write]) as offload:
-                _say_absent("measuring", offload.wait_for_sites(plan_path, config.connect_s))
+                _say_absent("measuring", offload.wait_for_sites(work.function, config.connect_s))
                 drive.run_alone(offload)
     finally:
-        for file in (trace, alone):
-            if file:
-                file.close()
-    for file in (trace, alone):
-        if file and file.lost:
+        for file in files:
+            file.close()
+    for file in files:
+        if file.lost:
             raise OffloadError(f"{file.lost} tasks are not in {file.path}")
     return 0
 

@@ -28,11 +28,13 @@ from common.errors import (
     CloudTimeout,
     ConfigError,
     OffloadError,
+    Overtaken,
     ProtocolError,
     TaskFailed,
 )
 from common.tasks import Kind, Task, kinds
-from robot_client.runner import CLOUD, Execution, check_endpoint
+from robot_client.heartbeat import Heartbeat
+from robot_client.runner import CLOUD, Condition, Execution, check_endpoint
 
 PENDING_MAX = 1024
 ATTEMPTS_MAX = 4  # sends of one request: the first, and one after each `need_blob`
@@ -69,12 +71,14 @@ class CloudRunner:
     """Runs tasks on the server at `endpoint` (tcp://HOST:PORT).
 
     The site is available for a kind once the server has answered `hello` on the present connection with
-    the same protocol version and the same source for that kind.
+    the same protocol version and the same source for that kind. `heartbeat_s`: seconds between heartbeats;
+    0: none, and nothing is measured but tasks.
     """
 
-    def __init__(self, endpoint: str, *, site: str = CLOUD) -> None:
+    def __init__(self, endpoint: str, *, site: str = CLOUD, heartbeat_s: float = 0.0, seed: int = 0) -> None:
         check_endpoint(site, endpoint)
         self.site = site
+        self._heartbeat = Heartbeat(heartbeat_s, seed)
         self._endpoint = endpoint
         self._absent: str | None = f"no answer from {endpoint} yet"
         self._remote: dict[str, str] = {}
@@ -82,6 +86,7 @@ class CloudRunner:
         self._told: set[str] = set()
         self._pending: dict[int, _Pending] = {}
         self._inbox: deque[_Pending] = deque()
+        self._unwanted: deque[int] = deque()
         self._waker, self._wake = _wake_pair()
         self._closing = False
         self._hello_due = float("inf")
@@ -131,6 +136,13 @@ class CloudRunner:
             pending.future.cancel()
         return pending.future
 
+    def cancel(self, task: Task) -> None:
+        self._unwanted.append(task.id)
+        self._wake_up()
+
+    def condition(self) -> Condition:
+        return self._heartbeat.condition(time.perf_counter())
+
     def close(self) -> None:
         self._closing = True
         self._wake_up()
@@ -167,10 +179,19 @@ class CloudRunner:
                 self._receive_all()
             while self._inbox:
                 self._send_first(self._inbox.popleft())
+            while self._unwanted:
+                self._give_up(self._unwanted.popleft())
             self._expire()
+            self._beat()
 
     def _wait_s(self) -> float:
-        due = min([self._hello_due, *(pending.deadline for pending in self._pending.values())])
+        due = min(
+            [
+                self._hello_due,
+                self._heartbeat.due_s,
+                *(pending.deadline for pending in self._pending.values()),
+            ]
+        )
         return min(max(0.0, due - time.perf_counter()), IDLE_WAIT_S)
 
     def _watch_connection(self) -> None:
@@ -180,6 +201,7 @@ class CloudRunner:
                 self._say_hello()
             elif event == zmq.EVENT_DISCONNECTED:
                 self._hello_due = float("inf")
+                self._heartbeat.stop()
                 if self._absent is None:
                     log.warning("%s: connection to %s lost", self.site, self._endpoint)
                 self._absent = f"not connected to {self._endpoint}"
@@ -191,6 +213,18 @@ class CloudRunner:
         self._hello_due = time.perf_counter() + HELLO_EVERY_S
         known = {kind.name: kind.source_hash for kind in kinds()}
         self._send(wire.Hello(known, SOFTWARE, MESSAGE_BYTES_MAX))
+
+    def _beat(self) -> None:
+        now_s = time.perf_counter()
+        if self._heartbeat.due_s <= now_s:
+            self._send(wire.Ping(self._heartbeat.beat(now_s)))
+
+    def _give_up(self, request_id: int) -> None:
+        """Nobody waits for the answer any more."""
+        if request_id in self._pending:
+            self._send(wire.Cancel(request_id))
+            self._finish(request_id, Overtaken("another site answered first"), censored=True)
+            self._heartbeat.hurry(time.perf_counter())
 
     def _send_first(self, pending: _Pending) -> None:
         if not pending.future.set_running_or_notify_cancel():
@@ -218,8 +252,11 @@ class CloudRunner:
         return wire.byte_count(frames)
 
     def _receive_all(self) -> None:
-        while self._socket.poll(0):
-            frames = self._socket.recv_multipart(copy=False)
+        while True:
+            try:
+                frames = self._socket.recv_multipart(zmq.DONTWAIT, copy=False)
+            except zmq.Again:
+                return
             received = time.perf_counter()
             buffers = [frame.buffer for frame in frames]
             try:
@@ -236,8 +273,15 @@ class CloudRunner:
             self._remote, self._message_bytes_max = message.tasks, message.message_bytes_max
             if self._absent is not None:
                 log.info("%s: %s is up", self.site, self._endpoint)
+                self._heartbeat.start(received)
             self._absent = None
-        elif isinstance(message, wire.Reply) and message.id in self._pending:
+            return
+        if isinstance(message, wire.Pong):
+            self._heartbeat.answer(message.id, received, message.queue_depth)
+            return
+        if isinstance(message, wire.Reply):
+            self._heartbeat.hear(received, message.queue_depth)
+        if isinstance(message, wire.Reply) and message.id in self._pending:
             if message.status == "need_blob":
                 self._send_blobs(self._pending[message.id], message.missing)
             else:
@@ -290,6 +334,7 @@ class CloudRunner:
         for request_id in [id for id, pending in self._pending.items() if pending.deadline <= now]:
             self._send(wire.Cancel(request_id))
             self._finish(request_id, CloudTimeout("no answer within the budget"), censored=True)
+            self._heartbeat.hurry(now)
 
     def _finish(
         self, request_id: int, failure: CloudError, *, censored: bool = False, started: bool = True

@@ -1,169 +1,237 @@
-"""The simulated robot at work: ask for a plan, drive it, say how it goes, sum it up."""
+"""The robot at work: asks for each task when it is due, notes what came back, goes on, and sums it up."""
 
-import statistics
-import sys
-from collections.abc import Callable
-from pathlib import Path
-from random import Random
+import contextlib
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import Any, TypeVar
 
-from common import cpu
-from common.maps import GridMap, read_map, resampled
-from common.planner import plan_path, warm
+from common import cpu, errors
+from common.errors import ConfigError, TaskError
+from common.tasks import kind_of
+from robot_client.answers import Answered, Answers
 from robot_client.config import RobotConfig
 from robot_client.offloader import BOTH, Offloader
-from robot_client.robot import SimulatedRobot
+from robot_client.references import References, orders
 from robot_client.runner import CLOUD, ONBOARD
+from robot_client.summary import Summary, describe, show_progress
 from robot_client.trace import Record
+from robot_client.work import Work
+from robot_client.workload import CLOSED, due_instants
 
-PROGRESS_EVERY = 10  # tasks
-WAYS = (ONBOARD, CLOUD, BOTH)  # in which `Drive.run_alone` runs each of its plans
+MADE_MAX = 32  # tasks that wait, ready made, for their instant
+WAYS = (ONBOARD, CLOUD, BOTH)  # in which `Drive.run_alone` runs each of its tasks
+
+T = TypeVar("T")
+
+
+class OwnRecord(threading.local):
+    """An observer that keeps, for each thread, the record of the task that it asked for last."""
+
+    record: Record | None = None
+
+    def __call__(self, record: Record) -> None:
+        self.record = record
+
+    def take(self) -> Record | None:
+        """The record, once."""
+        record, self.record = self.record, None
+        return record
 
 
 class Drive:
-    """Makes `config.tasks` plans on `prior`, the first `config.measure` of them on both sites."""
+    """Asks for `config.tasks` tasks of `work`, the first `config.measure` of them on both sites.
+
+    `own` is an observer of `offload`. With `answers` every task leaves a line there, those that have one
+    are not asked again, and a task that fails does not end the run.
+    """
 
     def __init__(
-        self, config: RobotConfig, prior: GridMap, offload: Offloader, say: Callable[[str], None]
+        self,
+        config: RobotConfig,
+        work: Work,
+        offload: Offloader,
+        own: OwnRecord,
+        say: Callable[[str], None],
+        *,
+        answers: Answers | None = None,
+        references: References | None = None,
     ) -> None:
         self._config = config
+        self._work = work
         self._offload = offload
+        self._own = own
         self._say = say
-        self._robot = SimulatedRobot(
-            prior, seed=config.seed, obstacles=config.obstacles, radius_m=config.radius_m
-        )
-        self._summary = Summary()
+        self._answers = answers
+        self._references = references
+        self._done = answers.done if answers else frozenset()
+        self._left = sum(number not in self._done for number in range(config.tasks))
+        self._summary = Summary(found=work.found, due=config.arrivals != CLOSED)
+        self._noted = 0
+        self._lock = threading.Lock()  # of the summary
+        self._stopped = False
+        self._start_s: float | None = None
 
     def warm(self, offload: Offloader) -> None:
-        """Compile the planner and prepare the map on all sites before the first measured task.
+        """Get all sites ready for the first measured task; it is the same task afterwards.
 
         `offload` is not the one of the run, which shall learn and record nothing of this.
         """
-        warm()
+        kind = kind_of(self._work.function)
+        if kind.warm is not None:
+            kind.warm()
         cpu.used_s()  # the first call looks for what to read
-        offload(plan_path, *self._robot.request(), where=BOTH)
+        if kind.duplicate:
+            with contextlib.suppress(TaskError):  # task 0 will say it again
+                offload(self._work.function, *self._work.request(), where=BOTH)
 
     def run(self) -> None:
-        """All plans, and the summary."""
-        for number in range(self._config.tasks):
-            measured = number < self._config.measure
-            plan = self._offload(plan_path, *self._robot.request(), where=BOTH if measured else None)
-            self._robot.drive(plan)
-            record = self._offload.last
-            assert record is not None
-            self._summary.add(record, planned=plan.status == "NONE")
-            _progress(number + 1, self._config.tasks, record)
+        """All tasks that have no answer yet, and the summary."""
+        if self._done:
+            self._say(
+                f"{self._config.tasks - self._left} of {self._config.tasks} tasks had their answer before"
+            )
+        if self._config.arrivals == CLOSED:
+            self._run_closed()
+        else:
+            self._run_open()
         for line in self._summary.lines():
             self._say(line)
 
     def run_alone(self, offload: Offloader) -> None:
-        """`config.alone` further plans, each run in all WAYS one after the other, in turning order.
+        """`config.alone` further tasks, each run in all WAYS one after the other, in turning order.
 
         `offload` knows onboard and the cloud, and nobody else.
         """
-        whole = 0
-        for number, order in enumerate(orders(self._config.alone, self._config.seed)):
-            request, ran = self._robot.request(), 0
+        whole, what = 0, "plans" if self._config.map else "tasks"
+        for number, order in enumerate(orders(self._config.alone, self._config.seed, WAYS)):
+            request, ran = self._work.request(), 0
             for n, way in enumerate(order, 1):
-                plan = offload(plan_path, *request, where=way)
+                answer = offload(self._work.function, *request, where=way)
                 record = offload.last
                 assert record is not None
                 ran += _ran(record, way)
-                _progress(number * len(WAYS) + n, self._config.alone * len(WAYS), record)
-            self._robot.drive(plan)
+                show_progress(number * len(WAYS) + n, self._config.alone * len(WAYS), describe(record))
+            self._work.advance(answer)
             whole += ran == len(WAYS)
         missing = f"; the {CLOUD} did not answer for the others" if whole < self._config.alone else ""
         self._say(
-            f"run on each site alone and on both at once: {whole} of {self._config.alone} plans{missing}"
+            f"run on each site alone and on both at once: {whole} of {self._config.alone} {what}{missing}"
         )
 
+    def _run_closed(self) -> None:
+        """Each task when the last is answered."""
+        for number in range(self._config.tasks):
+            answer = None
+            if number not in self._done:
+                request = self._work.request()
+                self._begin()
+                answer = self._ask(number, None, request)
+            self._work.advance(answer)
 
-def read_prior(path: Path, resolution: float) -> GridMap:
-    """The map that the robot was given; ROS maps at the planning resolution."""
-    grid = read_map(path)
-    return grid if path.suffix == ".map" else resampled(grid, resolution)
+    def _run_open(self) -> None:
+        """Each task when it is due, or as soon as fewer than `config.in_flight` are under way."""
+        slots = threading.BoundedSemaphore(self._config.in_flight)
+        pool = ThreadPoolExecutor(self._config.in_flight, thread_name_prefix="task")
+        failures: deque[BaseException] = deque(maxlen=1)
+
+        def finish(future: "Future[Any]") -> None:
+            if not future.cancelled() and (failure := future.exception()) is not None:
+                failures.append(failure)
+            slots.release()
+
+        try:
+            with contextlib.closing(made_ahead(self._made())) as made:
+                for number, due_s, request in made:
+                    self._begin()
+                    time.sleep(max(0.0, due_s - self._now_s()))
+                    slots.acquire()
+                    if failures:
+                        break
+                    pool.submit(self._ask, number, due_s, request).add_done_callback(finish)
+            pool.shutdown()
+            if failures:
+                raise failures[0]
+        except BaseException:  # Ctrl-C too
+            self._stopped = True  # what is given up now is not answered
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+    def _made(self) -> Iterator[tuple[int, float, tuple[Any, ...]]]:
+        """Number, due instant in s after that of the first, and arguments of each task without an answer."""
+        config, first_s = self._config, None
+        assert config.rate is not None, "checked by the config"
+        instants = due_instants(config.arrivals, config.rate, config.burst, config.seed)
+        for number, due_s in zip(range(config.tasks), instants, strict=False):
+            if number not in self._done:
+                first_s = due_s if first_s is None else first_s
+                yield number, due_s - first_s, self._work.request()
+            self._work.advance(None)
+
+    def _begin(self) -> None:
+        """The first task is due: times count from here."""
+        if self._start_s is None:
+            if self._answers:
+                self._answers.begin()
+            self._start_s = time.monotonic()
+
+    def _now_s(self) -> float:
+        assert self._start_s is not None, "not begun"
+        return time.monotonic() - self._start_s
+
+    def _ask(self, number: int, due_s: float | None, request: tuple[Any, ...]) -> Any:
+        """Run the task now and note how it went; its answer, None where it has none."""
+        where = BOTH if number < self._config.measure else None
+        answer, described, error = None, None, None
+        began_s = self._now_s()
+        due_s = began_s if due_s is None else due_s
+        try:
+            answer = self._offload(self._work.function, *request, where=where)
+            ended_s = self._now_s()
+            described = self._work.describe(answer) if self._answers else None
+        except Exception as failure:  # also what the user's own size function raises
+            if self._answers is None or isinstance(failure, ConfigError):
+                raise
+            ended_s, answer, error = self._now_s(), None, errors.describe(failure)
+        record = self._own.take()
+        if self._stopped:
+            return None
+        if self._answers:
+            own_id = record.id if record else None
+            self._answers.write(Answered(number, own_id, due_s, began_s, ended_s, error, described))
+        self._note(record, answer, error, began_s - due_s)
+        if self._references and self._references.due(number) and record is not None:
+            self._references.measure(
+                number, self._work.function, request, waited_s=ended_s - due_s, record=record
+            )
+        return answer
+
+    def _note(self, record: Record | None, answer: Any, error: str | None, late_s: float) -> None:
+        with self._lock:
+            if record is None or error is not None:
+                self._summary.add_failure(late_s=late_s)
+            else:
+                self._summary.add(record, got=self._work.got(answer), late_s=late_s)
+            self._noted += 1
+            show_progress(self._noted, self._left, describe(record) if record else str(error))
 
 
-def orders(count: int, seed: int) -> list[tuple[str, ...]]:
-    """The order of WAYS for each of so many plans; in every three each way is first, second and third once.
-
-    Whatever a run leaves behind for the next one, warm caches or a spent quota, meets all ways alike.
-    """
-    random = Random(seed)
-    found: list[tuple[str, ...]] = []
-    while len(found) < count:
-        order = random.sample(WAYS, len(WAYS))
-        found += [(*order[n:], *order[:n]) for n in range(len(WAYS))]
-    return found[:count]
-
-
-def describe(record: Record) -> str:
-    """One decision in one line."""
-    took = ", ".join(
-        f"{one.site} {one.seconds * 1e3:.1f} ms" if one.ok else f"{one.site} {one.error}"
-        for one in record.executions
-    )
-    return f"size {record.size:.2f} -> {took} ({record.decision.reason})"
+def made_ahead(tasks: Iterator[T]) -> Generator[T]:
+    """The same in the same order, made by one thread, up to MADE_MAX of them before they are asked for."""
+    maker = ThreadPoolExecutor(1, thread_name_prefix="maker")
+    try:
+        made = deque(maker.submit(next, tasks, None) for _ in range(MADE_MAX))
+        wait(made)
+        while (task := made.popleft().result()) is not None:
+            made.append(maker.submit(next, tasks, None))
+            yield task
+    finally:
+        maker.shutdown(cancel_futures=True)
 
 
 def _ran(record: Record, way: str) -> bool:
     """Whether it ran well where it was sent, and nowhere else."""
     sent = [ONBOARD, CLOUD] if way == BOTH else [way]
     return sorted(one.site for one in record.executions if one.ok) == sorted(sent)
-
-
-def _progress(done: int, total: int, record: Record) -> None:
-    if sys.stdout.isatty():
-        print(f"\r\x1b[K{done}/{total} {describe(record)}"[:160], end="", flush=True)
-        if done == total:
-            print()
-    elif done % PROGRESS_EVERY == 0 or done == total:
-        print(f"{done}/{total} {describe(record)}", flush=True)
-
-
-class Summary:
-    """What the robot says at the end; keeps a few numbers a task."""
-
-    def __init__(self) -> None:
-        self._planned = 0
-        self._both: list[tuple[float | None, float | None]] = []  # seconds onboard, and of the fastest other
-        self._waited: dict[str, list[float]] = {}  # by the chosen site
-        self._fallbacks = 0
-
-    def add(self, record: Record, *, planned: bool) -> None:
-        self._planned += planned
-        if record.decision.both:
-            good = {one.site: one.seconds for one in record.executions if one.ok}
-            onboard = good.pop(ONBOARD, None)
-            self._both.append((onboard, min(good.values(), default=None)))
-        else:
-            self._waited.setdefault(record.decision.site, []).append(record.waited_s)
-            self._fallbacks += len(record.executions) > 1
-
-    def lines(self) -> list[str]:
-        chosen = sum(map(len, self._waited.values()))
-        lines = [f"{len(self._both) + chosen} tasks answered; a path was found for {self._planned}"]
-        if self._both:
-            lines.append(f"run on both sites: {len(self._both)}; {_both_times(self._both)}")
-        if chosen:
-            lines.append(f"run on the chosen site: {chosen} ({self._shares(chosen)}); {self._times()}")
-        return lines
-
-    def _shares(self, chosen: int) -> str:
-        return ", ".join(f"{site} {len(self._waited[site]) / chosen:.0%}" for site in sorted(self._waited))
-
-    def _times(self) -> str:
-        waited = sorted(1e3 * seconds for times in self._waited.values() for seconds in times)
-        p95 = waited[min(len(waited) - 1, int(0.95 * len(waited)))]
-        mean = statistics.fmean(waited)
-        return f"mean {mean:.1f} ms, P95 {p95:.1f} ms; {self._fallbacks} fell back {ONBOARD}"
-
-
-def _both_times(times: list[tuple[float | None, float | None]]) -> str:
-    pairs = [(onboard, other) for onboard, other in times if onboard is not None and other is not None]
-    if not pairs:
-        return "no answer from another site"
-    onboard_ms, other_ms = (1e3 * statistics.fmean(column) for column in zip(*pairs, strict=True))
-    share = sum(onboard > other for onboard, other in pairs) / len(pairs)
-    return (
-        f"cloud mean {other_ms:.1f} ms, onboard mean {onboard_ms:.1f} ms; the cloud was faster in {share:.0%}"
-    )

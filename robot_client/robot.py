@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from common.errors import ConfigError
 from common.flood import covered
-from common.maps import OCCUPIED, GridMap, largest_component, passable
+from common.maps import OCCUPIED, GridMap, largest_component, passable, path_size
 from common.planner import RADIUS_CELLS_MAX, RADIUS_M, Plan, Point, Pose, Scan, scan_hits
 from robot_client.lidar import BEAMS, RANGE_MAX_M, cast_scan
 
@@ -26,7 +26,8 @@ Request = tuple[GridMap, Scan, Pose, Point, float]
 class SimulatedRobot:
     """A robot of `radius_m` on `prior`, in a world with `obstacles` boxes more; all random by `seed`.
 
-    `truth` is that world; `stops` counts the paths that it could not drive to their end.
+    `truth` is that world; `stops` counts the paths that it could not drive to their end. Wherever a `size`
+    is taken, it is the input size d that the next goal shall have as nearly as the candidates allow.
     """
 
     def __init__(
@@ -38,6 +39,7 @@ class SimulatedRobot:
         radius_m: float = RADIUS_M,
         beams: int = BEAMS,
         range_max: float = RANGE_MAX_M,
+        size: float | None = None,
     ) -> None:
         if radius_m > RADIUS_CELLS_MAX * prior.resolution:
             allowed = f"at most {RADIUS_CELLS_MAX} cells of {prior.resolution:g} m"
@@ -51,19 +53,19 @@ class SimulatedRobot:
         self.stops = 0
         self._failures = 0
         self._set_down()
-        self._pick_goal()
+        self._pick_goal(size)
 
     def request(self) -> Request:
         """The arguments of `plan_path`, from where the robot stands; asking twice changes nothing."""
         return self.prior, self._scan(), self.pose, self.goal, self.radius_m
 
-    def drive(self, plan: Plan) -> NDArray[np.int32]:
+    def drive(self, plan: Plan, size: float | None = None) -> NDArray[np.int32]:
         """Follow the plan, looking again every half metre; stop before what was not there when it was made.
 
         Returns the cells (row, col) it drove, K x 2.
         """
         if plan.status != "NONE":
-            self._give_up_goal()
+            self.give_up_goal(size)
             return plan.cells
         self._failures = 0
         driven = self._follow(plan.cells)
@@ -71,14 +73,20 @@ class SimulatedRobot:
         self.stops += not reached
         self._tries += 1
         if reached or self._tries == TRIES_MAX:
-            self._pick_goal()
+            self._pick_goal(size)
         return driven
 
-    def _give_up_goal(self) -> None:
+    def jump(self, size: float | None = None) -> None:
+        """Stand at the goal, turned at random, and pick the next one: nothing of it depends on an answer."""
+        self.pose = Pose(self.goal.x, self.goal.y, float(self._random.uniform(-math.pi, math.pi)))
+        self._pick_goal(size)
+
+    def give_up_goal(self, size: float | None = None) -> None:
+        """There is no path to the goal: pick another one, from another place if that went on for long."""
         self._failures += 1
         if self._failures == FAILURES_MAX:
             self._set_down()
-        self._pick_goal()
+        self._pick_goal(size)
 
     def _follow(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:
         """Drive cell by cell; those before the first that is not safe."""
@@ -114,7 +122,8 @@ class SimulatedRobot:
         return cast_scan(self.truth, self.pose, beams=self._beams, range_max=self._range_max)
 
     def _free(self, grid: GridMap) -> NDArray[np.int32]:
-        free = np.argwhere(largest_component(passable(grid, self.radius_m))).astype(np.int32)
+        # Row after row: from any other order a draw of a few cells copies them all first.
+        free = np.argwhere(largest_component(passable(grid, self.radius_m))).astype(np.int32, order="C")
         if len(free) < 2:
             raise ConfigError(f"the map has no room for a robot of radius {self.radius_m} m")
         return free
@@ -124,14 +133,20 @@ class SimulatedRobot:
         self.pose = Pose(float(x), float(y), float(self._random.uniform(-math.pi, math.pi)))
         self._failures = 0
 
-    def _pick_goal(self) -> None:
-        """Near and far alike: of some random cells the one nearest to a distance drawn evenly."""
+    def _pick_goal(self, size: float | None) -> None:
+        """Of some random cells the one nearest to `size`; without, to a distance drawn evenly."""
         points = self.prior.metres(self._random.choice(self._standable, CANDIDATES))
         distances = np.hypot(*(points - (self.pose.x, self.pose.y)).T)
-        wanted = self._random.uniform(0, distances.max())
-        x, y = points[np.abs(distances - wanted).argmin()]
+        if size is None:
+            away = np.abs(distances - self._random.uniform(0, distances.max()))
+        else:
+            away = np.abs([self._size(distance) - size for distance in distances])
+        x, y = points[away.argmin()]
         self.goal = Point(float(x), float(y))
         self._tries = 0
+
+    def _size(self, distance_m: float) -> float:
+        return path_size(distance_m, self.prior.resolution, self.prior.cells.size)
 
 
 def _with_boxes(prior: GridMap, free: NDArray[np.int32], count: int, random: np.random.Generator) -> GridMap:

@@ -48,6 +48,25 @@ class Execution:
         return None if self.failure is None else f"{type(self.failure).__name__}: {self.failure}"
 
 
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """What is measured of a site beside the times of its tasks: the features of a prediction.
+
+    `round_trip_s` is that of its heartbeats (None: it has none); `silent`: they go unanswered; `queue`: tasks
+    that wait there, as it last said; `load`: the share of the robot's own CPU that others take, 0 to 1;
+    `wait_s`: how long the robot's own tasks will still keep the site from beginning.
+    """
+
+    round_trip_s: float | None = None
+    silent: bool = False
+    queue: int = 0
+    load: float = 0.0
+    wait_s: float = 0.0
+
+
+UNMEASURED = Condition()
+
+
 class Runner(Protocol):
     """Runs tasks on one site. All methods may be called from any thread."""
 
@@ -60,6 +79,12 @@ class Runner(Protocol):
     def submit(self, task: Task, budget_s: float) -> "Future[Execution]":
         """Start the task. The future always gets an Execution, never an exception; a remote runner
         gives the task up after `budget_s` seconds."""
+
+    def cancel(self, task: Task) -> None:
+        """The answer is no longer wanted: where it can still be stopped, its future ends now, censored."""
+
+    def condition(self) -> Condition:
+        """What is measured now. Must not block; it is asked once a task."""
 
     def close(self) -> None:
         """Stop; tasks in flight are given up. Safe to call twice."""

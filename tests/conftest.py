@@ -1,30 +1,38 @@
 """Fixtures that make real parts and end them."""
 
 import os
-from collections.abc import Callable, Iterator
+import signal
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from loadgen.testbed import LocalTestbed
+from loadgen.processes import LocalTestbed
+from loadgen.testbed import Setup
 from robot_client.offloader import Offloader
 
 ROOT = Path(__file__).parents[1]
 # The compiled planner is kept beside the checkout, as `make` does it.
 os.environ.setdefault("NUMBA_CACHE_DIR", str(ROOT / ".cache" / "numba"))
+# A shell's background job ignores Ctrl-C, and so would every process that a test starts and interrupts.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
-PROBES = ("--tasks", "tests.probes", "--workers", "1")
+PROBES = {"tasks": "tests.probes", "workers": 1}
 
 
 @pytest.fixture
 def testbed(tmp_path: Path) -> Iterator[Callable[..., LocalTestbed]]:
-    """Makes started testbeds: a real server and a real relay on loopback, without delay unless asked for."""
+    """Makes started testbeds: a real server and a real relay on loopback, without delay unless asked for.
+
+    The server's flags are the first argument, the link's conditions are named.
+    """
     made: list[LocalTestbed] = []
 
-    def factory(*cloud_args: str, **link: Any) -> LocalTestbed:
+    def factory(cloud: Mapping[str, Any] | None = None, **link: Any) -> LocalTestbed:
         conditions = {"delay_ms": 0.0, "bandwidth_mbps": 0.0} | link
-        bed = LocalTestbed(tmp_path, link=conditions, cloud_args=[*PROBES, *cloud_args])
+        setups = {"cloud": Setup(PROBES | dict(cloud or {})), "wan": Setup(conditions)}
+        bed = LocalTestbed(tmp_path, setups)
         bed.__enter__()
         made.append(bed)
         bed.start()

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 
 from common.tasks import Kind, Task
-from robot_client.runner import Execution
+from robot_client.runner import UNMEASURED, Condition, Execution
 
 
 class ScriptedRunner:
@@ -18,6 +18,8 @@ class ScriptedRunner:
         self.absent = unavailable
         self.tasks: list[Task] = []
         self.closed = False
+        self.cancelled: list[Task] = []
+        self.measured = UNMEASURED
 
     def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - the same for every kind
         return self.absent
@@ -27,6 +29,12 @@ class ScriptedRunner:
         future: Future[Execution] = Future()
         future.set_result(self.script(task))
         return future
+
+    def cancel(self, task: Task) -> None:
+        self.cancelled.append(task)
+
+    def condition(self) -> Condition:
+        return self.measured
 
     def close(self) -> None:
         self.closed = True

@@ -9,18 +9,19 @@ import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 WAN = """
 import sys
 from common.config import load, run_command
-from loadgen.wan import WanConfig, run_wan
+from loadgen.relay.wan import WanConfig, run_wan
 settings = dict(prog="wan", description="", environ={}, prefix="WAN")
 sys.exit(run_command("wan", lambda: run_wan(load(WanConfig, sys.argv[1:], **settings))))
 """
 WAIT_S = 5.0
-PINGS = 50
-BATCHES = 3
+PINGS = 15
+BATCHES = 10
 QUIET_S = 0.15
 
 
@@ -65,9 +66,9 @@ def round_trip_s(client: socket.socket) -> float:
     return time.perf_counter() - start
 
 
-def quietest(measure: Callable[[], float]) -> float:
-    """The least of three medians: other load on the machine only ever adds."""
-    return min(statistics.median(measure() for _ in range(PINGS)) for _ in range(BATCHES))
+def quietest(measure: Callable[[], float], batches: int = BATCHES) -> float:
+    """The least median of a batch: other load on the machine only ever adds."""
+    return min(statistics.median(measure() for _ in range(PINGS)) for _ in range(batches))
 
 
 def receive(client: socket.socket, size: int) -> bytes:
@@ -86,6 +87,22 @@ def silent(client: socket.socket) -> bool:
         return True
     finally:
         client.settimeout(WAIT_S)
+
+
+def stop(relay: Wan) -> None:
+    relay.process.terminate()
+    assert relay.process.wait(WAIT_S) == 0
+
+
+def read_truth(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def is_reset(client: socket.socket) -> bool:
+    try:
+        return client.recv(1) is None
+    except ConnectionResetError:
+        return True
 
 
 def wait_until(fact: Callable[[], Any]) -> None:

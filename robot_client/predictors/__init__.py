@@ -9,7 +9,10 @@ from robot_client.predictors.base import Prediction, Predictor
 __all__ = ["LEAST_SQUARES", "Prediction", "Predictor", "check_name", "make", "names", "slow"]
 
 LEAST_SQUARES = "least-squares"
+AVERAGE = "average"
+FEATURES = "features:"  # before a name: with the measured features taken out
 RIVER = "river:"
+WORK = "work:"  # before a name: times per work, where a kind tells its work
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +27,11 @@ class _Entry:
 _ENTRIES: dict[str, _Entry] = {
     LEAST_SQUARES: _Entry("linear", "LeastSquares"),
     "recursive-least-squares": _Entry("linear", "RecursiveLeastSquares"),
+    "clipped-least-squares": _Entry("adaptive", "ClippedLeastSquares"),
+    "bayesian-least-squares": _Entry("adaptive", "BayesianLeastSquares"),
+    "kalman": _Entry("adaptive", "Kalman"),
+    "blind-average": _Entry("average", "blind_average"),
+    AVERAGE: _Entry("average", "Average"),
     "theil-sen": _Entry("robust", "TheilSen"),
     "huber": _Entry("robust", "Huber"),
     "random-forest": _Entry("forest", "RandomForest", slow=True),
@@ -31,7 +39,7 @@ _ENTRIES: dict[str, _Entry] = {
     "sarima": _Entry("series", "Sarima", slow=True),
     "lstm": _Entry("lstm", "Lstm", slow=True),
 }
-HELP = f"{', '.join(_ENTRIES)}, or {RIVER}MODULE.CLASS"  # for --help of whoever takes a name
+HELP = f"{', '.join(_ENTRIES)}, or {RIVER}MODULE.CLASS; {FEATURES}NAME: on measured features"  # for --help
 
 
 def make(name: str, window: int, seed: int = 0) -> Predictor:
@@ -40,6 +48,11 @@ def make(name: str, window: int, seed: int = 0) -> Predictor:
     MissingExtra where its library is not installed.
     """
     check_name(name)
+    name = name.removeprefix(WORK)
+    if name.startswith(FEATURES):
+        from robot_client.predictors.features import Measured
+
+        return Measured(make(name.removeprefix(FEATURES), window, seed))
     if name.startswith(RIVER):
         from robot_client.predictors.online import River
 
@@ -48,6 +61,11 @@ def make(name: str, window: int, seed: int = 0) -> Predictor:
     module = importlib.import_module(f"robot_client.predictors.{entry.module}")
     made: Predictor = getattr(module, entry.name)(window, seed=seed)
     return made
+
+
+def conditional(name: str) -> bool:
+    """Whether it asks for what is measured of a site."""
+    return name.startswith(FEATURES) or name in (AVERAGE, "blind-average")
 
 
 def names() -> tuple[str, ...]:
@@ -62,5 +80,6 @@ def slow(name: str) -> bool:
 
 def check_name(name: str, where: str = "predictor") -> None:
     """ConfigError, naming `where` it stood, unless `make` knows it; nothing is loaded."""
-    if name not in _ENTRIES and not name.startswith(RIVER):
+    plain = name.removeprefix(WORK).removeprefix(FEATURES)
+    if plain not in _ENTRIES and not plain.startswith(RIVER):
         raise ConfigError(f"{where}: {name!r} is not one of {HELP}")

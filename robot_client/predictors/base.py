@@ -17,10 +17,14 @@ SIZE_MIN = 1e-100  # sizes that differ by less are equal: a steeper line would l
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """Expected `seconds` of a task, and the standard deviation of what was seen around it (None: unknown)."""
+    """Expected `seconds` of a task, and the standard deviation of what was seen around it (None: unknown).
+
+    `error_s` is the standard error of the expectation itself, where the predictor knows it.
+    """
 
     seconds: float
     spread_s: float | None
+    error_s: float | None = None
 
 
 class Predictor(Protocol):

@@ -51,9 +51,7 @@ class RecursiveLeastSquares:
 
     def __init__(self, window: int, seed: int = 0, forgetting: float | None = None) -> None:  # noqa: ARG002
         self.window = checked_length(window)
-        self.forgetting = 1 - 1 / window if forgetting is None else forgetting
-        if not 0.5 <= self.forgetting <= 1:
-            raise ConfigError(f"forgetting {forgetting}: must be from 0.5 to 1")
+        self.forgetting = checked_forgetting(window, forgetting)
         self._count = 0  # stops at the window
         self._weight = self._squares = 0.0  # sums of the weights and of their squares
         self._size, self._seconds = _Mean(), _Mean()
@@ -86,9 +84,14 @@ class RecursiveLeastSquares:
     def predict(self, size: float, ahead: int = 1) -> Prediction | None:  # noqa: ARG002
         if not self._count:
             return None
+        return Prediction(self._expected(size), self._spread(self._slope()))
+
+    def _expected(self, size: float) -> float:
+        return self._seconds.value + self._slope() * self._size.offset(size)
+
+    def _slope(self) -> float:
         least = max(ROUNDING * self._size.value, SIZE_MIN)
-        slope = self._sdt / self._sdd if self._sdd > self._weight * least * least else 0.0
-        return Prediction(self._seconds.value + slope * self._size.offset(size), self._spread(slope))
+        return self._sdt / self._sdd if self._sdd > self._weight * least * least else 0.0
 
     def _spread(self, slope: float) -> float | None:
         """Root of the weighted residual sum of squares over W - 2 sum(w^2) / W; N - 2 where nothing fades."""
@@ -96,6 +99,14 @@ class RecursiveLeastSquares:
             return None
         freedom = self._weight - 2 * self._squares / self._weight
         return math.sqrt(max(0.0, self._stt - slope * self._sdt) / freedom)
+
+
+def checked_forgetting(window: int, forgetting: float | None) -> float:
+    """What is left of a weight after one more execution; ConfigError where that is too little or too much."""
+    share = 1 - 1 / window if forgetting is None else forgetting
+    if not 0.5 <= share <= 1:
+        raise ConfigError(f"forgetting {forgetting}: must be from 0.5 to 1")
+    return share
 
 
 class _Mean:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from loadgen.disturbance import measure
-from loadgen.testbed import LocalTestbed
+from loadgen.processes import LocalTestbed
 from robot_client.offloader import Offloader
 from robot_client.policies import PINNED
 from robot_client.runner import CLOUD, ONBOARD, Execution
@@ -54,7 +54,7 @@ def test_cpu_time_tells_computing_from_waiting(
 
     The run is compared in the best of a few: a virtual machine may stand still and not know.
     """
-    offload = connect(testbed("--executor", executor))
+    offload = connect(testbed({"executor": executor}))
     for site in (ONBOARD, CLOUD):
         rests = []
         for _ in range(BURNS):

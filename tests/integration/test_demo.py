@@ -112,5 +112,5 @@ def test_a_killed_robot_is_a_failed_run(tmp_path: Path) -> None:
         (robot,) = (pid for pid, command in marked_processes().items() if "robot_client" in command)
         os.kill(robot, signal.SIGKILL)
         assert host.wait(30) == 1
-        assert host.stderr.read() == "loadgen run: the robot was ended by signal 9\n"
+        assert host.stderr.read() == "loadgen run: robot was ended by signal 9\n"
     assert marked_processes() == {}

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from common.errors import CloudTimeout
-from loadgen.testbed import LocalTestbed
+from loadgen.processes import LocalTestbed
+from loadgen.testbed import Setup
 from robot_client.offloader import Offloader
 from robot_client.runner import CLOUD, ONBOARD
 from robot_client.trace import Record
@@ -167,8 +168,8 @@ def test_a_killed_relay_is_a_lost_connection(testbed: Beds, connect: Connect) ->
 
 def test_a_robot_that_comes_before_the_server_is_warm_is_let_in_later(tmp_path: Path) -> None:
     """hello is answered once every kind is warm, and said again until it is answered."""
-    args = ["--tasks", "tests.slow_probe,tests.probes"]
-    with LocalTestbed(tmp_path, link={"delay_ms": 0.0}, cloud_args=args) as bed:
+    cloud = {"cloud": Setup({"tasks": "tests.slow_probe,tests.probes"})}
+    with LocalTestbed(tmp_path, cloud) as bed:
         bed.start("wan")
         bed.start_part(replace(bed.parts["cloud"], ready="/health"))
         with Offloader.connect(bed.endpoint, policy=CLOUD) as offload:
@@ -204,7 +205,7 @@ def test_a_task_that_must_not_run_twice_did_not(
 
 def test_a_worker_that_dies_costs_no_answer(testbed: Beds, connect: Connect) -> None:
     """A killed worker process is the server's fault: its task is answered onboard, the pool comes back."""
-    offload = connect(testbed("--executor", "processes"), policy=CLOUD, timeout_s=10.0)
+    offload = connect(testbed({"executor": "processes"}), policy=CLOUD, timeout_s=10.0)
     worker = offload(process_id)
     threading.Timer(0.3, os.kill, (worker, signal.SIGKILL)).start()
     assert offload(nap, 1.0) == 1.0
@@ -218,7 +219,7 @@ def test_a_worker_that_dies_costs_no_answer(testbed: Beds, connect: Connect) -> 
 
 def test_a_value_too_large_for_the_server_stays_onboard(testbed: Beds, connect: Connect) -> None:
     """An argument or result over its limit is answered onboard, and the connection lives on."""
-    offload = connect(testbed("--message-mib", "1", "--blob-mib", "8"), policy=CLOUD, timeout_s=5.0)
+    offload = connect(testbed({"message_mib": 1, "blob_mib": 8}), policy=CLOUD, timeout_s=5.0)
     assert len(offload(zeros, 3_000_000)) == 3_000_000
     assert offload(total, np.ones(500_000)) == 500_000
     assert offload.last is not None
@@ -244,7 +245,7 @@ def test_a_blob_that_many_tasks_need_is_uploaded_once(testbed: Beds, connect: Co
 
 def test_a_full_queue_is_answered_onboard(testbed: Beds, connect: Connect) -> None:
     """`busy` is an answer at once, not a wait for the timeout."""
-    bed = testbed("--queue-max", "1")
+    bed = testbed({"queue_max": 1})
     offload = connect(bed, policy=CLOUD, timeout_s=10.0)
     threads = [threading.Thread(target=offload, args=(nap, 1.0), kwargs={"where": CLOUD}) for _ in range(3)]
     for thread in threads:

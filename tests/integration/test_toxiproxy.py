@@ -17,8 +17,8 @@ import pytest
 import toxiproxy
 from toxiproxy.exceptions import InvalidToxic, NotFound, ProxyExists
 
-from loadgen.proxies import PROXIES_MAX, TOXICS_MAX
-from loadgen.toxiproxy import BODY_BYTES_MAX
+from loadgen.relay.proxies import PROXIES_MAX, TOXICS_MAX
+from loadgen.relay.toxiproxy import BODY_BYTES_MAX
 from tests.relays import WAIT_S, receive, round_trip_s, silent
 
 pytestmark = pytest.mark.integration
@@ -225,8 +225,8 @@ def test_reset_peer_resets(client: Any, upstream: Any, timeout_ms: int) -> None:
     proxy = client.create(upstream=upstream(), name="echo")
     proxy.add_toxic(type="reset_peer", attributes={"timeout": timeout_ms})
     start = time.perf_counter()
-    # The RST of 0 may come before the ping is sent.
-    with connect(proxy) as connection, pytest.raises(ConnectionResetError):
+    # The RST of 0 may come before the connect has returned.
+    with pytest.raises(ConnectionResetError), connect(proxy) as connection:
         round_trip_s(connection)
     assert time.perf_counter() - start >= timeout_ms / 1e3
 
@@ -431,6 +431,7 @@ def test_latencies_together_are_bounded(api: int) -> None:
     assert [toxic["name"] for toxic in ask(api, "GET", "/proxies/p/toxics")[1]] == ["one"]
 
 
+@pytest.mark.timeout(40)  # three relays
 def test_toxicity_is_drawn_for_each_connection_from_the_seed(upstream: Any) -> None:
     """With a toxicity of one half some connections time out and some do not: the same ones in two runs
     of one seed, others with another seed."""

@@ -4,11 +4,17 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from common.config import as_dict, check, load, run_command, setting
 from common.errors import ConfigError, DataError, OffloadError
+from robot_client import trace
+from robot_client.allowance import DUPLICATES_MAX
+from robot_client.config import RobotConfig
+from robot_client.energy import Energy
+from robot_client.objectives import Mean, TimeAndEnergy
 
 
 @dataclass(frozen=True)
@@ -141,12 +147,13 @@ FILES = {
     "bad.jsonl": '{"v": 1}\nnonsense\n',
     "text.csv": "size,onboard_s,cloud_s\n1,2,3\n1,two,3\n",
     "empty.csv": "",
+    "answers.jsonl": '{"v":1,"i":0,"id":"","due_s":0,"began_s":0,"ended_s":0,"error":"","answer":null}\n',
     "open.map": "type octile\nheight 3\nwidth 3\nmap\n...\n...\n...\n",
     "text-link.toml": 'name = "odd"\n[workload]\nmap = "open.map"\n[link]\ndelay_ms = "slow"\n',
     "open.toml": 'name = "open"\n[workload]\nmap = "open.map"\n',
     "alone.toml": 'name = "alone"\n[workload]\nmap = "open.map"\ntasks = 3\nalone = 4\n',
     "no-map.toml": 'name = "odd"\n[workload]\nmap = "none.yaml"\n',
-    "odd.toml": 'name = "odd"\n[workload]\nmap = "m.yaml"\ntask = 3\n',
+    "odd.toml": 'name = "odd"\n[workload]\nmap = "m.yaml"\ntaks = 3\n',
 }
 
 
@@ -155,12 +162,23 @@ FILES = {
     [
         (["robot_client"], "--map is missing"),
         (["robot_client", "--map", "none.yaml"], "none.yaml"),
+        (["robot_client", "--task", "m:f", "--map", "open.map"], "--task: 'm:f' is not allowed beside --map"),
+        (["robot_client", "--task", "m:f", "--sizes", "constant:1"], "--task: 'm:f' is not MODULE:FUNCTION"),
+        (["robot_client", "--map", "open.map", "--sizes", "none.csv"], "--sizes: 'none.csv' is not"),
+        (
+            ["robot_client", "--map", "open.map", "--radius", "0", "--answers", "answers.jsonl"],
+            "--answers: answers.jsonl holds 1 answers; going on needs --jump",
+        ),
         (["robot_client", "--map", "no-resolution.yaml"], "no-resolution.yaml: resolution"),
         (["robot_client", "--map", "text-image.yaml"], "words.txt"),
         (["robot_client", "--map", "open.map", "--radius", "9"], "no room for a robot of radius 9.0 m"),
         (
             ["robot_client", "--map", "open.map", "--metrics", "127.0.0.1:99999"],
             "--metrics: '127.0.0.1:99999'",
+        ),
+        (
+            ["robot_client", "--map", "open.map", "--objective", "p95"],
+            "--objective: p95 changes nothing with",
         ),
         (
             ["robot_client", "--map", "open.map", "--trace", "words.txt"],
@@ -195,12 +213,12 @@ FILES = {
         (["loadgen", "table", "empty.csv"], "empty.csv"),
         (["loadgen", "table", "bad.jsonl"], "bad.jsonl:1: no field"),
         (["loadgen", "table", "text.csv", "--windows", "0"], "--windows: '0'"),
-        (["loadgen", "run", "odd.toml"], "odd.toml:4: unknown key 'task'; did you mean 'tasks'?"),
+        (["loadgen", "run", "odd.toml"], "odd.toml:4: unknown key 'taks'; did you mean 'tasks'?"),
         (["loadgen", "run", "no-map.toml"], "no-map.toml: workload.map: "),
         (["cloud_server", "--tasks", "json"], "--tasks: json registers no task"),
         (["cloud_server", "--config", "."], ".: Is a directory"),
-        (["loadgen", "run", "none"], "scenario 'none' is neither a file nor one of congested, demo, paper"),
-        (["loadgen", "run", "text-link.toml"], "text-link.toml: link.delay-ms: 'slow' is not a number"),
+        (["loadgen", "run", "none"], "scenario 'none' is neither a file nor one of bandwidth, burst"),
+        (["loadgen", "run", "text-link.toml"], "text-link.toml: link.delay_ms: 'slow' is not a number"),
         (["loadgen", "run", "open.toml", "--out", "words.txt"], "--out: words.txt cannot be written to"),
         (["loadgen", "wan", "--delay-ms", "-1"], "--delay-ms: -1"),
         (["loadgen", "wan", "--to", "nowhere"], "--to: 'nowhere' is not HOST:PORT"),
@@ -223,7 +241,7 @@ def test_a_users_mistake_is_one_line_and_exit_code_2(
 
 @pytest.mark.parametrize(
     ("command", "extra"),
-    [(["cloud_server"], "cloud"), (["loadgen", "wan"], "bench"), (["loadgen", "run", "demo"], "bench")],
+    [(["cloud_server"], "cloud"), (["loadgen", "wan"], "bench")],
 )
 def test_a_missing_extra_is_named(command: list[str], extra: str) -> None:
     """Without the optional libraries a command says what to install, exit code 2."""
@@ -248,3 +266,122 @@ def test_a_reader_that_leaves_early_is_no_error(tmp_path: Path) -> None:
         f"{table} --format json | true", shell=True, cwd=tmp_path, capture_output=True, text=True, timeout=30
     )
     assert done.stderr == ""
+
+
+MAP, TASK = {"map": Path("m.yaml")}, {"task": "m:f", "sizes": ("constant:1",)}
+OPEN = {"arrivals": "poisson", "rate": 5.0}
+TRACED = {"trace": Path("t"), "cloud": "tcp://h:1"}
+COSTS = {"policy": "greedy"}
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({}, "--map is missing"),
+        (MAP | TASK, "--task: 'm:f' is not allowed beside --map m.yaml"),
+        ({"task": "m:f"}, "--task: 'm:f' needs --sizes"),
+        (MAP | {"sizes": ("constant",)}, "--sizes: 'constant' is not constant:X"),
+        (MAP | {"arrivals": "often"}, "--arrivals: 'often' is not one of closed, constant, poisson, bursts"),
+        (TASK | {"arrivals": "bursts"}, "--arrivals: bursts needs --rate"),
+        (TASK | OPEN | {"rate": 0.0}, "--rate: 0.0 is below 0.001"),
+        (TASK | OPEN | {"burst": 0}, "--burst: 0 is below 1"),
+        (TASK | OPEN | {"in_flight": 0}, "--in-flight: 0 is below 1"),
+        (TASK | OPEN | {"in_flight": 1025}, "--in-flight: 1025 is above 1024"),
+        (MAP | OPEN, "--arrivals: poisson on a map needs --jump"),
+        (TASK | OPEN | {"measure": 1}, "--measure: 1 needs --arrivals closed"),
+        (TASK | OPEN | TRACED | {"alone": 2}, "--alone: 2 needs --arrivals closed"),
+        (TASK | OPEN | TRACED | {"reference": 3}, "--reference: 3 needs --arrivals closed"),
+        (TASK | TRACED | {"reference": 3, "trace": None}, "--reference: 3 needs --trace"),
+        (TASK | TRACED | {"reference": 3, "cloud": None}, "--reference: 3 needs --cloud"),
+        (MAP | TRACED | {"reference": 3}, "--reference: 3 on a map needs --jump"),
+        (MAP | {"reference": -1}, "--reference: -1 is below 0"),
+        (MAP | {"trace": Path("t"), "answers": Path("t")}, "--answers: t is the file of --trace"),
+        (MAP | {"trace": Path("t"), "memory": Path("t")}, "--memory: t is the file of --trace or --answers"),
+        (
+            MAP | COSTS | {"objective": "fast"},
+            "--objective: 'fast' is not one of mean, p95, deadline, energy",
+        ),
+        (MAP | COSTS | {"objective": "deadline"}, "--objective: deadline needs --deadline"),
+        (MAP | COSTS | {"objective": "energy"}, "--objective: energy needs --s-per-joule"),
+        (MAP | COSTS | {"deadline_s": 0.5}, "--deadline: 0.5 needs --objective deadline"),
+        (MAP | COSTS | {"s_per_joule": 2.0}, "--s-per-joule: 2 needs --objective energy"),
+        (MAP | COSTS | {"objective": "deadline", "deadline_s": 0.0}, "--deadline: 0.0 is below 0.001"),
+        (MAP | {"objective": "p95"}, "--objective: p95 changes nothing with --policy paper"),
+        (MAP | {"objective": "p95", "policy": "hedge:cloud"}, "--objective: p95 changes nothing with"),
+        (MAP | {"duplicates": 1.5}, "--duplicates: 1.5 is above 1"),
+        (MAP | {"compute_watts": -1.0}, "--compute-watts: -1.0 is below 0"),
+        (MAP | {"bytes_per_minute": -1.0}, "--bytes-per-minute: -1.0 is below 0"),
+        (MAP | {"joules_per_minute": float("nan")}, "--joules-per-minute: nan is below 0"),
+    ],
+)
+def test_a_workload_that_cannot_be_is_refused(settings: dict[str, Any], message: str) -> None:
+    """Flags that contradict each other are named with their values, before anything is opened."""
+    with pytest.raises(ConfigError) as caught:
+        RobotConfig(**settings)
+    assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        MAP,
+        TASK | OPEN,
+        MAP | OPEN | {"jump": True, "arrivals": "bursts"},
+        MAP | TRACED | {"jump": True, "reference": 10, "measure": 5, "alone": 5},
+        TASK | TRACED | {"reference": 1},
+        MAP | {"policy": "hedge:greedy", "objective": "deadline", "deadline_s": 0.2},
+        MAP | {"bytes_per_minute": 1e6, "joules_per_minute": 60.0, "duplicates": 0.0, "memory": Path("m")},
+    ],
+)
+def test_a_workload_that_can_be_is_taken(settings: dict[str, Any]) -> None:
+    """What is asked for together and goes together is no error."""
+    assert RobotConfig(**settings).in_flight == 16
+
+
+def test_the_flags_of_cost_become_what_the_offloader_is_given() -> None:
+    """Objective, energy and allowance are made of the flags; by default those of the library."""
+    plain = RobotConfig(**MAP)
+    assert isinstance(plain.goal(), Mean)
+    assert plain.energy() == Energy()
+    assert not plain.allowance().capped
+    flags = "--objective energy --s-per-joule 2 --compute-watts 3 --idle-watts 0.5 --radio-joules-byte 1e-6"
+    caps = "--policy greedy --bytes-per-minute 6000 --joules-per-minute 60 --duplicates 0.5"
+    config = load(
+        RobotConfig,
+        ["--map", "m", *flags.split(), *caps.split()],
+        prog="r",
+        description="",
+        environ={},
+        prefix="R",
+    )
+    assert config.goal() == TimeAndEnergy(2.0)
+    assert config.energy() == Energy(3.0, 0.5, 1e-6)
+    allowance = config.allowance()
+    allowance.begin(0.0)
+    assert (allowance.duplicates, allowance.bytes_left, allowance.joules_left) == (
+        DUPLICATES_MAX,
+        6000.0,
+        60.0,
+    )
+
+
+def test_a_command_keeps_and_uses_its_memory(tmp_path: Path) -> None:
+    """With --memory the second run begins with what the first one learnt; a folder is refused."""
+    (tmp_path / "mine.py").write_text(
+        "from common.tasks import task\n"
+        "@task('mine', size=lambda number: number)\n"
+        "def mine(number: int) -> int:\n"
+        "    return number\n"
+    )
+    flags = "--task mine:mine --sizes uniform:1:9 --window 5 --memory memory.json --trace trace.jsonl --tasks"
+    for tasks in ("8", "1"):
+        command = [sys.executable, "-m", "robot_client", *flags.split(), tasks]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=30, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+    records = list(trace.read(tmp_path / "trace.jsonl"))
+    assert records[0]["sites"]["onboard"]["predicted_s"] is None
+    assert records[8]["sites"]["onboard"]["predicted_s"] is not None
+    assert (records[8]["i"], records[8]["sites"]["onboard"]["age"]) == (0, 20)
+    command = [sys.executable, "-m", "robot_client", *flags.replace("memory.json", ".").split(), "1"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=30, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (2, "robot-client: memory .: is a folder\n")

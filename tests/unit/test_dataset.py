@@ -6,16 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.config import load
 from common.errors import ConfigError, DataError
-from loadgen.compose import _overlay, play_in_containers
 from loadgen.dataset import DatasetConfig, ExportConfig, run_dataset, run_export
 from loadgen.evaluate import TableConfig, table_text
 from loadgen.notes import notes
+from loadgen.play import play
 from loadgen.rows import read
 from loadgen.scenario import read_scenario
-from loadgen.wan import WanConfig
-from robot_client.config import RobotConfig
 from robot_client.policies import Decision
 from robot_client.runner import Execution
 from robot_client.trace import Record, Trace
@@ -80,38 +77,16 @@ def test_notes_of_somebody_else_are_named(tmp_path: Path, text: str, expected: s
         notes(tmp_path / "d.csv")
 
 
-@pytest.mark.parametrize("name", ["demo", "paper", "congested"])
-def test_containers_are_told_the_scenario(name: str) -> None:
-    """The commands laid over docker-compose.yml are good ones, and carry the scenario's values."""
-    scenario = read_scenario(ROOT / "loadgen" / "scenarios" / f"{name}.toml")
-    services = _overlay(scenario)["services"]
-    environ: dict[str, str] = {}
-    robot = load(
-        RobotConfig, services["robot"]["command"], prog="", description="", environ=environ, prefix="ROBOT"
-    )
-    assert (robot.tasks, robot.seed, robot.alone) == (
-        scenario.workload.tasks,
-        scenario.seed,
-        scenario.workload.alone,
-    )
-    assert str(robot.map) == "/maps/willow-full-0.05.yaml"
-    assert services["robot"]["volumes"] == [f"{scenario.workload.map.parent}:/maps:ro"]
-    assert services["robot"]["cpu_quota"] == 2000
-    wan = load(
-        WanConfig, services["wan"]["command"][1:], prog="", description="", environ=environ, prefix="WAN"
-    )
-    assert wan.delay_ms == scenario.link["delay_ms"]
-    assert wan.distribution == scenario.link.get("distribution")
-    assert wan.seed == scenario.seed
-
-
 @pytest.mark.parametrize(
     ("docker", "said"),
     [
         (None, r"docker cannot be asked: .*No such file"),
-        ("echo Cannot connect >&2; exit 1", r"docker does not answer to `docker info`: Cannot connect"),
         (
-            'test "$1" = info || { echo unknown command >&2; exit 125; }',
+            "echo Cannot connect >&2; exit 1",
+            r"docker does not answer to `docker compose version`: Cannot connect",
+        ),
+        (
+            'test "$2" = version || exit 0; echo unknown command >&2; exit 125',
             r"docker does not answer to `docker compose version`: unknown command",
         ),
     ],
@@ -127,7 +102,7 @@ def test_containers_need_an_engine(
     monkeypatch.chdir(tmp_path)
     Path("docker-compose.yml").touch()
     with pytest.raises(ConfigError, match=f"--testbed: {said}"):
-        play_in_containers(read_scenario(ROOT / "loadgen" / "scenarios" / "paper.toml"), tmp_path / "out")
+        play(read_scenario(ROOT / "loadgen" / "scenarios" / "paper.toml"), tmp_path / "out", "docker")
     assert not (tmp_path / "out").exists()
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from common.errors import CloudTimeout, DataError
 from loadgen.disturbance import ALONE, Change, Disturbance, measure
-from loadgen.play import TRACE
+from loadgen.player import TRACE
 from robot_client.policies import Decision
 from robot_client.runner import CLOUD, ONBOARD, Execution
 from robot_client.trace import Record, Trace, alone_path, as_dict

@@ -8,9 +8,9 @@ import pytest
 
 from common.config import load
 from common.errors import ConfigError, DataError
-from loadgen.control import Change
-from loadgen.flags import LinkFlags, as_flags
-from loadgen.link import Link, LinkConditions
+from loadgen.relay.control import Change
+from loadgen.relay.flags import LinkFlags, as_flags
+from loadgen.relay.link import Link, LinkConditions
 from loadgen.scenario import read_scenario
 
 NAMES = {field.name for field in fields(LinkConditions)}

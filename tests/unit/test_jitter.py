@@ -10,8 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.errors import DataError
-from loadgen.draws import REPLAY_MAX, Draws, replay_from
-from loadgen.jitter import DISTRIBUTIONS, PARETO_SD, PARETO_SHAPE, SAMPLES_MAX, Jitter, quantile, read_samples
+from loadgen.relay.draws import REPLAY_MAX, Draws, replay_from
+from loadgen.relay.jitter import (
+    DISTRIBUTIONS,
+    PARETO_SD,
+    PARETO_SHAPE,
+    SAMPLES_MAX,
+    Jitter,
+    quantile,
+    read_samples,
+)
 
 SEEDS = st.integers(0, 2**32)
 CORRELATION = 0.6

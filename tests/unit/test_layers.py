@@ -17,8 +17,9 @@ ROOMS = {
 # Heavy or optional libraries, and the files that may import them.
 OWNERS = {
     "zmq": {"robot_client/cloud.py", "cloud_server/server.py"},
-    "fastapi": {"cloud_server/web.py", "loadgen/control.py", "loadgen/toxiproxy.py"},
-    "uvicorn": {"cloud_server/web.py", "loadgen/control.py"},
+    "fastapi": {"cloud_server/web.py", "loadgen/relay/control.py", "loadgen/relay/toxiproxy.py"},
+    "uvicorn": {"cloud_server/web.py", "loadgen/relay/control.py"},
+    "docker": {"loadgen/containers.py"},
     "numba": {"common/compiled.py"},
     "PIL": {"common/maps.py"},
     "yaml": {"common/maps.py"},

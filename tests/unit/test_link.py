@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.errors import ConfigError
-from loadgen.jitter import DISTRIBUTIONS, Jitter
-from loadgen.link import BUCKET_S, CHUNK_BYTES, SEGMENT_BYTES, Link, LinkConditions, Pipe
-from loadgen.loss import Loss, stall_ms
+from loadgen.relay.jitter import DISTRIBUTIONS, Jitter
+from loadgen.relay.link import BUCKET_S, CHUNK_BYTES, SEGMENT_BYTES, Link, LinkConditions, Pipe
+from loadgen.relay.loss import Loss, stall_ms
 
 SEEDS = st.integers(0, 2**32)
 CUTS = st.lists(st.integers(1, 5 * SEGMENT_BYTES), min_size=1, max_size=20)
@@ -217,10 +217,12 @@ def test_a_burst_is_one_bucket(bandwidth_mbps: float, sizes: list[int]) -> None:
 
 
 def test_segments_that_draw_travel_alone() -> None:
-    """With jitter or loss a chunk is within one segment; without, up to eight go together."""
+    """With jitter or loss a chunk is within one segment; else up to eight go together, all where even the
+    bandwidth has no limit."""
     for effect in ({"jitter_ms": 1.0}, {"loss": 0.1}):
         assert Pipe(LinkConditions(**effect), 0, 0, "up").chunk_bytes(10**6) == SEGMENT_BYTES
-    assert Pipe(LinkConditions(delay_ms=15), 0, 0, "up").chunk_bytes(10**6) == CHUNK_BYTES
+    assert Pipe(LinkConditions(bandwidth_mbps=400), 0, 0, "up").chunk_bytes(10**6) == CHUNK_BYTES
+    assert Pipe(LinkConditions(delay_ms=15), 0, 0, "up").chunk_bytes(10**6) == 10**6
 
 
 def test_conditions_change_for_later_chunks() -> None:

@@ -2,10 +2,13 @@
 
 from dataclasses import replace
 
+import pytest
 from prometheus_client import CollectorRegistry
 
+from common.errors import CloudBroken
 from robot_client.metrics import Metrics
-from robot_client.runner import CLOUD, ONBOARD
+from robot_client.regret import Regret
+from robot_client.runner import CLOUD, ONBOARD, Execution
 from tests.unit.test_trace import record
 
 
@@ -26,3 +29,38 @@ def test_a_record_is_counted_once_by_site_and_outcome() -> None:
     assert value("robot_waited_seconds_sum") == 4.2
     assert value("robot_predicted_seconds", site=ONBOARD) == 0.1
     assert value("robot_predicted_seconds", site=CLOUD) is None
+    assert value("robot_decisions_total", site=CLOUD, policy="paper") == 2
+    assert value("robot_duplicates_total") == 2
+
+
+@pytest.mark.parametrize(
+    ("seconds", "inside"), [(0.079, "false"), (0.08, "true"), (0.15, "true"), (0.2, "false")]
+)
+def test_intervals_are_held_to_what_came(seconds: float, inside: str) -> None:
+    """Each answer counts as inside or outside; sites without an interval, and failures, do not."""
+    registry = CollectorRegistry()
+    observe = Metrics(registry)
+    for failure in (None, CloudBroken("gone")):
+        runs = (
+            Execution(ONBOARD, seconds, failure=failure),
+            Execution(CLOUD, seconds),
+            Execution("edge", seconds),
+        )
+        observe(replace(record(0), executions=runs))
+    found = next(one for one in registry.collect() if one.name == "robot_interval").samples
+    assert {
+        (one.labels["site"], one.labels["inside"]): one.value for one in found if one.name.endswith("total")
+    } == {(ONBOARD, inside): 1.0}
+
+
+def test_regret_is_the_last_estimate_with_its_bounds() -> None:
+    """Mean and both ends, and 0 until probes have told."""
+    registry = CollectorRegistry()
+    observe = Metrics(registry)
+    observe(replace(record(0), regret=None))
+    assert registry.get_sample_value("robot_regret_seconds") == 0
+    for mean_s in (0.5, 0.01):
+        observe(replace(record(0), regret=Regret(mean_s, 0.004, 0.02, 9)))
+    observe(replace(record(0), regret=None))
+    names = ("robot_regret_seconds", "robot_regret_low_seconds", "robot_regret_high_seconds")
+    assert [registry.get_sample_value(name) for name in names] == [0.01, 0.004, 0.02]

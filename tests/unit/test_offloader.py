@@ -19,6 +19,7 @@ from common.errors import (
 )
 from common.tasks import Task, task
 from robot_client import policies, predictors
+from robot_client.allowance import DUPLICATES, Allowance
 from robot_client.offloader import Offloader
 from robot_client.onboard import OnboardRunner
 from robot_client.runner import CLOUD, ONBOARD, Execution, Runner
@@ -78,6 +79,29 @@ def test_a_failed_site_is_learnt_and_the_task_runs_onboard(make: Make, failure: 
         assert offload.last is not None
         cloud = offload.last.sites[CLOUD]
         assert (cloud.predicted_s, cloud.failures) == (1.5, 1)
+
+
+def test_a_run_in_place_of_a_failed_one_is_no_second_run(make: Make) -> None:
+    """In an outage the allowance is not spent on answers, nor on what the caller has measured on both."""
+    allowance = Allowance(first=0.0)
+    with make(cloud_answers(0.1, CloudTimeout("late")), OnboardRunner(), allowance=allowance) as offload:
+        for _ in range(10):
+            assert offload(add_one, 4) == 5
+        assert allowance.duplicates == pytest.approx(10 * DUPLICATES)
+        offload(add_one, 4, where="both")
+        assert allowance.duplicates == pytest.approx(11 * DUPLICATES)
+
+
+def test_warm_up_ends_with_the_smallest_window_too(make: Make) -> None:
+    """A window of 2 never holds so many observations: it is full, and that is enough."""
+    sites: list[int] = []
+    onboard = ScriptedRunner(ONBOARD, lambda one: Execution(ONBOARD, 0.5, one.args[0] + 1))
+    with make(cloud_answers(0.1), onboard, policy="greedy") as offload:
+        for _ in range(5):
+            offload(add_one, 1)
+            assert offload.last is not None
+            sites.append(len(offload.last.executions))
+    assert sites == [2, 2, 1, 1, 1]
 
 
 def test_the_tasks_own_exception_is_raised_once_alike(make: Make) -> None:

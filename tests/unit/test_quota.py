@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -84,6 +85,28 @@ def test_a_busy_process_gets_its_share(
         print(f"{quota.kind}: {share:.4f} CPU")
         assert quota.cpus == SHARE
         assert share == pytest.approx(SHARE, rel=TOLERANCE)
+
+
+def test_a_quota_can_be_changed(child: Callable[[str], int], held: Callable[..., Quota]) -> None:
+    """A process held to little gets its larger share once the quota is set to it."""
+    pid = child(BUSY)
+    with held(pid, 0.05) as quota:
+        time.sleep(0.2)
+        quota.set(SHARE)
+        assert quota.cpus == pytest.approx(SHARE)
+        assert used_share(pid) == pytest.approx(SHARE, rel=TOLERANCE)
+
+
+def test_another_process_shares_the_quota(child: Callable[[str], int], held: Callable[..., Quota]) -> None:
+    """A hog beside the process: both together get the share, and each about half of it."""
+    pid, hog = child(BUSY), child(BUSY)
+    with held(pid, SHARE) as quota:
+        quota.add(hog)
+        time.sleep(0.2)
+        with ThreadPoolExecutor(2) as threads:
+            mine, theirs = threads.map(used_share, (pid, hog))
+        assert mine + theirs == pytest.approx(SHARE, rel=TOLERANCE)
+        assert mine == pytest.approx(SHARE / 2, rel=0.4)
 
 
 def test_a_closed_quota_lets_the_process_run(child: Callable[[str], int], held: Callable[..., Quota]) -> None:

@@ -11,7 +11,7 @@ from common import maps, planner
 from common.errors import ConfigError
 from common.maps import GridMap
 from common.planner import Plan, Point, Pose, plan_path, size_of_plan
-from robot_client.robot import FAILURES_MAX, TRIES_MAX, SimulatedRobot
+from robot_client.robot import CANDIDATES, FAILURES_MAX, TRIES_MAX, SimulatedRobot
 
 WILLOW = maps.read_map(Path(__file__).parents[2] / "maps/willow-full-0.05.yaml")
 NO_PATH = Plan("NO_VALID_PATH", np.zeros((0, 2), np.int32), np.zeros((0, 2), np.float32), 0.0, 0)
@@ -89,6 +89,42 @@ def test_goals_are_near_and_far() -> None:
         robot.drive(NO_PATH)
     low, middle, high = np.quantile(sizes, [0.1, 0.5, 0.9])
     assert low * 5 < middle < high / 2
+
+
+def test_jumping_asks_the_same_whatever_was_answered() -> None:
+    """A robot that jumps stands at each goal next; between jumps nothing that it drives changes its tasks."""
+
+    def story(size: float | None, drives: bool) -> list[object]:
+        robot = SimulatedRobot(WILLOW, seed=5, size=size)
+        found = []
+        for _ in range(10):
+            _, scan, pose, goal, _ = request = robot.request()
+            found.append((pose, goal, scan.ranges.tolist()))
+            if drives:
+                plan_path(*request)
+                robot.request()
+            robot.jump(size)
+            assert (robot.pose.x, robot.pose.y) == (goal.x, goal.y)
+        return found
+
+    assert story(None, False) == story(None, True)
+    assert story(0.5, False) == story(0.5, True) != story(None, False)
+    assert len({pose.yaw for pose, _, _ in story(None, False)}) == 10
+
+
+def test_a_goal_is_the_candidate_nearest_in_size() -> None:
+    """With a size each goal is, of the same candidates, the one whose d is nearest to it."""
+    for wanted in (0.0, 0.05, 0.5, 3.0, 1e9):
+        robot, twin = (SimulatedRobot(WILLOW, seed=6, size=wanted) for _ in range(2))
+        for _ in range(5):
+            twin.pose = Pose(robot.goal.x, robot.goal.y)
+            twin._random.bit_generator.state = robot._random.bit_generator.state
+            twin._random.uniform()  # the yaw
+            points = WILLOW.metres(twin._random.choice(twin._standable, CANDIDATES))
+            robot.jump(wanted)
+            made = [size_of_plan(WILLOW, None, robot.pose, Point(x, y)) for x, y in points]
+            got = size_of_plan(WILLOW, None, robot.pose, robot.goal)
+            assert abs(got - wanted) == min(abs(size - wanted) for size in made)
 
 
 def test_asking_twice_changes_nothing() -> None:

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from common.errors import ConfigError, DataError
-from loadgen.link import Link, LinkConditions
-from loadgen.schedule import EVENTS_MAX, Schedule, parse_schedule, read_schedule
+from loadgen.relay.link import Link, LinkConditions
+from loadgen.relay.schedule import EVENTS_MAX, Schedule, parse_schedule, read_schedule
 
 GOOD = """
 [[event]]

@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.errors import ConfigError
-from loadgen.endpoint import on_loopback
-from loadgen.link import Link, LinkConditions
-from loadgen.toxics import ATTRIBUTES, Refused, Toxic, attributes, closes_after_s, link_of
+from loadgen.relay.endpoint import on_loopback
+from loadgen.relay.link import Link, LinkConditions
+from loadgen.relay.toxics import ATTRIBUTES, Refused, Toxic, attributes, closes_after_s, link_of
 
 
 def toxic(type: str, stream: str = "downstream", toxicity: float = 1.0, **given: Any) -> Toxic:

@@ -11,8 +11,9 @@ import pytest
 
 from common.errors import CloudTimeout, ConfigError, DataError
 from robot_client.policies import Decision, Outlook
-from robot_client.runner import CLOUD, ONBOARD, Execution
-from robot_client.trace import Record, Trace, read
+from robot_client.regret import Regret
+from robot_client.runner import CLOUD, ONBOARD, Condition, Execution
+from robot_client.trace import Late, Record, Trace, read
 
 
 def record(i: int = 0) -> Record:
@@ -21,14 +22,20 @@ def record(i: int = 0) -> Record:
         id=f"s-{i}",
         kind="plan_path",
         size=1.5,
-        sites={ONBOARD: Outlook(0.1, 0.01, True, 3, 0), CLOUD: Outlook(None, None, False, 0, 1)},
-        decision=Decision(CLOUD, False, "cloud 1 ms against onboard 2 ms", "paper"),
+        sites={
+            ONBOARD: Outlook(0.1, 0.01, True, 3, 0, low_s=0.08, high_s=0.15),
+            CLOUD: Outlook(None, None, False, 0, 1, condition=Condition(round_trip_s=0.03, queue=2)),
+        },
+        decision=Decision(CLOUD, False, "cloud 1 ms against onboard 2 ms", "paper", ONBOARD, 0.5),
         executions=(
             Execution(CLOUD, 2.0, failure=CloudTimeout("late"), censored=True, bytes_out=10),
             Execution(ONBOARD, 0.1, queue_s=0.0, run_s=0.1, network_s=0.0, cpu_s=0.02),
         ),
         used=ONBOARD,
         waited_s=2.1,
+        amount=70.0,
+        late=(Late("s-7", CLOUD, 0.4, True, False),),
+        regret=Regret(0.01, 0.0, 0.02, 9),
         started_at=datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC),
     )
 
@@ -46,16 +53,40 @@ def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
         "kind": "plan_path",
         "started_at": "2026-01-02T03:04:05.000+00:00",
         "size": 1.5,
-        "features": {},
+        "features": {
+            "work": 70.0,
+            "cloud.round_trip_s": 0.03,
+            "cloud.silent": False,
+            "cloud.queue": 2,
+            "cloud.load": 0.0,
+            "cloud.wait_s": 0.0,
+        },
         "sites": {
-            "onboard": {"predicted_s": 0.1, "spread_s": 0.01, "age": 3, "failures": 0},
-            "cloud": {"predicted_s": None, "spread_s": None, "age": 0, "failures": 1},
+            "onboard": {
+                "predicted_s": 0.1,
+                "spread_s": 0.01,
+                "low_s": 0.08,
+                "high_s": 0.15,
+                "age": 3,
+                "failures": 0,
+            },
+            "cloud": {
+                "predicted_s": None,
+                "spread_s": None,
+                "low_s": None,
+                "high_s": None,
+                "age": 0,
+                "failures": 1,
+            },
         },
         "decision": {
             "site": "cloud",
             "both": False,
             "reason": "cloud 1 ms against onboard 2 ms",
             "policy": "paper",
+            "second": "onboard",
+            "second_after_s": 0.5,
+            "spared": [],
         },
         "executions": [
             {
@@ -87,6 +118,8 @@ def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
         ],
         "used": "onboard",
         "waited_s": 2.1,
+        "late": [{"id": "s-7", "site": "cloud", "seconds": 0.4, "ok": True, "censored": False}],
+        "regret": {"mean_s": 0.01, "low_s": 0.0, "high_s": 0.02, "probes": 9},
     }
 
 
@@ -164,6 +197,17 @@ def test_a_full_disk_is_logged_and_tasks_go_on(tmp_path: Path, caplog: pytest.Lo
     trace.write(record(2))
     trace.close()
     assert [fields["i"] for fields in read(path)] == [0, 2]
+
+
+def test_a_closed_trace_takes_no_more(tmp_path: Path) -> None:
+    """A task that ends after the trace was closed leaves no line and no error; closing twice is once."""
+    trace = Trace(tmp_path / "trace.jsonl")
+    trace.write(record(0))
+    trace.close()
+    trace.write(record(1))
+    trace.close()
+    assert trace.lost == 0
+    assert [fields["i"] for fields in read(trace.path)] == [0]
 
 
 def write(folder: Path, count: int) -> Path:

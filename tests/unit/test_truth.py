@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from common.errors import ConfigError
-from loadgen import truth as module
-from loadgen.link import Link, LinkConditions, Pipe
-from loadgen.truth import Truth
+from loadgen.relay import truth as module
+from loadgen.relay.link import Link, LinkConditions, Pipe
+from loadgen.relay.truth import Truth
 
 
 def read(path: Path) -> list[dict[str, Any]]:

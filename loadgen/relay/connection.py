@@ -1,0 +1,235 @@
+"""One connection of the relay: a client's socket, the one to the cloud, and the two flows between them.
+
+One direction of it is `flow.py`, what a link does is `link.py`; all connections together are `relay.py`'s.
+"""
+
+import asyncio
+import select
+import socket
+import struct
+from typing import Protocol
+
+from loadgen.relay.flow import Flow, ReadBuffer
+from loadgen.relay.link import Link, Pipe
+from loadgen.relay.truth import Truth
+
+CONNECT_S = 5.0
+RST_AT_CLOSE = struct.pack("ii", 1, 0)  # SO_LINGER on, of no seconds
+
+
+class Among(Protocol):
+    """The relay, as far as its connections know it."""
+
+    target: tuple[str, int]
+    link: Link
+    seed: int
+    buffer: ReadBuffer
+    buffer_bytes: int
+    truth: Truth | None
+    connections: "set[Connection]"
+    bytes: dict[str, int]
+
+    def target_up(self) -> None:
+        """The cloud took a connection."""
+
+    def target_down(self, error: OSError) -> None:
+        """The cloud took none."""
+
+
+class Connection:
+    """A client's socket, the one to the cloud that belongs to it, and the two flows between them.
+
+    When one side closes its half, what it had sent is still delivered, then that end; when both ends were
+    delivered both sockets are closed. When the cloud refuses, the client is closed at once. In an outage, or
+    where the cloud hangs, the client is accepted and hears nothing.
+    """
+
+    def __init__(self, relay: Among, number: int) -> None:
+        self._relay = relay
+        self.number = number
+        self.buffer = relay.buffer
+        self.buffer_bytes = relay.buffer_bytes
+        self.truth = relay.truth
+        self._loop = asyncio.get_running_loop()
+        self._how = ""
+        self._aborted = self._by_rst = self._over = False
+        if self.truth is not None:
+            self.truth.opened(self._loop.time(), number)
+        self._up = Flow(self, "up", Pipe(relay.link.up, relay.seed, number, "up"))
+        self._down = Flow(self, "down", Pipe(relay.link.down, relay.seed, number, "down"))
+        self._passable = asyncio.Event()
+        self.client = Side(self, self._up, self._down)
+        self._open_sides = {self.client}
+        self._reset_from_s = dict.fromkeys(("up", "down"), self._loop.time())
+        self._reset_timer: asyncio.TimerHandle | None = None
+        self._link = relay.link
+        self.set_link(relay.link)
+        self._opening = self._loop.create_task(self._open())
+
+    def set_link(self, link: Link) -> None:
+        before, self._link = self._link, link
+        if link.up.outage or link.down.outage or link.up.hang:
+            self._passable.clear()
+        else:
+            self._passable.set()
+        for flow, now in ((self._up, link.up), (self._down, link.down)):
+            flow.set_conditions(now)
+            if flow.swallowed and not now.hang:  # what follows a gap must not be taken for the whole
+                self.reset("hang")
+        self.settle()
+        for direction in ("up", "down"):
+            if getattr(link, direction).reset_after_ms != getattr(before, direction).reset_after_ms:
+                self._reset_from_s[direction] = self._loop.time()
+        self._await_reset()
+
+    @property
+    def left(self) -> bool:
+        """The client has closed, at least its half, and nothing that it said can reach the cloud now."""
+        if self._up.done:
+            return self._up.source_ended
+        held = self._link.up.outage or (self._link.down.outage and self._up.target is None)
+        return held and self._up.source is not None and _peer_closed(self._up.source)
+
+    def abort(self, how: str = "closed") -> None:
+        """Close both sockets now, one that is still to come when it does."""
+        self.because(how)
+        self._aborted = True
+        for transport in (self._up.source, self._up.target):
+            if transport is not None:
+                if self._by_rst and not transport.is_closing():
+                    connected = transport.get_extra_info("socket")
+                    connected.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RST_AT_CLOSE)
+                transport.abort()
+
+    def reset(self, how: str = "reset") -> None:
+        """Close both sockets by RST now, one that is still to come when it does."""
+        self._by_rst = True
+        self.abort(how)
+
+    def because(self, how: str) -> None:
+        self._how = self._how or how
+
+    def close(self) -> None:
+        """Close both sides, after what was delivered to them."""
+        for transport in (self._up.source, self._up.target):
+            if transport is not None:
+                transport.close()
+
+    def settle(self) -> None:
+        """End when both flows are done, or when nobody is left to wait for what a hang swallowed.
+
+        A client that did not end hears of a gap when the hang ends, not before: it is silence until then.
+        """
+        over = self._up.done and self._down.done
+        if not (self._up.swallowed or self._down.swallowed):
+            if over:
+                self.close()
+        elif self._up.source_ended and (self._up.swallowed or over):
+            self.reset("hang")
+
+    def count(self, direction: str, size: int) -> None:
+        self._relay.bytes[direction] += size
+
+    def made(self, side: "Side") -> None:
+        """A socket of the connection is open."""
+        self._open_sides.add(side)
+        # Not from here: Python 3.11.2 undoes a pause made inside connection_made, and ignores later ones.
+        self._loop.call_soon(self._begin)
+
+    def lost(self, side: "Side") -> None:
+        """A socket of the connection is closed."""
+        self._opening.cancel()
+        self._open_sides.discard(side)
+        if not self._open_sides and not self._over:
+            self._end()
+
+    def _begin(self) -> None:
+        if self._aborted:
+            self.abort()
+        self._up.refresh()
+        self._down.refresh()
+
+    def _await_reset(self) -> None:
+        """Reset when it is time, in an outage not before its end: a reset is a message too."""
+        if self._reset_timer is not None:
+            self._reset_timer.cancel()
+            self._reset_timer = None
+        times_s = [
+            self._reset_from_s[direction] + getattr(self._link, direction).reset_after_ms / 1e3
+            for direction in ("up", "down")
+            if getattr(self._link, direction).reset_after_ms
+        ]
+        if not times_s or self._link.up.outage or self._link.down.outage:
+            return
+        if min(times_s) <= self._loop.time():
+            self.reset()
+        else:
+            self._reset_timer = self._loop.call_at(min(times_s), self._await_reset)
+
+    async def _open(self) -> None:
+        await self._passable.wait()
+        cloud = Side(self, self._down, self._up)
+        try:
+            async with asyncio.timeout(CONNECT_S):
+                await self._loop.create_connection(lambda: cloud, *self._relay.target)
+            self._relay.target_up()
+        except OSError as error:  # TimeoutError is one
+            self._relay.target_down(error)
+            self.abort("refused")
+
+    def _end(self) -> None:
+        self._over = self._aborted = True  # a socket to the cloud that was just opening comes and goes
+        self._relay.connections.discard(self)
+        if self._reset_timer is not None:
+            self._reset_timer.cancel()
+        if self.truth is not None:
+            self._up.drop()
+            self._down.drop()
+            self.truth.closed(self._loop.time(), self.number, self._how)
+
+
+class Side(asyncio.BufferedProtocol):
+    """One socket of a connection: what it receives enters `incoming`; `outgoing` is delivered to it."""
+
+    def __init__(self, connection: Connection, incoming: Flow, outgoing: Flow) -> None:
+        self._connection = connection
+        self._incoming = incoming
+        self._outgoing = outgoing
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        # asyncio itself does so only where the socket was made with the number of the protocol.
+        transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._incoming.source = self._outgoing.target = transport
+        self._connection.made(self)
+
+    def get_buffer(self, _sizehint: int) -> memoryview:
+        return self._incoming.room()
+
+    def buffer_updated(self, nbytes: int) -> None:
+        self._incoming.take(nbytes)
+
+    def eof_received(self) -> bool:
+        self._incoming.end()
+        return True  # asyncio must not close the socket: bytes for it may still be under way
+
+    def pause_writing(self) -> None:
+        self._outgoing.writable = False
+
+    def resume_writing(self) -> None:
+        self._outgoing.writable = True
+        self._outgoing.refresh()
+
+    def connection_lost(self, _error: Exception | None) -> None:
+        self._incoming.end()
+        self._outgoing.lose_target()
+        self._connection.lost(self)
+
+
+def _peer_closed(transport: asyncio.Transport) -> bool:
+    """Also where bytes that came before the end were not read."""
+    if transport.is_closing():
+        return True
+    poll = select.poll()
+    poll.register(transport.get_extra_info("socket"), select.POLLRDHUP)
+    return bool(poll.poll(0))

@@ -1,0 +1,206 @@
+"""One direction of one connection: bytes in from a socket, out to another when the link says so.
+
+When they are due is `link.py`'s business, the two sockets and their connection are `connection.py`'s.
+"""
+
+import asyncio
+import contextlib
+from collections import deque
+from typing import Protocol
+
+from loadgen.relay.link import LinkConditions, Pipe
+from loadgen.relay.truth import Truth
+
+READ_BYTES = 256 << 10  # at a time, and written at a time; the fastest of 64 KiB to 1 MiB
+CHUNKS_MAX = 65_536  # under way in one direction: a chunk of one byte takes memory for a hundred
+
+
+class ReadBuffer:
+    """Memory that all sockets of a relay read into, one read after the other."""
+
+    def __init__(self) -> None:
+        self.renew()
+
+    def renew(self) -> None:
+        """Leave the memory to whoever still looks at it."""
+        self.view = memoryview(bytearray(READ_BYTES))
+
+
+class Owner(Protocol):
+    """The connection that a flow belongs to."""
+
+    number: int
+    buffer: ReadBuffer
+    buffer_bytes: int
+    truth: Truth | None
+
+    def because(self, how: str) -> None:
+        """The connection ends for this reason, unless it had another before."""
+
+    def close(self) -> None:
+        """The last byte that a truncated stream lets through was delivered."""
+
+    def settle(self) -> None:
+        """A source has ended, or nothing more can be delivered to a target."""
+
+    def count(self, direction: str, size: int) -> None:
+        """So many bytes were delivered."""
+
+
+class Flow:
+    """Takes bytes from the source, gives them to the target when due: at once where nothing holds them.
+
+    What is under way is bounded, in bytes and in chunks: beyond it the source is not read, and TCP makes
+    the sender wait. In an outage nothing is read and nothing delivered. While the target's side hangs all
+    is read and lost. The source's end is delivered like bytes, after them.
+    """
+
+    def __init__(self, owner: Owner, direction: str, pipe: Pipe) -> None:
+        self._owner = owner
+        self._direction = direction
+        self._pipe = pipe
+        self._loop = asyncio.get_running_loop()
+        # (due, chunk, its line of the truth); an empty chunk is the end
+        self._under_way: deque[tuple[float, bytes, str]] = deque()
+        self._under_way_bytes = 0
+        self._ended = False  # the end is under way, or was
+        self._cut = False  # ended by truncation
+        self._timer: asyncio.TimerHandle | None = None
+        self.source_ended = False
+        self.done = False  # nothing more will be delivered: the end was, or never can be
+        self.swallowed = False  # a hang took something that can never be delivered
+        self.writable = True  # the target has room
+        self.source: asyncio.Transport | None = None
+        self.target: asyncio.Transport | None = None
+
+    def room(self) -> memoryview:
+        """Where to read to, as much as may be under way."""
+        return self._owner.buffer.view[: max(1, self._owner.buffer_bytes - self._under_way_bytes)]
+
+    def take(self, size: int) -> None:
+        """So many bytes arrived from the source, in `room`."""
+        if self._ended:  # truncated before
+            return
+        arrived_s = self._loop.time()
+        data = self._owner.buffer.view[: self._pipe.left(size)]
+        start = 0
+        while start < len(data):
+            end = start + self._pipe.chunk_bytes(len(data) - start)
+            self._send(arrived_s, data[start:end])
+            start = end
+        self._truncate()
+        self.refresh()
+
+    def end(self) -> None:
+        """The source is closed, or closes its half."""
+        self.source_ended = True
+        if not self._ended:
+            self._owner.because("client" if self._direction == "up" else "cloud")
+            self._ended = True
+            self._send(self._loop.time(), b"")
+            self.refresh()
+        self._owner.settle()
+
+    def lose_target(self) -> None:
+        """The target is closed: what is under way to it, and what comes, is lost when due."""
+        self.done = self.writable = True
+        self.refresh()
+        self._owner.settle()
+
+    def set_conditions(self, conditions: LinkConditions) -> None:
+        self._pipe.conditions = conditions
+        if conditions.hang and not conditions.outage:
+            self.drop()
+        self._truncate()
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Deliver what is due, set the timer for the next chunk, read the source if there is room."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        now = self._pipe.conditions
+        if self.target is not None and not now.outage:
+            self._deliver(self.target)
+        if self.source is not None and not self.source.is_closing():
+            if (now.hang or (self._has_room() and self.target is not None)) and not now.outage:
+                self.source.resume_reading()
+            else:
+                self.source.pause_reading()
+
+    def drop(self) -> None:
+        """Forget what is under way: it will never be delivered."""
+        if self._under_way:
+            self.swallowed = True
+            self.done = self.done or not self._under_way[-1][1]
+        for _due_s, _chunk, line in self._under_way:
+            self._note(line, None)
+        self._under_way.clear()
+        self._under_way_bytes = 0
+
+    def _has_room(self) -> bool:
+        return self._under_way_bytes < self._owner.buffer_bytes and len(self._under_way) < CHUNKS_MAX
+
+    def _send(self, arrived_s: float, chunk: memoryview | bytes) -> None:
+        segment, size = self._pipe.segment, len(chunk)
+        due_s = self._pipe.due(arrived_s, size)
+        line = ""
+        if self._owner.truth is not None:
+            number, direction = self._owner.number, self._direction
+            line = self._owner.truth.chunk(number, direction, segment, size, arrived_s, due_s, self._pipe)
+        now = self._pipe.conditions
+        clear = self.writable and not (self._under_way or now.outage or now.hang)
+        if self.target is not None and clear and size and due_s <= arrived_s:
+            self._note(line, None if self.target.is_closing() else self._loop.time())
+            self._write(self.target, chunk)
+            return
+        self._under_way.append((due_s, bytes(chunk), line))
+        self._under_way_bytes += size
+        if now.hang and not now.outage:
+            self.drop()
+
+    def _truncate(self) -> None:
+        if not self._ended and self._pipe.left(1) == 0:
+            self._owner.because("truncated")
+            self._ended = self._cut = True
+            self._send(self._loop.time(), b"")
+
+    def _deliver(self, target: asyncio.Transport) -> None:
+        now_s = self._loop.time()
+        ended = False
+        while self.writable and self._under_way and self._under_way[0][0] <= now_s:
+            due, size = [], 0
+            while self._under_way and self._under_way[0][0] <= now_s and size < READ_BYTES:
+                _due_s, chunk, line = self._under_way.popleft()
+                due.append(chunk)
+                size += len(chunk)
+                ended = not chunk
+                self._note(line, None if target.is_closing() else now_s)
+            self._under_way_bytes -= size
+            self._write(target, b"".join(due))
+        if ended:
+            self._finish(target)
+        elif self.writable and self._under_way:
+            self._timer = self._loop.call_at(self._under_way[0][0], self.refresh)
+
+    def _write(self, target: asyncio.Transport, data: memoryview | bytes) -> None:
+        if not data or target.is_closing():
+            return
+        self._owner.count(self._direction, len(data))
+        target.write(data)
+        # asyncio keeps what the socket did not take, since Python 3.12 without copying it.
+        if isinstance(data, memoryview) and target.get_write_buffer_size():
+            self._owner.buffer.renew()
+
+    def _finish(self, target: asyncio.Transport) -> None:
+        self.done = True
+        if self._cut:
+            self._owner.close()
+        else:
+            with contextlib.suppress(OSError):  # the target is reset, and asyncio has not said so yet
+                target.write_eof()
+            self._owner.settle()
+
+    def _note(self, line: str, delivered_s: float | None) -> None:
+        if self._owner.truth is not None:
+            self._owner.truth.delivered(line, delivered_s)

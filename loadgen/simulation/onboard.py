@@ -1,0 +1,84 @@
+"""The runner of the robot's own computer in a simulation, and what it measures of its load."""
+
+from concurrent.futures import Future
+from functools import partial
+
+from common.tasks import Kind, Task
+from loadgen.simulation.clock import VirtualClock
+from loadgen.simulation.processor import Processor, Run
+from loadgen.simulation.truth import Truth
+from loadgen.testbed import ROBOT
+from robot_client.load import EVERY_S, FREE_MIN, MEMORY_S
+from robot_client.runner import ONBOARD, Condition, Execution
+
+
+class SimulatedOnboard:
+    """One task at a time on the robot's quota, as `OnboardRunner`."""
+
+    site = ONBOARD
+
+    def __init__(self, clock: VirtualClock, processor: Processor, truth: Truth) -> None:
+        self._clock = clock
+        self._processor = processor
+        self._truth = truth
+        self._runs: dict[int, tuple[Run, Future[Execution]]] = {}
+        self._load = _Load(clock, processor)
+
+    def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - onboard always exists
+        return None
+
+    def submit(self, task: Task, budget_s: float) -> "Future[Execution]":  # noqa: ARG002 - not to be stopped
+        future: Future[Execution] = Future()
+        cpu_s = self._truth.cpu_s(ONBOARD, task)
+        run = self._processor.add(cpu_s, partial(self._ended, task, cpu_s), owner=ROBOT)
+        self._runs[task.id] = run, future
+        return future
+
+    def cancel(self, task: Task) -> None:
+        """Only a task that still waits: a thread cannot be stopped."""
+        run, future = self._runs.get(task.id, (None, None))
+        if run is not None and future is not None and self._processor.drop(run):
+            del self._runs[task.id]
+            future.cancel()
+
+    def condition(self) -> Condition:
+        return Condition(load=self._load.share())
+
+    def close(self) -> None:
+        pass
+
+    def _ended(self, task: Task, cpu_s: float, run: Run) -> None:
+        _, future = self._runs.pop(task.id)
+        now_s = self._clock.now_s()
+        future.set_result(
+            Execution(
+                ONBOARD,
+                now_s - run.added_s,
+                self._truth.value(task),
+                queue_s=run.begun_s - run.added_s,
+                run_s=now_s - run.begun_s,
+                network_s=0.0,
+                cpu_s=cpu_s,
+            )
+        )
+
+
+class _Load:
+    """What `robot_client.load` would read of the quota: the share of the rest that others took."""
+
+    def __init__(self, clock: VirtualClock, processor: Processor) -> None:
+        self._clock = clock
+        self._processor = processor
+        self._read_at_s = self._own_s = self._others_s = self._share = 0.0
+
+    def share(self) -> float:
+        since_s = self._clock.now_s() - self._read_at_s
+        if since_s >= EVERY_S:
+            self._processor.settle()
+            own_s, others_s = self._processor.own_s, self._processor.others_s
+            took_s, left_s = others_s - self._others_s, self._processor.cpus * since_s - (own_s - self._own_s)
+            self._own_s, self._others_s, self._read_at_s = own_s, others_s, self._clock.now_s()
+            if left_s >= FREE_MIN * self._processor.cpus * since_s:
+                fresh = min(1.0, max(0.0, took_s / left_s))
+                self._share += min(1.0, since_s / MEMORY_S) * (fresh - self._share)
+        return self._share

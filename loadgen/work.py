@@ -1,0 +1,37 @@
+"""Tasks of one number for scenarios: real CPU work whose answer tells whether it was done.
+
+A server runs them with `--tasks loadgen.work`, a robot with `--task loadgen.work:NAME`.
+"""
+
+import hashlib
+
+from common.tasks import task
+
+ROUNDS_MAX = 10_000_000
+RARE = 25  # one in so many sizes ...
+MUCH = 20  # ... takes so many times the work
+
+
+@task("hash_rounds", size=float)
+def hash_rounds(rounds: int) -> bytes:
+    """So many rounds of PBKDF2-HMAC-SHA256 (RFC 8018): time is linear in the size."""
+    return _hashed(rounds)
+
+
+@task("hash_pairs", size=float)
+def hash_pairs(count: int) -> bytes:
+    """A round for every thousand pairs of so many things: time grows with the square of the size."""
+    return _hashed(count * count // 1000)
+
+
+@task("hash_rarely_long", size=float)
+def hash_rarely_long(rounds: int) -> bytes:
+    """As `hash_rounds`, but sizes that RARE divides take MUCH times as long: a tail out of nowhere."""
+    return _hashed(rounds * MUCH if rounds % RARE == 0 else rounds)
+
+
+def _hashed(rounds: int) -> bytes:
+    """Runs without the interpreter's lock."""
+    if rounds > ROUNDS_MAX:
+        raise ValueError(f"{rounds} rounds are over {ROUNDS_MAX}")
+    return hashlib.pbkdf2_hmac("sha256", b"offboard", b"scenario", max(rounds, 1))

@@ -1,0 +1,138 @@
+"""Adaptive conformal intervals: bounds around a prediction that hold what they say, whatever the predictor.
+
+Gibbs and Candès, Adaptive Conformal Inference Under Distribution Shift (2021): the share of errors that the
+interval leaves out grows after one that it held and shrinks after one that it missed, so that the realised
+share stays at what was asked for. Of all intervals that hold so many of the last errors it is the shortest:
+times are skewed.
+"""
+
+import math
+from bisect import bisect_left, insort
+from collections import deque
+
+COVERAGE = 0.9
+OUTSIDE = 1 - COVERAGE
+OUTSIDE_MIN, OUTSIDE_MAX = -0.1, 0.5  # below 0: wider than all that was seen
+SCORES_MAX = 100  # errors remembered
+SCORES_MIN = 10  # before so many the spread alone tells
+RATE = 0.03  # of the adaption
+TAIL = 0.2  # of the errors: the largest, from which one tells how long a late task will still be
+BEYOND = 0.25  # of the distance from the median to the largest error: so much later nothing was ever
+NORMAL_90 = 1.645  # standard deviations on each side that hold 90 %, on one side 95 %
+USUAL_RATE = 0.05
+
+
+Tail = tuple[tuple[float, float], ...]
+
+
+class Conformal:
+    """The errors of one site's predictions, in units that grow with the predicted time.
+
+    The unit is the mean of this prediction and of the usual one: part of the noise grows with the task, part
+    does not.
+    """
+
+    def __init__(self) -> None:
+        self._order: deque[float] = deque()
+        self._sorted: list[float] = []
+        self._usual_s = 0.0
+        self._count = 0
+        self._outside = OUTSIDE
+        self._low = self._high = 0.0  # scores between which the next one should be
+        self._tail: Tail = ()
+
+    def learn(self, predicted_s: float, seconds: float) -> None:
+        """Take what came of a prediction."""
+        if self._count:
+            score = (seconds - predicted_s) / self._unit(predicted_s)
+            if len(self._sorted) >= SCORES_MIN:
+                missed = not self._low <= score <= self._high
+                outside = self._outside + RATE * (OUTSIDE - missed)
+                self._outside = min(OUTSIDE_MAX, max(OUTSIDE_MIN, outside))
+            self._add(score)
+        self._count = min(self._count + 1, SCORES_MAX)
+        self._usual_s += max(1 / self._count, USUAL_RATE) * (max(seconds, predicted_s) - self._usual_s)
+
+    def interval(self, predicted_s: float, spread_s: float | None) -> tuple[float, float] | None:
+        """Lower and upper end of the COVERAGE interval; None while nothing tells."""
+        if len(self._sorted) < SCORES_MIN:
+            if spread_s is None:
+                return None
+            return max(0.0, predicted_s - NORMAL_90 * spread_s), predicted_s + NORMAL_90 * spread_s
+        unit = self._unit(predicted_s)
+        low_s, high_s = predicted_s + unit * self._low, predicted_s + unit * self._high
+        return max(0.0, min(low_s, predicted_s)), max(high_s, predicted_s, 0.0)
+
+    def overdue(self, predicted_s: float, worth_s: float) -> float | None:
+        """The time from which on a task so predicted is expected to need more than `worth_s` still.
+
+        None while too few errors are known.
+        """
+        unit = self._unit(predicted_s)
+        for score, rest in self._tail:
+            if unit * rest > worth_s:
+                return max(0.0, predicted_s + unit * score)
+        return None
+
+    def share_above(self, predicted_s: float, limit_s: float) -> float | None:
+        """The share of errors with which a task so predicted would exceed `limit_s`; None: too few known."""
+        count = len(self._sorted)
+        if count < SCORES_MIN:
+            return None
+        score = (limit_s - predicted_s) / self._unit(predicted_s)
+        # A limit beyond all that was seen is still not certain.
+        return (count - bisect_left(self._sorted, score) + 0.5) / (count + 1)
+
+    def below(self, predicted_s: float, share: float) -> float | None:
+        """The time that this share of tasks so predicted stays below; None: too few known."""
+        count = len(self._sorted)
+        if count < SCORES_MIN:
+            return None
+        rank = min(count - 1, math.ceil(share * (count + 1)) - 1)
+        return max(0.0, predicted_s + self._unit(predicted_s) * self._sorted[rank])
+
+    def _unit(self, predicted_s: float) -> float:
+        return 0.5 * (max(0.0, predicted_s) + self._usual_s) or 1.0
+
+    def _add(self, score: float) -> None:
+        ordered = self._sorted
+        if len(self._order) == SCORES_MAX:
+            del ordered[bisect_left(ordered, self._order.popleft())]
+        self._order.append(score)
+        insort(ordered, score)
+        self._low, self._high = _shortest(ordered, 1 - self._outside)
+        if len(ordered) >= SCORES_MIN:
+            self._tail = _tail(ordered)
+
+
+def _tail(ordered: list[float]) -> Tail:
+    """Of the largest errors each, and how much longer those beyond it were in the mean.
+
+    Who is later than all that were seen may never come.
+    """
+    count = len(ordered)
+    first = count - max(2, round(TAIL * count))
+    found: list[tuple[float, float]] = []
+    total = 0.0
+    for n, place in enumerate(range(count - 1, first - 1, -1)):
+        if n:
+            found.append((ordered[place], total / n - ordered[place]))
+        total += ordered[place]
+    found.reverse()
+    last = ordered[-1] + BEYOND * (ordered[-1] - ordered[count // 2])
+    return (*found, (last, math.inf))
+
+
+def _shortest(ordered: list[float], share: float) -> tuple[float, float]:
+    """Ends of the shortest window that holds this share, with the finite-sample rank of conformal prediction.
+
+    More than all that was seen is all of it, and as much of its range beyond on both sides.
+    """
+    count = len(ordered)
+    held = math.ceil(share * (count + 1))
+    if held >= count:
+        beyond = (share * (count + 1) / count - 1) * (ordered[-1] - ordered[0])
+        return ordered[0] - max(0.0, beyond), ordered[-1] + max(0.0, beyond)
+    widths = [high - low for low, high in zip(ordered, ordered[held - 1 :], strict=False)]
+    first = widths.index(min(widths))
+    return ordered[first], ordered[first + held - 1]

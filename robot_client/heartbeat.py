@@ -1,0 +1,100 @@
+"""Heartbeats: small questions to a server whose answers tell the round trip, its queue, and that it is there.
+
+Pure: time comes in as an argument; who sends them is `cloud`.
+"""
+
+from collections import deque
+from random import Random
+
+from robot_client.runner import Condition
+
+EVERY_S = 0.5
+JITTER = 0.2  # each comes up to this share earlier or later: robots of a fleet do not beat together
+SILENT_S = 0.25  # unanswered for longer than this, and longer than round trips vary: the site is silent
+UNANSWERED_MAX = 16  # remembered; while so many are out they come SLOWER times as rarely
+SLOWER = 5
+LEAST_OF = 2  # round trips: one stalled segment is no slow link, and one that is quick again is believed
+_SMOOTHING, _VARIATION = 1 / 8, 1 / 4  # of RFC 6298
+
+
+class Heartbeat:
+    """Of one connection. `every_s` 0: none are sent, and nothing is known."""
+
+    def __init__(self, every_s: float, seed: int = 0) -> None:
+        self._every_s = every_s
+        self._random = Random(seed)
+        self._next_id = 0
+        self.stop()
+
+    def start(self, now_s: float) -> None:
+        """The connection is up."""
+        self.stop()
+        if self._every_s:
+            self.due_s = now_s
+
+    def stop(self) -> None:
+        """The connection is gone: nothing is known of the next one."""
+        self.due_s = float("inf")
+        self._sent: dict[int, float] = {}
+        self._oldest_s = float("inf")  # when the first that is unanswered was sent
+        self._heard_s = -float("inf")
+        self._recent: deque[float] = deque(maxlen=LEAST_OF)
+        self._round_trip_s: float | None = None
+        self._smooth_s = self._varies_s = 0.0
+        self._back_s = -float("inf")  # when the site was last heard again
+        self._queue = 0
+
+    def hurry(self, now_s: float) -> None:
+        """A task is late: ask now whether the server is there, unless it was asked already."""
+        if self._oldest_s > now_s and self.due_s < float("inf"):
+            self.due_s = now_s
+
+    def beat(self, now_s: float) -> int:
+        """The number of the heartbeat to send now."""
+        self._next_id += 1
+        self._sent[self._next_id] = now_s
+        self._oldest_s = min(self._oldest_s, now_s)
+        pause_s = self._every_s * (1 + JITTER * self._random.uniform(-1, 1))
+        if len(self._sent) > UNANSWERED_MAX:
+            del self._sent[next(iter(self._sent))]
+            pause_s *= SLOWER
+        self.due_s = now_s + pause_s
+        return self._next_id
+
+    def answer(self, id: int, now_s: float, queue: int) -> None:
+        """The answer to one of them."""
+        sent_s = self._sent.pop(id, None)
+        if sent_s is None:
+            return
+        # They come back in order: those before it were lost with the connection that carried them.
+        for older in [number for number in self._sent if number < id]:
+            del self._sent[older]
+        if self._silent(now_s):
+            self._back_s = now_s
+        self._oldest_s = next(iter(self._sent.values()), float("inf"))
+        self._vary(now_s - sent_s)
+        if sent_s < self._back_s:
+            self.hurry(now_s)  # it was held up by what made the site silent, and says nothing of the link now
+        else:
+            self._recent.append(now_s - sent_s)
+            self._round_trip_s = min(self._recent)
+        self.hear(now_s, queue)
+
+    def hear(self, now_s: float, queue: int) -> None:
+        """Anything that the server said shows that it is there."""
+        self._heard_s, self._queue = now_s, queue
+
+    def condition(self, now_s: float) -> Condition:
+        return Condition(self._round_trip_s, self._silent(now_s), self._queue)
+
+    def _silent(self, now_s: float) -> bool:
+        limit_s = max(SILENT_S, self._smooth_s + 4 * self._varies_s)
+        return now_s - self._oldest_s > limit_s and now_s - self._heard_s > limit_s
+
+    def _vary(self, round_trip_s: float) -> None:
+        """What is usual, whatever held it up: a link that is always slow is not silent."""
+        if not self._smooth_s:
+            self._smooth_s, self._varies_s = round_trip_s, round_trip_s / 2
+            return
+        self._varies_s += _VARIATION * (abs(round_trip_s - self._smooth_s) - self._varies_s)
+        self._smooth_s += _SMOOTHING * (round_trip_s - self._smooth_s)

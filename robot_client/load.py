@@ -1,0 +1,89 @@
+"""How much of the robot's own CPU other programs take: a feature of onboard times.
+
+In a container, or wherever else a CPU quota holds, the CPU is the quota: what others of the group use is
+missing to this process, and so is the time that all of them are throttled for.
+"""
+
+import contextlib
+import os
+import time
+from pathlib import Path
+
+from common.cpu import QuotaGroup, parse_usage, quota_group
+
+EVERY_S = 0.25  # read no more often: a reading costs what a decision does
+QUOTA_EVERY = 8  # readings: how often the quota is looked up again
+MEMORY_S = 0.5  # the share is that of about the last so many seconds
+FREE_MIN = 0.1  # of the CPU: where this process leaves less to others, what they take says nothing
+PROCESSES_MAX = 64  # of a group whose CPU time is the sum of theirs
+TICK_S = 1 / os.sysconf("SC_CLK_TCK")
+
+
+class Load:
+    """Reads the CPU time of all that shares the CPU with the process at `proc` (/proc/self).
+
+    Everything is found at the first reading: by then the process must be where its quota is.
+    """
+
+    def __init__(self, proc: Path, root: Path = Path("/proc")) -> None:
+        self._proc = proc
+        self._root = root
+        self._group: QuotaGroup | None = None
+        self._found = False
+        self._cpus = 1.0
+        self._readings = 0
+        self._read_at_s = -EVERY_S
+        self._others_s = self._own_s = 0.0
+        self._share = 0.0
+
+    def share(self) -> float:
+        """From 0 to 1: what others took of the CPU that this process left; 0 where that cannot be told."""
+        now_s = time.monotonic()
+        since_s = now_s - self._read_at_s
+        if since_s >= EVERY_S:
+            with contextlib.suppress(OSError, ValueError, IndexError):
+                self._read(now_s, since_s)
+        return self._share
+
+    def _read(self, now_s: float, since_s: float) -> None:
+        first = not self._found
+        if first:
+            self._group, self._found = quota_group(self._proc), True
+        if self._readings % QUOTA_EVERY == 0:
+            self._cpus = (self._group.cpus() if self._group else None) or float(os.cpu_count() or 1)
+        self._readings += 1
+        cpus = self._cpus
+        own_s = time.process_time()
+        others_s = self._total_s() - own_s
+        took_s, left_s = others_s - self._others_s, cpus * since_s - (own_s - self._own_s)
+        self._others_s, self._own_s, self._read_at_s = others_s, own_s, now_s
+        if first:
+            return
+        if left_s >= FREE_MIN * cpus * since_s:
+            fresh = min(1.0, max(0.0, took_s / left_s))
+            self._share += min(1.0, since_s / MEMORY_S) * (fresh - self._share)
+
+    def _total_s(self) -> float:
+        """CPU seconds of all, this process among them."""
+        if self._group is None:
+            return self._machine_s()
+        if self._group.usage is not None:
+            return parse_usage(self._group.usage.read_bytes())
+        pids = (self._group.folder / "cgroup.procs").read_text().split()
+        return sum(self._process_s(pid) for pid in pids[:PROCESSES_MAX])
+
+    def _machine_s(self) -> float:
+        """From /proc/stat: all but idling, waiting for disks, and guests, who are users already."""
+        user, nice, system, _idle, _wait, *rest = map(
+            int, (self._root / "stat").read_text().split("\n", 1)[0].split()[1:9]
+        )
+        return TICK_S * (user + nice + system + sum(rest))
+
+    def _process_s(self, pid: str) -> float:
+        if pid == str(os.getpid()):
+            return time.process_time()  # ticks are too coarse where it is taken away again
+        try:
+            fields = (self._root / pid / "stat").read_text().rpartition(")")[2].split()
+        except OSError:  # it has just ended
+            return 0.0
+        return TICK_S * (int(fields[11]) + int(fields[12]))

@@ -1,0 +1,269 @@
+"""What is known of one kind of task: the work of its sizes, and its times on every site.
+
+Which site is taken for it is the business of `policies`.
+"""
+
+import logging
+import math
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from common.errors import Overtaken, TaskError
+from common.tasks import Kind
+from robot_client.conformal import Conformal
+from robot_client.energy import Energy
+from robot_client.objectives import Expected, Objective
+from robot_client.policies.base import Outlook
+from robot_client.predictors import Predictor
+from robot_client.predictors.features import Conditional
+from robot_client.runner import ONBOARD, UNMEASURED, Condition, Execution
+from robot_client.shared_work import SharedWork
+
+AMOUNT_RATE = 0.1  # of the bytes and CPU seconds that a task usually takes
+OBSERVATIONS_MAX = 200  # of a site, kept for `store`
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What one execution taught its site, and all that is needed to teach it again.
+
+    `amount`: what the predictor learnt `seconds` for, the size, or the work, which `work` is where a result
+    told it; `waited_s` of the run's time were left out of them; `predicted_s`: what the interval learnt from.
+    """
+
+    size: float
+    amount: float
+    work: float | None
+    seconds: float
+    ok: bool
+    condition: Condition = UNMEASURED
+    predicted_s: float | None = None
+    waited_s: float = 0.0
+    bytes: float = 0.0
+    cpu_s: float | None = None
+
+
+class KindMemory:
+    """Of one kind. `make` makes the predictor of a site; with `shared_work` sites learn seconds per work."""
+
+    def __init__(
+        self,
+        kind: Kind,
+        make: Callable[[], Predictor],
+        *,
+        objective: Objective,
+        energy: Energy,
+        shared_work: bool,
+    ) -> None:
+        self.sites: dict[str, SiteMemory] = {}
+        self.last_site: str | None = None
+        self.worked: deque[tuple[float, float]] = deque(maxlen=OBSERVATIONS_MAX)  # sizes and their work
+        self.kind = kind
+        self._make = make
+        self._objective = objective
+        self._energy = energy
+        self._work = SharedWork() if shared_work and kind.work is not None else None
+
+    @property
+    def per_work(self) -> bool:
+        """Whether sites learn seconds per work; else per size."""
+        return self._work is not None
+
+    def site(self, name: str) -> "SiteMemory":
+        if name not in self.sites:
+            self.sites[name] = SiteMemory(name, self._make(), self._objective, self._energy)
+        return self.sites[name]
+
+    def amount(self, size: float) -> float | None:
+        """What the predictors are asked with: the work to expect of a size, the size where none is told."""
+        return size if self._work is None else self._work.predict(size)
+
+    def work_of(self, execution: Execution) -> float | None:
+        """The work that the execution's result says it was."""
+        if self._work is None or not execution.ok:
+            return None
+        try:
+            return self.kind.work_of(execution.value)
+        except Exception:  # the function is the user's own
+            log.exception("the work of a result of task %s cannot be told", self.kind.name)
+            return None
+
+    def learn_work(self, size: float, executions: Iterable[Execution]) -> float | None:
+        """Once a task; the work it was, where a result says so."""
+        for execution in executions:
+            work = self.work_of(execution)
+            if work is not None:
+                self.learn_size(size, work)
+                return work
+        return None
+
+    def learn_size(self, size: float, work: float) -> None:
+        """A task of this size was so much work."""
+        if self._work is not None:
+            self._work.learn(size, work)
+            self.worked.append((size, work))
+
+    def pass_by(self) -> None:
+        """One more task of this kind, wherever it runs."""
+        for memory in self.sites.values():
+            memory.age += 1
+
+
+class SiteMemory:
+    """Of one kind on one site."""
+
+    def __init__(self, site: str, predictor: Predictor, objective: Objective, energy: Energy) -> None:
+        self.predictor = predictor
+        self.age = 0
+        self.observations: deque[Observation] = deque(maxlen=OBSERVATIONS_MAX)
+        self.conditional = isinstance(predictor, Conditional)
+        self._site = site
+        self._failures = 0
+        self._conformal = Conformal()
+        self._objective = objective
+        self._energy = energy
+        self._bytes = _Usual()
+        self._cpu_s = _Usual()
+
+    def outlook(
+        self, amount: float | None, condition: Condition, *, in_flight: int, timeout_s: float
+    ) -> Outlook:
+        """Before a task of so much work, or of this size."""
+        predictor, found = self.predictor, None
+        if amount is not None:
+            if isinstance(predictor, Conditional):
+                found = predictor.predict(amount, self.age + 1, condition)
+            else:
+                found = predictor.predict(amount, self.age + 1)
+        if found is None:
+            return Outlook(
+                None, None, predictor.full, self.age, self._failures, in_flight=in_flight, condition=condition
+            )
+        seconds = found.seconds + condition.wait_s
+        if condition.silent:
+            seconds = max(seconds, timeout_s)
+        low_s, high_s = self._conformal.interval(seconds, found.spread_s) or (None, None)
+        joules = self._joules(seconds)
+        return Outlook(
+            seconds,
+            found.spread_s,
+            predictor.full,
+            self.age,
+            self._failures,
+            len(predictor),
+            low_s,
+            high_s,
+            found.error_s,
+            self._objective.cost(Expected(seconds, found.spread_s, joules), self._conformal),
+            in_flight,
+            self._bytes.value,
+            joules,
+            condition,
+            self._conformal,
+        )
+
+    def learn(
+        self,
+        amount: float | None,
+        execution: Execution,
+        outlook: Outlook | None,
+        *,
+        silent: bool,
+        size: float,
+        work: float | None = None,
+    ) -> None:
+        """Take an execution; `outlook` is what was expected of it, `amount` as for `outlook`.
+
+        A failed run is learnt as the time until it was given up: the one addition to Algorithm 1. To a
+        predictor of measured features it says that the time is longer: a refusal at once says nothing, nor
+        does any failure where the site's heartbeats go unanswered (`silent`).
+        """
+        expected_s = outlook.predicted_s if outlook else None
+        overtaken = isinstance(execution.failure, Overtaken)
+        if overtaken and execution.seconds <= (expected_s or 0.0):
+            self._use(execution.bytes_out + execution.bytes_in, execution.cpu_s)
+            return  # stopped before it was due: as little is known of the site as before
+        self.age = 0
+        if isinstance(execution.failure, TaskError):
+            return
+        if not overtaken:  # whoever lost a race did not fail
+            self._failures = 0 if execution.ok else self._failures + 1
+        condition = outlook.condition if outlook else UNMEASURED
+        seconds = execution.seconds
+        moved, cpu_s = execution.bytes_out + execution.bytes_in, execution.cpu_s
+        tells = execution.ok or (not silent and _longer(execution, seconds, expected_s))
+        if self.conditional and (amount is None or not tells):
+            self._use(moved, cpu_s)
+            return
+        waited_s = (execution.queue_s or 0.0) if self.conditional and self._site == ONBOARD else 0.0
+        interval = execution.ok and not condition.silent
+        self._take(
+            Observation(
+                size,
+                amount or 0.0,
+                work,
+                max(0.0, seconds - waited_s),
+                execution.ok,
+                condition,
+                expected_s if interval else None,
+                waited_s,
+                moved,
+                cpu_s,
+            )
+        )
+
+    def recall(self, observations: Iterable[Observation], *, age: int) -> None:
+        """Learn again what was learnt before, oldest first; it is as old as `age` tasks."""
+        for one in observations:
+            self._failures = 0 if one.ok else self._failures + 1
+            self._take(one)
+        self.age = age
+
+    def _take(self, one: Observation) -> None:
+        self.observations.append(one)
+        self._use(one.bytes, one.cpu_s)
+        if one.predicted_s is not None:
+            self._conformal.learn(one.predicted_s, one.seconds + one.waited_s)
+        if isinstance(self.predictor, Conditional):
+            self.predictor.learn(one.amount, one.seconds, one.condition)
+        else:
+            self.predictor.learn(one.amount, one.seconds)
+
+    def _use(self, moved: float, cpu_s: float | None) -> None:
+        self._bytes.add(moved)
+        if cpu_s is not None:
+            self._cpu_s.add(cpu_s)
+
+    def joules(self, execution: Execution) -> float:
+        """What an execution took from the battery."""
+        if self._site == ONBOARD:
+            return self._energy.onboard_j(execution.cpu_s or execution.run_s or execution.seconds)
+        return self._energy.remote_j(execution.seconds, execution.bytes_out + execution.bytes_in)
+
+    def _joules(self, seconds: float) -> float:
+        if self._site == ONBOARD:
+            return self._energy.onboard_j(self._cpu_s.value or seconds)
+        return self._energy.remote_j(seconds, self._bytes.value)
+
+
+def _longer(execution: Execution, seconds: float, expected_s: float | None) -> bool:
+    """Whether a failed run tells that the site takes longer than expected."""
+    return execution.censored if expected_s is None else seconds >= expected_s
+
+
+class _Usual:
+    """A running mean of amounts."""
+
+    __slots__ = ("_count", "value")
+
+    def __init__(self) -> None:
+        self.value = 0.0
+        self._count = 0
+
+    def add(self, amount: float) -> None:
+        if math.isfinite(amount):
+            self._count = min(self._count + 1, round(1 / AMOUNT_RATE))
+            self.value += (amount - self.value) / self._count

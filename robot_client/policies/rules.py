@@ -1,0 +1,123 @@
+"""Rules that compare what the sites would cost."""
+
+from random import Random
+
+from robot_client.policies.base import Decision, Forecast, cheapest, costs_of, explain, home
+
+WARM_UP = 6  # observations of each site before anything is compared
+MARGIN = 0.1
+EPSILON = 0.05
+
+
+class Paper:
+    """Algorithm 1 of Penmetcha, Kannan and Min, exactly."""
+
+    def decide(self, forecast: Forecast) -> Decision:
+        if not all(outlook.full for outlook in forecast.sites.values()):
+            # Algorithm 1, warm-up branch: both sites, until both queues are full.
+            cold = [site for site, outlook in forecast.sites.items() if not outlook.full]
+            reason = f"warm-up: the window of {' and '.join(sorted(cold))} is not full"
+            return Decision(home(forecast), len(forecast.sites) > 1, reason, "paper")
+        predicted = {site: outlook.predicted_s or 0.0 for site, outlook in forecast.sites.items()}
+        # Eq. 1: the cloud only where it is strictly faster; a tie stays onboard.
+        site = cheapest(predicted)
+        names = [site, *(name for name in predicted if name != site)]
+        reason = " against ".join(f"{name} {predicted[name] * 1e3:.1f} ms" for name in names)
+        return Decision(site, False, reason, "paper")
+
+
+class Always:
+    """One site for every task; onboard where that site cannot take it."""
+
+    def __init__(self, site: str) -> None:
+        self._site = site
+
+    def decide(self, forecast: Forecast) -> Decision:
+        if self._site in forecast.sites:
+            return Decision(self._site, False, f"always {self._site}", self._site)
+        return Decision(home(forecast), False, f"{self._site} cannot take it", self._site)
+
+
+class Greedy:
+    """The site that should cost least, from the first few observations of each on."""
+
+    name = "greedy"
+
+    def decide(self, forecast: Forecast) -> Decision:
+        if (warming := warm_up(forecast, self.name)) is not None:
+            return warming
+        site = self._choose(forecast, costs_of(forecast))
+        return Decision(site, False, explain(forecast, site), self.name)
+
+    def _choose(self, forecast: Forecast, costs: dict[str, float]) -> str:  # noqa: ARG002 - leaves look at it
+        return cheapest(costs)
+
+
+class Hysteresis(Greedy):
+    """Stays where it is until another site costs less by MARGIN: no flapping between equals."""
+
+    name = "hysteresis"
+
+    def _choose(self, forecast: Forecast, costs: dict[str, float]) -> str:
+        best, last = cheapest(costs), forecast.last_site
+        if last in costs and costs[best] > (1 - MARGIN) * costs[last]:
+            return last
+        return best
+
+
+class Epsilon(Greedy):
+    """Epsilon-greedy: one task in 1 / EPSILON goes to a site drawn evenly from the others that are heard."""
+
+    name = "epsilon"
+
+    def __init__(self, random: Random) -> None:
+        self._random = random
+
+    def _choose(self, forecast: Forecast, costs: dict[str, float]) -> str:
+        best = cheapest(costs)
+        others = [site for site in costs if site != best and not forecast.sites[site].condition.silent]
+        if others and self._random.random() < EPSILON:
+            return self._random.choice(others)
+        return best
+
+
+class LinUcb(Greedy):
+    """Optimism: the cost less WIDTH standard errors of what is known of it (Li et al. 2010, LinUCB)."""
+
+    name = "linucb"
+    WIDTH = 1.0
+
+    def _choose(self, forecast: Forecast, costs: dict[str, float]) -> str:
+        return cheapest(
+            {site: costs[site] - self.WIDTH * (one.error_s or 0.0) for site, one in forecast.sites.items()}
+        )
+
+
+class Thompson(Greedy):
+    """Thompson sampling: the cost drawn from what is believed of it (Agrawal and Goyal 2013)."""
+
+    name = "thompson"
+
+    def __init__(self, random: Random) -> None:
+        self._random = random
+
+    def _choose(self, forecast: Forecast, costs: dict[str, float]) -> str:
+        return cheapest(
+            {
+                site: self._random.gauss(costs[site], one.error_s or 0.0)
+                for site, one in forecast.sites.items()
+            }
+        )
+
+
+def warm_up(forecast: Forecast, policy: str) -> Decision | None:
+    """All sites but silent ones, while one of them has too few observations."""
+    heard = forecast.only([site for site, one in forecast.sites.items() if not one.condition.silent])
+    cold = [
+        site for site, one in heard.sites.items() if one.count < WARM_UP and not (one.full or one.in_flight)
+    ]
+    if not cold or len(heard.sites) == 1:
+        return None
+    reason = f"warm-up: too little is known of {' and '.join(sorted(cold))}"
+    silent = tuple(site for site in forecast.sites if site not in heard.sites)
+    return Decision(home(heard), True, reason, policy, spared=silent)

@@ -1,0 +1,230 @@
+"""Lines that follow a site that changes, and do not jump at a single outlier.
+
+All limits are in units of the site's own running error, so that tasks of 5 ms and of 50 s are alike to them.
+"""
+
+import math
+
+from robot_client.predictors.base import SIZE_MIN, Prediction, check_observation
+from robot_client.predictors.linear import ROUNDING, RecursiveLeastSquares, checked_forgetting
+from robot_client.window import checked_length
+
+CLIP = 3.0  # standard deviations of the running error that one observation may pull by
+CLIP_FROM = 8  # observations: before them nothing is known to be an outlier
+SCALE_RATE = 0.05  # of the running error's variance, once so many observations made it
+GROWTH = 2.0  # clips: a larger error counts as this large in the running error, so that it can grow
+
+
+class Scale:
+    """Running standard deviation of errors: the mean of their squares, an early one an equal part of it.
+
+    An error is taken as at most GROWTH clips, so that one outlier does not make the next one look usual,
+    while a lasting change doubles the scale within a few tasks. `clip` is the largest error that is believed:
+    infinite while too few are known, or all were 0.
+    """
+
+    __slots__ = ("_square", "clip", "count", "deviation")
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.deviation = 0.0
+        self.clip = math.inf
+        self._square = 0.0
+
+    def add(self, error: float) -> None:
+        error = min(abs(error), GROWTH * self.clip)
+        self.count += 1
+        rate = 1 / self.count if self.count * SCALE_RATE < 1 else SCALE_RATE
+        self._square += rate * (error * error - self._square)
+        self.deviation = math.sqrt(self._square)
+        if self.count >= CLIP_FROM and self._square:
+            self.clip = CLIP * self.deviation
+
+
+class ClippedLeastSquares:
+    """Least squares with weights that fade, where no observation pulls by more than CLIP running errors.
+
+    What lies further out is learnt as if it lay there (Huber's psi as a one-step weight).
+    The spread is the running error of predictions made before the observation was known.
+    forgetting: of the weight of an execution with each further one; None: 1 - 1 / window.
+    """
+
+    def __init__(self, window: int, seed: int = 0, forgetting: float | None = None) -> None:  # noqa: ARG002
+        self.window = checked_length(window)
+        self.forgetting = checked_forgetting(window, forgetting)
+        self._count = 0  # stops at the window
+        self._weight = self._size = self._seconds = self._sdd = self._sdt = self._slope = 0.0
+        self._scale = Scale()
+
+    @property
+    def full(self) -> bool:
+        return self._count == self.window
+
+    def __len__(self) -> int:
+        return self._count
+
+    def expect(self, size: float) -> float:
+        """The expected seconds alone."""
+        return self._seconds + self._slope * (size - self._size)
+
+    def predict(self, size: float, ahead: int = 1) -> Prediction | None:  # noqa: ARG002
+        if not self._count:
+            return None
+        return Prediction(self.expect(size), self._scale.deviation if self._scale.count > 1 else None)
+
+    def learn(self, size: float, seconds: float) -> None:
+        """The centred sums of West (1979), as `RecursiveLeastSquares`."""
+        check_observation(size, seconds)
+        scale = self._scale
+        if self._count:
+            expected = self.expect(size)
+            error, clip = seconds - expected, scale.clip
+            scale.add(error)
+            if error > clip:
+                seconds = expected + clip
+            elif error < -clip:
+                seconds = max(0.0, expected - clip)
+        if self._count < self.window:
+            self._count += 1
+        faded = self.forgetting * self._weight
+        weight = self._weight = faded + 1
+        d, t = size - self._size, seconds - self._seconds
+        self._size += d / weight
+        self._seconds += t / weight
+        least = max(ROUNDING * size, SIZE_MIN)
+        if -least <= d <= least:  # else a run of one size would fade all sums but that of its rounding
+            d = 0.0
+        share = faded / weight
+        self._sdd = self.forgetting * self._sdd + share * d * d
+        self._sdt = self.forgetting * self._sdt + share * d * t
+        self._slope = self._sdt / self._sdd if self._sdd > weight * least * least else 0.0
+
+
+class BayesianLeastSquares(RecursiveLeastSquares):
+    """Bayesian linear regression with unknown noise; nothing is forgotten unless told.
+
+    The slope's prior is normal around 0 and weighs PRIOR observations; level and noise have none (Gelman
+    et al., Bayesian Data Analysis, chapter 14). `error_s` is the posterior's standard deviation of the
+    mean time at this size: what bandits explore by.
+    """
+
+    PRIOR = 1.0
+
+    def __init__(self, window: int, seed: int = 0, forgetting: float | None = None) -> None:
+        super().__init__(window, seed, 1.0 if forgetting is None else forgetting)
+
+    def predict(self, size: float, ahead: int = 1) -> Prediction | None:  # noqa: ARG002
+        if not self._count:
+            return None
+        ridge = self.PRIOR * self._sdd / self._weight  # in the units of the sizes seen
+        least = max(SIZE_MIN, ROUNDING * self._size.value)
+        known = self._sdd > self._weight * least * least
+        slope = self._sdt / (self._sdd + ridge) if known else 0.0
+        offset = self._size.offset(size)
+        spread = self._spread(slope)
+        error = None
+        if spread is not None:
+            leverage = offset * offset / (self._sdd + ridge) if known else 0.0
+            error = spread * math.sqrt(1 / self._weight + leverage)
+            if not math.isfinite(error):
+                error = None
+        return Prediction(self._seconds.value + slope * offset, spread, error)
+
+
+class Kalman:
+    """A dynamic linear model: level and slope are random walks, what is observed has noise.
+
+    West and Harrison, Bayesian Forecasting and Dynamic Models; noise of the walks as shares of the
+    measured one, so that no unit matters. Innovations are clipped at CLIP running errors. After RUN
+    innovations of one sign beyond SIGNAL running errors the level is as uncertain as the last of them is
+    large: what has changed for good is believed at once. Alone it can lock on to what it last saw of a
+    site that is no longer tried: it needs probes.
+    """
+
+    LEVEL_NOISE = 0.1  # variance a task over that of the measurement
+    SLOPE_NOISE = 0.01  # the same for the slope times the typical distance of a size from the first
+    NOISE_RATE = 0.04  # of the measurement's variance
+    SIGNAL, RUN = 2.0, 2
+
+    def __init__(self, window: int, seed: int = 0) -> None:  # noqa: ARG002 - nothing is random
+        self.window = checked_length(window)
+        self._count = 0
+        self._origin = 0.0  # the first size: the level is that there
+        self._level = self._slope = 0.0
+        self._p00 = self._p01 = self._p11 = 0.0  # covariance of level and slope
+        self._noise = 0.0
+        self._reach = 0.0  # mean square distance of sizes from the origin
+        self._scale = Scale()
+        self._run = 0  # innovations of one sign beyond SIGNAL, with that sign
+
+    @property
+    def full(self) -> bool:
+        return self._count >= self.window
+
+    def __len__(self) -> int:
+        return min(self._count, self.window)
+
+    def learn(self, size: float, seconds: float) -> None:
+        check_observation(size, seconds)
+        self._count = min(self._count + 1, self.window)
+        if self._scale.count == 0 and self._count == 1:
+            self._origin, self._level = size, seconds
+            self._noise = (0.3 * seconds) ** 2
+            self._p00 = self._noise
+            return
+        x = size - self._origin
+        if abs(x) <= SIZE_MIN:
+            x = 0.0
+        self._see(x)
+        expected = self._level + self._slope * x
+        error = seconds - expected
+        clip, deviation = self._scale.clip, self._scale.deviation
+        self._scale.add(error)
+        self._watch(error, deviation)
+        self._step(x, max(-clip, min(clip, error)))
+
+    def expect(self, size: float) -> float:
+        """The expected seconds alone."""
+        return self._level + self._slope * (size - self._origin)
+
+    def predict(self, size: float, ahead: int = 1) -> Prediction | None:  # noqa: ARG002
+        if not self._count:
+            return None
+        return Prediction(self.expect(size), self._scale.deviation if self._scale.count > 1 else None)
+
+    def _see(self, x: float) -> None:
+        """The slope is as unknown as the first size that differs tells; its walk is in units of the sizes."""
+        rate = max(1 / self._count, 1 / self.window)
+        first = self._reach == 0
+        self._reach += rate * (x * x - self._reach)
+        if first and self._reach > 0:
+            self._p11 = self._noise / self._reach
+
+    def _watch(self, error: float, deviation: float) -> None:
+        """Innovations beyond SIGNAL on one side, again and again, are a change."""
+        if self._scale.count <= CLIP_FROM or abs(error) <= self.SIGNAL * deviation:
+            self._run = 0
+            return
+        sign = 1 if error > 0 else -1
+        self._run = self._run + sign if self._run * sign > 0 else sign
+        if abs(self._run) >= self.RUN:
+            self._p00 += error * error
+
+    def _step(self, x: float, error: float) -> None:
+        """Predict and update (Kalman 1960), in the symmetric form."""
+        self._p00 += self.LEVEL_NOISE * self._noise
+        if self._reach > 0:
+            self._p11 += self.SLOPE_NOISE * self._noise / self._reach
+        c0, c1 = self._p00 + self._p01 * x, self._p01 + self._p11 * x
+        variance = c0 + c1 * x
+        total = variance + self._noise
+        if total > 0 and math.isfinite(total):
+            k0, k1 = c0 / total, c1 / total
+            self._level += k0 * error
+            self._slope += k1 * error
+            self._p00 = max(0.0, self._p00 - k0 * c0)
+            self._p01 -= k0 * c1
+            self._p11 = max(0.0, self._p11 - k1 * c1)
+        # What the model does not explain itself is noise of the measurement.
+        unexplained = max(error * error - variance, 0.0)
+        self._noise += max(1 / self._count, self.NOISE_RATE) * (unexplained - self._noise)

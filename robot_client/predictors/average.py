@@ -1,0 +1,112 @@
+"""Dynamic model averaging: several predictors of one site, each believed as far as it was right of late."""
+
+import math
+
+from robot_client.predictors.adaptive import ClippedLeastSquares, Kalman, Scale
+from robot_client.predictors.base import Prediction, check_observation
+from robot_client.predictors.features import Conditional, Gains
+from robot_client.runner import UNMEASURED, Condition
+
+SHARPNESS = 4.0  # weight of a model: exp(-SHARPNESS x its mean error in units of the average's own)
+MEMORY = 0.9  # of the mean error: so much of it is left after one more task
+ERROR_MAX = 4.0  # one task's error counts as at most so many of the average's own
+
+
+class Average(Conditional):
+    """Least squares and Kalman filter, each with the measured features (unless `blind`) and without.
+
+    The mean of their predictions, weighted by how small their errors were of late: Raftery, Karny and
+    Ettler, Online Prediction Under Model Uncertainty Via Dynamic Model Averaging (2010), with clipped
+    absolute errors in place of densities: an outlier is no model's fault. The models with features share
+    one set of gains. The spread is the running error of the average itself.
+    """
+
+    def __init__(self, window: int, seed: int = 0, *, blind: bool = False) -> None:
+        self._plain = _models(window, seed)
+        self._measured = () if blind else _models(window, seed)
+        count = len(self._plain) + len(self._measured)
+        self._errors = [0.0] * count
+        self._weights = [1 / count] * count
+        self._gains = Gains()
+        self._scale = Scale()
+
+    @property
+    def full(self) -> bool:
+        return self._plain[0].full
+
+    def __len__(self) -> int:
+        return len(self._plain[0])
+
+    def learn(self, size: float, seconds: float, condition: Condition = UNMEASURED) -> None:
+        check_observation(size, seconds)
+        if len(self):
+            self._judge(self._each(size, condition), seconds)
+        for plain in self._plain:
+            plain.learn(size, seconds)
+        if self._measured:
+            rest = max(0.0, seconds - (condition.round_trip_s or 0.0))
+            self._learn_gains(size, rest, condition)
+            rest /= self._gains.crowding(condition)
+            for measured in self._measured:
+                measured.learn(size, rest)
+
+    def predict(
+        self,
+        size: float,
+        ahead: int = 1,  # noqa: ARG002
+        condition: Condition = UNMEASURED,
+    ) -> Prediction | None:
+        if not len(self):
+            return None
+        return Prediction(
+            self._mean(self._each(size, condition)), self._scale.deviation if self._scale.count > 1 else None
+        )
+
+    def _each(self, size: float, condition: Condition) -> list[float]:
+        """Of every model: those without features first."""
+        found = [max(0.0, plain.expect(size)) for plain in self._plain]
+        if self._measured:
+            trip_s, crowding = condition.round_trip_s or 0.0, self._gains.crowding(condition)
+            found += [trip_s + crowding * max(0.0, one.expect(size)) for one in self._measured]
+        return found
+
+    def _mean(self, predicted: list[float]) -> float:
+        first = predicted[0]  # exact where all agree
+        return first + sum(
+            [weight * (one - first) for weight, one in zip(self._weights, predicted, strict=True)]
+        )
+
+    def _judge(self, predicted: list[float], seconds: float) -> None:
+        """How far each was off; the weights that follow."""
+        unit = self._scale.deviation
+        self._scale.add(seconds - self._mean(predicted))
+        unit = unit or self._scale.deviation
+        if not unit:
+            return
+        fresh = 1 - MEMORY
+        self._errors = [
+            MEMORY * before + fresh * min(abs(seconds - one) / unit, ERROR_MAX)
+            for before, one in zip(self._errors, predicted, strict=True)
+        ]
+        least = min(self._errors)
+        weights = [math.exp(SHARPNESS * (least - error)) for error in self._errors]
+        total = sum(weights)
+        self._weights = [weight / total for weight in weights]
+
+    def _learn_gains(self, size: float, rest: float, condition: Condition) -> None:
+        """From the error of the models that use them."""
+        if not (condition.queue or condition.load) or not len(self._measured[0]):
+            return
+        expected = sum(max(0.0, one.expect(size)) for one in self._measured) / len(self._measured)
+        expected *= self._gains.crowding(condition)
+        if expected > 0:
+            self._gains.learn(rest / expected, condition)
+
+
+def _models(window: int, seed: int) -> tuple[ClippedLeastSquares | Kalman, ...]:
+    return ClippedLeastSquares(window, seed), Kalman(window, seed)
+
+
+def blind_average(window: int, seed: int = 0) -> Average:
+    """Least squares and Kalman filter on the size alone."""
+    return Average(window, seed, blind=True)

@@ -1,0 +1,48 @@
+"""How much work a task of some size is: learnt from the results of all sites, so that it is never stale.
+
+What the unit of work is, a kind says itself (`@task(work=...)`); the times of a site are learnt per work.
+"""
+
+import math
+from bisect import bisect_left, insort
+from collections import deque
+
+PAIRS_MAX = 200  # (size, work) remembered
+ODD = 3.0  # times the median of those near: more work than this counts as so much
+NEAR = 20  # of them, those nearest in size: the line through them tells
+
+
+class SharedWork:
+    """Local linear regression of work on size (Cleveland 1979, with equal weights).
+
+    Work need not grow evenly with size: a line through all of it is off where it matters, at the size where
+    two sites take as long.
+    """
+
+    def __init__(self) -> None:
+        self._order: deque[tuple[float, float]] = deque()
+        self._sorted: list[tuple[float, float]] = []
+
+    def learn(self, size: float, work: float) -> None:
+        """A result said that a task of this size was so much work."""
+        if len(self._order) == PAIRS_MAX:
+            del self._sorted[bisect_left(self._sorted, self._order.popleft())]
+        self._order.append((size, work))
+        insort(self._sorted, (size, work))
+
+    def predict(self, size: float) -> float | None:
+        """The work to expect; None before anything is known."""
+        count = len(self._sorted)
+        if not count:
+            return None
+        first = max(0, min(bisect_left(self._sorted, (size,)) - NEAR // 2, count - NEAR))
+        near = self._sorted[first : first + NEAR]
+        sizes = [one for one, _ in near]
+        most = ODD * sorted([work for _, work in near])[len(near) // 2]
+        works = [min(work, most) for _, work in near]
+        mean_size, mean_work = math.fsum(sizes) / len(near), math.fsum(works) / len(near)
+        sdd = math.fsum([(one - mean_size) ** 2 for one in sizes])
+        if not sdd:
+            return mean_work
+        slope = math.fsum([(d - mean_size) * w for d, w in zip(sizes, works, strict=True)]) / sdd
+        return max(0.0, mean_work + slope * (size - mean_size))

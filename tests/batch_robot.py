@@ -1,0 +1,57 @@
+"""A robot that maps the same tasks over all sites and over each alone, in turn, and prints the seconds.
+
+The local testbed starts it in place of `robot-client`, held to its quota: `python -m tests.batch_robot`.
+"""
+
+import argparse
+import json
+import random
+import time
+
+from loadgen.work import hash_rounds
+from robot_client.offloader import Offloader
+from robot_client.policies import DEFAULT, predictor_of
+from robot_client.runner import CLOUD, ONBOARD
+from robot_client.trace import Record
+
+TASKS = 40
+ROUNDS = (10_000, 150_000)  # of a task, drawn evenly
+CONNECT_S = 20.0
+TIMEOUT_S = 20.0  # no answer is given up: what is measured is where tasks are put
+
+
+def main() -> None:
+    flags = argparse.ArgumentParser()
+    flags.add_argument("--cloud", required=True)
+    flags.add_argument("--repeats", type=int, required=True)
+    flags.add_argument("--seed", type=int, default=1)
+    given = flags.parse_args()
+    draws = random.Random(given.seed)
+    rounds = [draws.randint(*ROUNDS) for _ in range(TASKS)]
+    records: list[Record] = []
+    with Offloader.connect(
+        given.cloud,
+        policy=DEFAULT,
+        predictor=predictor_of(DEFAULT),
+        timeout_s=TIMEOUT_S,
+        observers=[records.append],
+    ) as offload:
+        assert offload.wait_for_sites(hash_rounds, CONNECT_S) == {}
+        expected = offload.map(hash_rounds, rounds)
+        ways: list[str | None] = [ONBOARD, CLOUD, None]
+        for repeat in range(given.repeats):
+            for way in ways[repeat % 3 :] + ways[: repeat % 3]:
+                records.clear()
+                began_s = time.perf_counter()
+                assert offload.map(hash_rounds, rounds, where=way) == expected
+                seconds = time.perf_counter() - began_s
+                used = [record.used for record in records]
+                twice = sum(len(record.executions) > 1 for record in records)
+                line = {"where": way or "all", "seconds": seconds, "twice": twice}
+                print(
+                    json.dumps({**line, **{site: used.count(site) for site in (ONBOARD, CLOUD)}}), flush=True
+                )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,19 @@
+"""How much is played: some in `make test`, all of it in `make chaos`, which sets CHAOS=1."""
+
+import os
+
+from loadgen.scenario import find_scenario, read_scenario, shipped
+
+ALL = os.environ.get("CHAOS") == "1"
+SCENARIOS = [name for name in shipped() if read_scenario(find_scenario(name)).checks]
+SHORT = [name for name in SCENARIOS if name != "soak"]
+FAULT_TIMES = {"local": 20, "docker": 3} if ALL else {"local": 1, "docker": 1}
+FEW_FAULTS = {
+    "local": ("truncation", "relay killed", "robot killed"),
+    "docker": ("network cut",),
+}
+WRONG = SHORT if ALL else ["outage"]  # scenarios that are played with wrong policies
+IN_CONTAINERS = SHORT if ALL else ["cloud-busy"]
+ON_LOOPBACK = SHORT if ALL else []  # with wrong policies they are played there anyway
+SOAK_TASKS = 1200  # one minute
+LEAK_TASKS = 600

@@ -1,0 +1,79 @@
+"""No check is a formality: each fails with the policy or the broken part that it names."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from loadgen import play as player
+from loadgen.play import Played, play
+from loadgen.scenario import Scenario, find_scenario, read_scenario
+from robot_client import policies
+from tests.breaks import BREAKS, bed_with
+from tests.chaos.plays import LEAK_TASKS, SCENARIOS, WRONG
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
+
+
+@pytest.fixture
+def broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Scenario, str], Played]:
+    """Plays a scenario with a wrong policy or a broken part."""
+
+    def run(scenario: Scenario, name: str) -> Played:
+        if name in policies.names():
+            return play(scenario.changed(policy=name), tmp_path, quiet=True)
+        change, cloud = BREAKS[name]
+        monkeypatch.setitem(player.TESTBEDS, "local", bed_with(cloud))
+        return play(change(scenario), tmp_path, quiet=True)
+
+    return run
+
+
+def failing(scenario: Scenario) -> dict[str, list[str]]:
+    """The checks by what they fail with."""
+    found: dict[str, list[str]] = {}
+    for check in scenario.checks:
+        found.setdefault(check.fails_with, []).append(str(check))
+    return found
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_every_check_names_what_it_fails_with(name: str) -> None:
+    """A policy or a broken part, and that nothing is lost and nothing is wrong is looked at everywhere."""
+    scenario = read_scenario(find_scenario(name))
+    assert failing(scenario).keys() <= {*policies.names(), *BREAKS}
+    assert scenario.about
+    for figure, fails_with in (("lost", "dead-robot"), ("wrong", "lying-cloud")):
+        assert [c.fails_with for c in scenario.checks if c.figure == figure] == [fails_with]
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        *(
+            (name, wrong)
+            for name in WRONG
+            for wrong in failing(read_scenario(find_scenario(name)))
+            if wrong in policies.names()
+        ),
+        ("calm", "dead-robot"),  # the same two checks are everywhere
+        ("calm", "lying-cloud"),
+    ],
+)
+def test_a_check_fails_with_what_it_names(broken: Callable[..., Played], name: str, wrong: str) -> None:
+    """Played for real with that policy or broken part it does not hold, and says by how much."""
+    scenario = read_scenario(find_scenario(name))
+    played = broken(scenario, wrong)
+    print(*played.verdicts, sep="\n")
+    held = {str(verdict.check): verdict.holds for verdict in played.verdicts}
+    assert [held[check] for check in failing(scenario)[wrong]] == [False] * len(failing(scenario)[wrong])
+    assert all("too much" in str(one) or "too little" in str(one) for one in played.verdicts if not one.holds)
+
+
+def test_a_leak_fails_the_soak(broken: Callable[..., Played]) -> None:
+    """A server that keeps a little of every task shows as growth of memory and of open files."""
+    scenario = read_scenario(find_scenario("soak")).changed(tasks=LEAK_TASKS)
+    played = broken(scenario, "leaky-cloud")
+    failed = {one.check.figure for one in played.verdicts if not one.holds}
+    print(*played.verdicts, sep="\n")
+    assert failed >= {"memory_growth_percent", "handles_growth_percent"}

@@ -1,0 +1,176 @@
+"""The fault list, played on both testbeds: nothing is lost, nothing is wrong, nothing hangs, nothing stays.
+
+`make test` plays some of them once, `make chaos` 20 times on loopback and 3 times in containers.
+"""
+
+import contextlib
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+
+from common.errors import OffloadError
+from loadgen import play as player
+from loadgen.containers import RUN
+from loadgen.play import Played, play
+from loadgen.player import EVENTS, TRACE
+from loadgen.scenario import CloudPart, RobotPart, Scenario, Workload
+from loadgen.testbed import CLOUD, ROBOT, WAN, Setup, Testbed
+from loadgen.timeline import Event
+from robot_client import trace
+from tests.chaos.plays import ALL, FAULT_TIMES, FEW_FAULTS
+from tests.compose.conftest import docker
+
+MAP = Path(__file__).parents[2] / "maps" / "depot.yaml"
+RATE = 20.0
+TIMEOUT_S = 0.5
+HUNG_S = 15.0  # the longest honest wait is the timeout and, after it, a queue of onboard plans
+FULL_DISK = "/dev/full"
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What begins and ends it, how long it lasts, and the seconds from one to the next."""
+
+    begin: tuple[str, object]
+    end: tuple[str, object] | None = None
+    last_s: float = 1.0
+    every_s: float = 3.0
+
+    def events(self, times: int) -> Iterator[Event]:
+        for n in range(times):
+            begin_s = 1.0 + n * self.every_s
+            yield Event(*self.begin, at_s=begin_s)
+            if self.end is not None:
+                yield Event(*self.end, at_s=begin_s + self.last_s)
+
+
+FAULTS = {
+    "cloud killed": Fault(("kill", CLOUD), ("start", CLOUD), every_s=7.0),
+    "cloud restarted": Fault(("restart", CLOUD), every_s=6.0),
+    "cloud stopped where it is": Fault(("pause", CLOUD), ("resume", CLOUD)),
+    "outage": Fault(("link", {"outage": True}), ("link", {"outage": False})),
+    "reset": Fault(("reset", True), every_s=1.0),
+    "hang": Fault(("link", {"hang": True}), ("link", {"hang": False})),
+    "truncation": Fault(
+        ("link", {"down": {"truncate_bytes": 3000}}), ("link", {"down": {"truncate_bytes": 0}})
+    ),
+    "relay killed": Fault(("kill", WAN), ("start", WAN), every_s=4.0),
+    "robot killed": Fault(("kill", ROBOT), ("start", ROBOT), every_s=7.0),
+    "network cut": Fault(("cut", CLOUD), ("join", CLOUD)),
+}
+UNSEEN = ("robot killed",)  # no task need fall back
+
+
+LOCAL = pytest.param("local", marks=pytest.mark.integration)
+DOCKER = pytest.param("docker", marks=pytest.mark.compose)
+pytestmark = pytest.mark.timeout(600)
+
+
+@pytest.fixture(autouse=True)
+def nothing_left(request: pytest.FixtureRequest) -> Iterator[None]:
+    """No process, container, network, socket or file of the testbed is there when the test is over."""
+    testbed = request.getfixturevalue("testbed")
+    if testbed == "docker":
+        request.getfixturevalue("engine")
+    left = {"local": processes, "docker": made_by_docker}[testbed]
+    before, files = set(left()), open_files()
+    yield
+    assert set(left()) == before
+    assert open_files() <= files + 1, "a socket or file of the testbed is open"
+
+
+def made_by_docker() -> list[str]:
+    """Containers and networks of any run."""
+    return [
+        *docker("ps", "--all", "--filter", f"label={RUN}", "--format", "{{.Names}}").split(),
+        *docker("network", "ls", "--filter", f"label={RUN}", "--format", "{{.Name}}").split(),
+    ]
+
+
+def open_files() -> int:
+    return sum(1 for _ in Path("/proc/self/fd").iterdir())
+
+
+def processes() -> list[str]:
+    """Command lines of the parts that this process started."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            if parent == os.getpid():
+                found.append((entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace"))
+    return found
+
+
+def scenario(fault: Fault | None, times: int) -> Scenario:
+    """Plans on a real map at a steady rate, sent to the cloud, and the fault so many times."""
+    seconds = 3.0 if fault is None else 2.0 + times * fault.every_s
+    workload = Workload(
+        map=MAP, resolution=0.05, tasks=int(RATE * seconds), arrivals="poisson", rate=RATE, jump=True
+    )
+    robot = RobotPart(cpus=1.0, policy="cloud", timeout_s=TIMEOUT_S)
+    events = () if fault is None else tuple(fault.events(times))
+    return Scenario("fault", 7, workload, "", robot, CloudPart(), {"delay_ms": 5.0}, events)
+
+
+def check(played: Played) -> None:
+    """Every task was answered once, rightly, and in bounded time."""
+    figures = player.figures(played.outcome, played.scenario)
+    assert (figures["lost"], figures["wrong"], figures["failed"]) == (0, 0, 0), [
+        one.wrong or one.error for one in played.outcome.answered if one.wrong or one.error
+    ]
+    numbers = sorted(one.i for one in played.outcome.answered)
+    assert numbers == list(range(played.scenario.workload.tasks))
+    assert max(one.response_s for one in played.outcome.answered) < HUNG_S
+
+
+@pytest.mark.parametrize(
+    ("testbed", "name"),
+    [
+        pytest.param(testbed, name, marks=mark)
+        for testbed, mark in (("local", pytest.mark.integration), ("docker", pytest.mark.compose))
+        for name in FAULTS
+        if ALL or name in FEW_FAULTS[testbed]
+    ],
+)
+def test_a_fault_costs_no_task(testbed: str, name: str, tmp_path: Path) -> None:
+    """All answered, every path right, the trace whole; and the fault was felt."""
+    times = FAULT_TIMES[testbed]
+    played = play(scenario(FAULTS[name], times), tmp_path, testbed, quiet=True)
+    check(played)
+    assert played.exit_codes[ROBOT] == 0
+    happened = [json.loads(line) for line in (tmp_path / EVENTS).read_text().splitlines()]
+    assert all(one["happened_s"] is not None and "skipped" not in one for one in happened), happened
+    records = list(trace.read(tmp_path / TRACE))
+    ids = {record["id"] for record in records}
+    assert len(ids) == len(records)
+    relays = 1 + (times if name == "relay killed" else 0)
+    assert len(list(tmp_path.glob("link*.jsonl"))) == relays, "the truth of a killed relay is kept"
+    fell_back = sum(record["used"] != CLOUD for record in records)
+    print(f"{name} x {times} on {testbed}: {len(records)} tasks, {fell_back} answered onboard")
+    assert fell_back or name in UNSEEN
+
+
+@pytest.mark.parametrize("testbed", [LOCAL, DOCKER])
+def test_a_full_disk_costs_the_trace_and_no_task(
+    testbed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The trace cannot be written: the robot says so and ends with 1, all tasks are answered."""
+    make: Callable[[Path, Mapping[str, Setup]], Testbed] = player.TESTBEDS[testbed]
+
+    def full(out: Path, setups: Mapping[str, Setup]) -> Testbed:
+        robot = setups[ROBOT]
+        flags = {**robot.flags, "trace": FULL_DISK}
+        return make(out, {**setups, ROBOT: replace(robot, flags=flags)})
+
+    monkeypatch.setitem(player.TESTBEDS, testbed, full)
+    played = play(scenario(None, 1), tmp_path, testbed, quiet=True)
+    check(played)
+    with pytest.raises(OffloadError, match="robot ended with exit code 1"):
+        played.check_robots()
+    log = (tmp_path / "logs" / "robot.log").read_text()
+    assert f"{played.scenario.workload.tasks} tasks are not in {FULL_DISK}" in log

@@ -1,0 +1,159 @@
+"""The Docker testbed is held to the testbed contract of `tests.testbeds`; and nothing of it is left."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from datetime import datetime
+from pathlib import Path
+
+import pytest
+
+from common.errors import ConfigError
+from loadgen.containers import OWNER, RUN, DockerTestbed
+from loadgen.testbed import Setup
+from tests.compose.conftest import ROOT, docker
+from tests.testbeds import CONTRACT, Bench, setups, start
+
+pytestmark = [pytest.mark.compose, pytest.mark.timeout(600), pytest.mark.usefixtures("engine")]
+
+END_S = 60.0
+HOG = "while"  # stands in the command of no part
+# A testbed in a process of its own, until it is ended.
+HOST = """
+import signal, sys, time
+from datetime import datetime
+from pathlib import Path
+from loadgen.containers import DockerTestbed
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores Ctrl-C
+with DockerTestbed(Path(sys.argv[1])) as bed:
+    bed.start("wan")
+    print(bed.run, flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.fixture(scope="module")
+def bench(engine: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:  # noqa: ARG001 - it skips
+    """Cloud and relay, started; robots that can be."""
+    out = tmp_path_factory.mktemp("docker")
+    with contextlib.chdir(ROOT), DockerTestbed(out, setups(out)) as bed:
+        bed.start()
+
+        def cpu(part: str) -> tuple[float, float]:
+            stats = bed._containers[part].stats(stream=False, one_shot=True)
+            read_at = datetime.fromisoformat(stats["read"])  # the engine takes its time to answer
+            return read_at.timestamp(), stats["cpu_stats"]["cpu_usage"]["total_usage"] / 1e9
+
+        def hogs(part: str) -> int:
+            if bed.exit_code(part) is not None:
+                return 0
+            return docker("top", name(bed, part), "-eo", "pid,args").count(HOG)
+
+        yield Bench(bed, cpu, hogs)
+    assert left_over(bed.run) == []
+
+
+@pytest.fixture
+def host(tmp_path: Path) -> Iterator[Callable[[], tuple[subprocess.Popen[str], str]]]:
+    """Factory: a process with a started testbed, and the testbed's run."""
+    with contextlib.ExitStack() as stack:
+
+        def run_host() -> tuple[subprocess.Popen[str], str]:
+            process = stack.enter_context(
+                subprocess.Popen(
+                    [sys.executable, "-c", HOST, str(tmp_path)], stdout=subprocess.PIPE, text=True, cwd=ROOT
+                )
+            )
+            stack.callback(process.kill)
+            assert process.stdout is not None
+            run = process.stdout.readline().strip()
+            assert len(left_over(run)) == 4, "a container and three networks"
+            return process, run
+
+        yield run_host
+
+
+def left_over(run: str) -> list[str]:
+    """What is there of a testbed's containers and networks."""
+    mine = ("--filter", f"label={RUN}={run}", "--format")
+    return [
+        *docker("ps", "--all", *mine, "{{.Names}}").split(),
+        *docker("network", "ls", *mine, "{{.Name}}").split(),
+    ]
+
+
+def name(bed: DockerTestbed, part: str) -> str:
+    return str(bed._containers[part].name)
+
+
+@pytest.mark.parametrize("sentence", CONTRACT, ids=lambda sentence: sentence.__name__)
+def test_the_docker_testbed_keeps_the_contract(bench: Bench, sentence: Callable[[Bench], None]) -> None:
+    """Each sentence of the contract, in containers."""
+    sentence(bench)
+
+
+def test_an_unknown_flag_is_the_parts_own_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A part that does not know a flag says so, as ConfigError; then nothing is left."""
+    monkeypatch.chdir(ROOT)
+    with (
+        DockerTestbed(tmp_path, {"wan": Setup({"dely_ms": 1.0})}) as bed,
+        pytest.raises(ConfigError, match=r"^loadgen wan: unrecognized arguments: --dely-ms=1.0 "),
+    ):
+        bed.start("wan")
+    assert left_over(bed.run) == []
+
+
+def test_a_robot_reaches_the_relay_and_nothing_else(bench: Bench) -> None:
+    """On the robots' network the cloud has no name, and there is no way out."""
+    bed = bench.bed
+    assert isinstance(bed, DockerTestbed)
+    try_all = (
+        "import socket\n"
+        "for host, port in (('wan', 5555), ('cloud', 5555), ('192.0.2.1', 80)):\n"
+        "    try:\n"
+        "        socket.create_connection((host, port), 3).close()\n"
+        "        print(host, port)\n"
+        "    except OSError:\n"
+        "        pass\n"
+    )
+    start(bench, "robot-2")
+    assert docker("exec", name(bed, "robot-2"), "python3", "-c", try_all) == "wan 5555"
+
+
+def test_a_container_is_its_callers(bench: Bench) -> None:
+    """The parts run as whoever runs the testbed; quotas are over 10 ms, and none is of the other kind."""
+    bed = bench.bed
+    assert isinstance(bed, DockerTestbed)
+    assert docker("exec", name(bed, "cloud"), "id", "-u") == str(os.getuid())
+    limits = docker("inspect", "-f", "{{.HostConfig.CpuPeriod}} {{.HostConfig.NanoCpus}}", name(bed, "cloud"))
+    assert limits == "10000 0"
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_testbed_leaves_nothing(host: Callable[..., tuple], stop: signal.Signals) -> None:
+    """Ctrl-C and SIGTERM, pressed twice: when the testbed has ended nothing of it is left."""
+    process, run = host()
+    process.send_signal(stop)
+    process.send_signal(stop)
+    process.wait(END_S)
+    assert left_over(run) == []
+
+
+def test_a_killed_testbed_is_cleared_away_by_the_next(
+    host: Callable[..., tuple], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a testbed left that was killed is gone once another starts; that of a living one stays."""
+    killed, left = host()
+    killed.kill()
+    killed.wait(END_S)
+    assert left_over(left) != []
+    monkeypatch.chdir(ROOT)
+    with DockerTestbed(tmp_path / "first") as first:
+        assert left_over(left) == []
+        with DockerTestbed(tmp_path / "second"):
+            assert len(left_over(first.run)) == 3, "its networks"
+            assert docker("network", "ls", "--filter", f"label={OWNER}", "--quiet").split()
+    assert left_over(first.run) == []

@@ -1,0 +1,159 @@
+"""`robot-client` with a workload of its own, against a real server: answers, references, open arrivals."""
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from loadgen.processes import LocalTestbed
+from robot_client import answers, references, trace
+from robot_client.policies import PINNED
+from robot_client.runner import CLOUD, ONBOARD
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
+
+ROOT = Path(__file__).parents[2]
+MAP = ("--map", str(ROOT / "maps/depot.yaml"), "--resolution", "0.05", "--jump")
+POISSON = ("--arrivals", "poisson", "--rate", "60")
+KILL_AFTER = 40  # answers
+WAIT_S = 60.0
+
+
+def command(*flags: object) -> list[str]:
+    return [sys.executable, "-m", "robot_client", *map(str, flags)]
+
+
+def robot(*flags: object, code: int = 0) -> str:
+    """Run the robot to its end; what it said."""
+    done = subprocess.run(command(*flags), capture_output=True, text=True, timeout=WAIT_S, cwd=ROOT)
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout
+
+
+def by_number(path: Path) -> dict[int, Any]:
+    """What each task was answered; each has one line."""
+    found = list(answers.read(path))
+    assert len({line["i"] for line in found}) == len(found)
+    return {line["i"]: line["answer"] for line in found}
+
+
+@pytest.mark.parametrize("arrivals", [(), POISSON], ids=["closed", "open"])
+def test_a_killed_run_goes_on_where_it_was(
+    testbed: Callable[..., LocalTestbed], tmp_path: Path, arrivals: tuple[str, ...]
+) -> None:
+    """kill -9, and again on the same files: each task is answered once, as in a run that nobody killed."""
+    bed = testbed({"tasks": "common.planner"})
+    flags = [*MAP, *arrivals, "--cloud", bed.endpoint, "--tasks", 150, "--sizes", "uniform:0:3", "--seed", 7]
+    robot(*flags, "--answers", tmp_path / "whole.jsonl")
+    path, kept = tmp_path / "answers.jsonl", tmp_path / "trace.jsonl"
+    killed = subprocess.Popen(
+        command(*flags, "--answers", path, "--trace", kept), stdout=subprocess.DEVNULL, cwd=ROOT
+    )
+    try:
+        until = time.monotonic() + WAIT_S
+        while not path.exists() or path.read_bytes().count(b"\n") < KILL_AFTER:
+            assert killed.poll() is None
+            assert time.monotonic() < until
+            time.sleep(0.005)
+    finally:
+        killed.kill()
+        killed.wait()
+    with path.open("ab") as file:
+        file.write(b'{"v":1,"i":')  # as a crash of the machine may leave it
+    before = {line["i"] for line in answers.read(path)}
+    assert KILL_AFTER <= len(before) < 150
+    ran_before = len(list(trace.read(kept)))
+    said = robot(*flags, "--answers", path, "--trace", kept)
+    assert f"{len(before)} of 150 tasks had their answer before" in said
+    assert f"{150 - len(before)} tasks answered" in said
+    assert len(list(trace.read(kept))) == ran_before + 150 - len(before)
+    assert by_number(path) == by_number(tmp_path / "whole.jsonl")
+    assert by_number(path).keys() == set(range(150))
+    lines = list(answers.read(path))[len(before) :]
+    assert min(line["due_s"] for line in lines) == pytest.approx(0, abs=1e-3)
+    if arrivals:
+        assert "began over 10 ms after they were due: " in said
+        assert all(line["due_s"] <= line["began_s"] <= line["ended_s"] for line in lines)
+
+
+def test_an_interrupted_run_records_what_it_answered(
+    testbed: Callable[..., LocalTestbed], tmp_path: Path
+) -> None:
+    """Ctrl-C with tasks in flight: trace and answers hold the same tasks, none of them given up."""
+    bed = testbed(delay_ms=40.0)
+    path, kept = tmp_path / "answers.jsonl", tmp_path / "trace.jsonl"
+    flags = ["--task", "tests.probes:zeros", "--sizes", "constant:9", "--tasks", 10_000, "--policy", CLOUD]
+    flags += ["--arrivals", "constant", "--rate", 100, "--cloud", bed.endpoint]
+    run = subprocess.Popen(
+        command(*flags, "--answers", path, "--trace", kept),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    )
+    until = time.monotonic() + WAIT_S
+    while not path.exists() or path.read_bytes().count(b"\n") < KILL_AFTER:
+        assert run.poll() is None
+        assert time.monotonic() < until
+        time.sleep(0.005)
+    run.send_signal(signal.SIGINT)
+    assert run.communicate(timeout=WAIT_S)[1] == "robot-client: interrupted\n"
+    assert run.returncode == 130
+    lines, records = list(answers.read(path)), list(trace.read(kept))
+    assert len(lines) >= KILL_AFTER
+    assert {line["id"] for line in lines} <= {record["id"] for record in records}
+    assert len(records) <= len(lines) + 16  # those that ended in the instant of the signal
+    assert all(record["used"] == CLOUD for record in records)
+
+
+def test_references_are_of_each_site_alone(testbed: Callable[..., LocalTestbed], tmp_path: Path) -> None:
+    """Every fifth plan again onboard and in the cloud; the trace of the run holds only the run."""
+    bed = testbed({"tasks": "common.planner"}, delay_ms=5.0)
+    kept = tmp_path / "trace.jsonl"
+    flags = ["--cloud", bed.endpoint, "--tasks", 20, "--window", 4, "--trace", kept, "--reference", 5]
+    robot(*MAP, *flags, "--answers", tmp_path / "a.jsonl")
+    records = {record["id"]: record for record in trace.read(kept)}
+    assert len(records) == 20
+    assert PINNED not in {record["decision"]["policy"] for record in records.values()}
+    asked = {line["i"]: line for line in answers.read(tmp_path / "a.jsonl")}
+    lines = list(references.read(trace.reference_path(kept)))
+    assert [line["i"] for line in lines] == [4, 9, 14, 19]
+    for line in lines:
+        record = records[asked[line["i"]]["id"]]
+        assert (line["chosen"], line["used"]) == (record["decision"]["site"], record["used"])
+        assert line["both"] == record["decision"]["both"]
+        assert line["waited_s"] == asked[line["i"]]["ended_s"] - asked[line["i"]]["due_s"]
+        assert line["sites"].keys() == {ONBOARD, CLOUD}
+        assert all(one["ok"] and not one["censored"] for one in line["sites"].values())
+        assert line["sites"][CLOUD]["seconds"] > 0.010  # the link alone
+
+
+def test_a_task_is_called_by_size(testbed: Callable[..., LocalTestbed], tmp_path: Path) -> None:
+    """Calls at a Poisson rate with sizes of a CSV, on both sites alike; those that fail are said."""
+    bed = testbed()
+    (tmp_path / "sizes.csv").write_text("size\n1000\n2500.7\n1e15\n")  # the last is more memory than there is
+    flags = ["--task", "tests.probes:zeros", "--sizes", tmp_path / "sizes.csv", "--tasks", 30, *POISSON]
+    found = {}
+    for policy in (ONBOARD, CLOUD):
+        path = tmp_path / f"{policy}.jsonl"
+        kept = tmp_path / f"{policy}.trace.jsonl"
+        to = ["--cloud", bed.endpoint, "--policy", policy, "--answers", path, "--trace", kept]
+        said = robot(*flags, *to)
+        assert "20 tasks answered; 10 failed\n" in said
+        lines = {line["i"]: line for line in answers.read(path)}
+        assert lines.keys() == set(range(30))
+        for i, line in lines.items():
+            assert (line["error"] is None) == (i % 3 != 2)
+            assert (line["error"] or "TaskFailed: MemoryError").startswith("TaskFailed: ")
+        records = {record["id"]: record for record in trace.read(kept)}
+        sizes = [records[lines[i]["id"]]["size"] for i in range(30)]
+        assert sizes == [1000, 2500, 1e15] * 10
+        assert {record["executions"][0]["site"] for record in records.values()} == {policy}
+        found[policy] = [(line["due_s"], line["answer"]) for _, line in sorted(lines.items())]
+    assert found[ONBOARD] == found[CLOUD]
+    assert len({answer["sha256"] for _, answer in found[CLOUD] if answer}) == 2

@@ -1,0 +1,69 @@
+"""Three real sites, each failing in turn: onboard, an edge server nearby, a faster cloud further away."""
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from loadgen.processes import LocalTestbed
+from loadgen.testbed import Setup
+from robot_client.offloader import Offloader
+from robot_client.policies import DEFAULT
+from robot_client.runner import CLOUD, ONBOARD
+from robot_client.trace import Record
+from tests import slow_site
+from tests.phases import EDGE, PHASES, TASKS, check
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(150)]
+
+EDGE_CPUS, EDGE_DELAY_MS = 0.3, 5.0
+CLOUD_CPUS, CLOUD_DELAY_MS = 2 * EDGE_CPUS, 40.0
+ROUNDS = (30_000, 50_000)  # about 10 ms of CPU
+ONBOARD_TIMES, SLOWED_TIMES = 15, 150  # the work of a server, and ten times that
+TIMEOUT_S = 0.5
+CONNECT_S = 20.0
+
+
+@pytest.fixture
+def servers(tmp_path: Path) -> Iterator[dict[str, LocalTestbed]]:
+    """Edge and cloud: each a server behind a relay of its own."""
+    with contextlib.ExitStack() as stack:
+        beds = {}
+        for site, cpus, delay_ms in ((EDGE, EDGE_CPUS, EDGE_DELAY_MS), (CLOUD, CLOUD_CPUS, CLOUD_DELAY_MS)):
+            setups = {
+                "cloud": Setup({"tasks": "tests.slow_site", "workers": 1}, cpus),
+                "wan": Setup({"delay_ms": delay_ms}),
+            }
+            beds[site] = stack.enter_context(LocalTestbed(tmp_path / site, setups))
+            beds[site].start()
+        yield beds
+
+
+def fail(servers: Mapping[str, LocalTestbed], failing: tuple[str, ...]) -> None:
+    """The edge crashes, the cloud's link falls silent, onboard becomes ten times as slow; others are well."""
+    if EDGE in failing:
+        servers[EDGE].kill("cloud")
+    elif not servers[EDGE].running("cloud"):
+        servers[EDGE].start("cloud")
+    servers[CLOUD].set_link(outage=CLOUD in failing)
+    slow_site.times = SLOWED_TIMES if ONBOARD in failing else ONBOARD_TIMES
+
+
+def test_the_best_living_site_is_used_within_thirty_tasks_of_each_change(
+    servers: dict[str, LocalTestbed], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the default policy, in phases of a hundred tasks; no task is lost."""
+    monkeypatch.setattr(slow_site, "times", ONBOARD_TIMES)
+    random, records = Random(1), list[Record]()
+    endpoints = {site: bed.endpoint for site, bed in servers.items()}
+    with Offloader.connect(
+        sites=endpoints, policy=DEFAULT, timeout_s=TIMEOUT_S, observers=[records.append]
+    ) as offload:
+        assert offload.wait_for_sites(slow_site.hash_slowly, CONNECT_S) == {}
+        for failing, _ in PHASES:
+            fail(servers, failing)
+            for _ in range(TASKS):
+                assert offload(slow_site.hash_slowly, random.randint(*ROUNDS))
+    check(records)

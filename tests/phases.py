@@ -1,0 +1,39 @@
+"""Onboard, edge and cloud failing in turn, and from which task on the best living one is used."""
+
+from collections.abc import Sequence
+
+from robot_client.runner import CLOUD, ONBOARD
+from robot_client.trace import Record
+
+EDGE = "edge"
+TASKS = 100  # of each phase
+WITHIN = 30  # tasks after a change
+SPAN, MOST = 10, 8  # tasks, and how many of them the best site answers: others are tried now and then
+# What fails in it, and the site that is best then.
+PHASES: tuple[tuple[tuple[str, ...], str], ...] = (
+    ((), EDGE),
+    ((EDGE,), CLOUD),
+    ((CLOUD,), EDGE),
+    ((ONBOARD,), EDGE),
+    ((EDGE, CLOUD), ONBOARD),
+    ((), EDGE),
+)
+
+
+def switch_point(used: Sequence[str | None], best: str) -> int | None:
+    """The first task from which on the best site answers MOST of any SPAN; None where there is none."""
+    right = [site == best for site in used]
+    bad = [n for n in range(len(right) - SPAN + 1) if sum(right[n : n + SPAN]) < MOST]
+    first = bad[-1] + 1 if bad else 0
+    return next((n for n in range(first, len(right) - SPAN + 1) if right[n]), None)
+
+
+def check(records: Sequence[Record], within: int = WITHIN) -> None:
+    """Print the switch point of each phase, and hold it to so many tasks."""
+    assert len(records) == TASKS * len(PHASES)
+    points = []
+    for n, (failing, best) in enumerate(PHASES):
+        used = [record.used for record in records[n * TASKS : (n + 1) * TASKS]]
+        points.append(switch_point(used, best))
+        print(f"failing: {' and '.join(failing) or 'nothing'}; used: {best} from task {points[-1]} on")
+    assert all(point is not None and point <= within for point in points), points

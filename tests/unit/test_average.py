@@ -1,0 +1,118 @@
+"""The average of several predictors."""
+
+from random import Random
+
+import pytest
+
+from robot_client.predictors.average import Average, blind_average
+from robot_client.runner import UNMEASURED, Condition
+
+
+class Says:
+    """A predictor that always says the same."""
+
+    full = True
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+
+    def __len__(self) -> int:
+        return 1
+
+    def learn(self, size: float, seconds: float) -> None:
+        pass
+
+    def expect(self, size: float) -> float:  # noqa: ARG002
+        return self.seconds
+
+
+def of(*seconds: float) -> Average:
+    one = Average(50, blind=True)
+    one._plain = tuple(Says(each) for each in seconds)  # type: ignore[assignment]
+    one._errors, one._weights = [0.0] * len(seconds), [1 / len(seconds)] * len(seconds)
+    return one
+
+
+def predicted(one: Average, condition: Condition = UNMEASURED) -> float:
+    found = one.predict(2.0, 1, condition)
+    assert found is not None
+    return found.seconds
+
+
+def test_before_they_have_erred_all_count_alike() -> None:
+    """The first prediction is the plain mean."""
+    assert predicted(of(0.1, 0.3)) == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("best", [0.1, 0.5])
+def test_the_better_model_wins(best: float) -> None:
+    """After thirty tasks the model that is right has nine tenths of the say."""
+    one, rng = of(0.1, 0.5), Random(1)
+    for _ in range(30):
+        one.learn(2.0, best * rng.uniform(0.9, 1.1))
+    assert predicted(one) == pytest.approx(best, abs=0.04)
+
+
+def test_a_model_that_becomes_right_is_believed_again() -> None:
+    """Errors fade: forty tasks after the other one took over it has the say."""
+    one = of(0.1, 0.5)
+    for _ in range(200):
+        one.learn(2.0, 0.1)
+    for _ in range(40):
+        one.learn(2.0, 0.5)
+    assert predicted(one) == pytest.approx(0.5, abs=0.04)
+
+
+def test_an_outlier_does_not_sway() -> None:
+    """One time a hundred times as long moves the prediction by less than a tenth of what parts the models."""
+    one, rng = of(0.1, 0.5), Random(2)
+    for _ in range(50):
+        one.learn(2.0, 0.1 * rng.uniform(0.9, 1.1))
+    before = predicted(one)
+    one.learn(2.0, 10.0)
+    assert predicted(one) == pytest.approx(before, abs=0.04)
+
+
+def test_where_all_agree_the_prediction_is_theirs() -> None:
+    """To the bit, also of a time that no sum of binary fractions is."""
+    for seconds in (0.1, 0.3, 1e-9):
+        assert predicted(of(seconds, seconds, seconds)) == seconds
+
+
+def test_no_time_is_below_zero() -> None:
+    """A model that says less than nothing counts as 0."""
+    assert predicted(of(-1.0, -2.0)) == 0.0
+
+
+@pytest.mark.parametrize("make", [Average, blind_average])
+def test_the_spread_is_the_average_error(make: object) -> None:
+    """Of normal noise of 20 ms around a line it comes to 20 ms, to a third."""
+    one, rng = make(50), Random(3)  # type: ignore[operator]
+    for _ in range(400):
+        size = rng.uniform(1, 5)
+        one.learn(size, 0.2 + 0.1 * size + rng.gauss(0, 0.02))
+    assert one.predict(2.0).spread_s == pytest.approx(0.02, rel=0.33)
+
+
+def test_a_link_that_changes_is_believed_after_it_has_told() -> None:
+    """Where the round trip explains the times the measured models win: a change is followed at once."""
+    one, rng = Average(50), Random(4)
+    for n in range(200):
+        trip_s = 0.02 if n // 20 % 2 else 0.2
+        size = rng.uniform(1, 5)
+        one.learn(size, trip_s + 0.02 * size, Condition(round_trip_s=trip_s))
+    assert predicted(one, Condition(round_trip_s=0.4)) == pytest.approx(0.44, rel=0.1)
+
+
+def test_a_feature_that_lies_is_not_believed() -> None:
+    """Where round trips are measured at random the blind models win: predictions stay near the truth."""
+    one, rng = Average(50), Random(5)
+    off = []
+    for n in range(300):
+        size, condition = rng.uniform(1, 5), Condition(round_trip_s=rng.choice([0.0, 0.5]))
+        if n > 100:
+            found = one.predict(size, 1, condition)
+            assert found is not None
+            off.append(abs(found.seconds - 0.1 * size))
+        one.learn(size, 0.1 * size, condition)
+    assert sum(off) / len(off) < 0.03, "the measured ones alone err by a quarter second"

@@ -1,0 +1,361 @@
+"""What `Offloader.map` does with a batch, with sites that answer when they are told to."""
+
+import re
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import pytest
+
+from common.errors import CloudBroken, CloudTimeout, ConfigError, Overtaken, TaskFailed
+from common.tasks import Task, task
+from robot_client import policies, predictors
+from robot_client.allowance import DUPLICATES_MAX, Allowance
+from robot_client.offloader import Offloader
+from robot_client.placement import SERVER_IN_FLIGHT_MAX
+from robot_client.policies.rules import WARM_UP
+from robot_client.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
+from robot_client.trace import Record
+from tests.fakes import ScriptedRunner
+
+WAIT_S = 5.0
+
+
+@task("doubled", size=lambda number: abs(float(number)))
+def doubled(number: int) -> int:
+    if number < 0:
+        raise ValueError(f"{number} is negative")
+    return 2 * number
+
+
+@task("scaled", size=lambda number, factor=1: float(number * factor))
+def scaled(number: int, factor: int = 1) -> int:
+    return number * factor
+
+
+@task("summed", size=lambda *numbers: float(sum(numbers)))
+def summed(*numbers: int) -> int:
+    return sum(numbers)
+
+
+@task("first_of", size=lambda pair: float(pair[0]))
+def first_of(pair: tuple[int, int]) -> int:
+    return pair[0]
+
+
+@task("stamp_once", size=lambda number: float(number), duplicate=False)
+def stamp_once(number: int) -> int:
+    return number
+
+
+def answers(site: str, a_second: float = 100.0, **fields: Any) -> Callable[[Task], Execution]:
+    """Right answers, that took as long as the task is large."""
+
+    def script(one: Task) -> Execution:
+        try:
+            value, failure = one.kind.function(*one.args), None
+        except ValueError as error:
+            value, failure = None, TaskFailed(f"ValueError: {error}")
+        seconds = one.size / a_second
+        return Execution(site, seconds, value, failure, queue_s=0.0, run_s=seconds, **fields)
+
+    return script
+
+
+class HeldRunner(ScriptedRunner):
+    """Answers a task when `release` lets it, once `holding`; one that is cancelled ends, as overtaken."""
+
+    def __init__(self, site: str, script: Callable[[Task], Execution]) -> None:
+        super().__init__(site, script)
+        self.holding = False
+        self.held: dict[int, tuple[Task, Future[Execution]]] = {}
+        self.most = 0
+        self._changed = threading.Condition()
+
+    def submit(self, task: Task, budget_s: float) -> "Future[Execution]":
+        if not self.holding:
+            return super().submit(task, budget_s)
+        future: Future[Execution] = Future()
+        with self._changed:
+            self.tasks.append(task)
+            self.held[task.id] = task, future
+            self.most = max(self.most, len(self.held))
+            self._changed.notify_all()
+        return future
+
+    def cancel(self, task: Task) -> None:
+        super().cancel(task)
+        _, future = self.held.pop(task.id)
+        future.set_result(Execution(self.site, 0.01, failure=Overtaken("late"), censored=True))
+
+    def wait_for(self, count: int) -> None:
+        """Until so many tasks are held."""
+        with self._changed:
+            assert self._changed.wait_for(lambda: len(self.held) >= count, WAIT_S), f"{len(self.held)} held"
+
+    def release(self) -> None:
+        """Answer the task that is held longest, once there is one."""
+        self.wait_for(1)
+        with self._changed:
+            task, future = self.held.pop(next(iter(self.held)))
+        future.set_result(self.script(task))
+
+
+Make = Callable[..., Offloader]
+Mapped = Callable[..., "Future[list[Any]]"]
+
+
+@pytest.fixture
+def make() -> Iterator[Make]:
+    """Makes offloaders by least squares; `records` are what they told."""
+    made: list[Offloader] = []
+
+    def factory(*runners: ScriptedRunner, records: list[Record] | None = None, **options: Any) -> Offloader:
+        made.append(
+            Offloader(
+                list(runners),
+                policy=policies.make("paper"),
+                predictor=lambda: predictors.make(predictors.LEAST_SQUARES, 20),
+                observers=[(records if records is not None else []).append],
+                **options,
+            )
+        )
+        return made[-1]
+
+    yield factory
+    for offload in made:
+        offload.close()
+
+
+def warm(offload: Offloader, function: Callable[..., Any] = doubled) -> None:
+    for number in range(1, 1 + WARM_UP):
+        for site in (ONBOARD, CLOUD):
+            offload(function, number, where=site)
+
+
+def test_answers_come_in_the_order_of_the_items(make: Make) -> None:
+    """Whatever order and site they ran in; each one leaves a record with a decision by map and its reason."""
+    records: list[Record] = []
+    cloud, onboard = ScriptedRunner(CLOUD, answers(CLOUD)), ScriptedRunner(ONBOARD, answers(ONBOARD))
+    offload = make(cloud, onboard, records=records)
+    numbers = [3, 40, 1, 17, 25, 9, 2]
+    assert offload.map(doubled, iter(numbers)) == [2 * one for one in numbers]
+    assert len(cloud.tasks) + len(onboard.tasks) == len(records) == len(numbers)
+    assert {record.decision.policy for record in records} == {"map"}
+    assert all(record.decision.reason for record in records)
+    assert offload.map(doubled, []) == []
+
+
+def test_an_item_is_the_argument_or_a_tuple_of_several(make: Make) -> None:
+    """A tuple is spread where the function takes several arguments, and is the one where it takes one."""
+    offload = make(ScriptedRunner(ONBOARD, answers(ONBOARD)))
+    assert offload.map(scaled, [(2, 3), 4, (5,)]) == [6, 4, 5]
+    assert offload.map(first_of, [(7, 8)]) == [7]
+    assert offload.map(summed, [(1, 2), 3]) == [3, 3]
+    with pytest.raises(TypeError, match="too many positional arguments"):
+        offload.map(scaled, [(1, 2), (1, 2, 3)])
+
+
+def test_the_first_error_is_raised_once_all_have_ended(make: Make) -> None:
+    """A task that fails costs the others nothing: all ran, and the first item's error is raised."""
+    cloud, onboard = ScriptedRunner(CLOUD, answers(CLOUD)), ScriptedRunner(ONBOARD, answers(ONBOARD))
+    offload = make(cloud, onboard)
+    with pytest.raises(TaskFailed, match=r"^ValueError: -2 is negative$"):
+        offload.map(doubled, [5, -2, 8, -13, 1])
+    assert sorted(one.args[0] for one in cloud.tasks + onboard.tasks) == [-13, -2, 1, 5, 8]
+
+
+def test_every_site_is_warmed_up_with_tasks_of_its_own(make: Make) -> None:
+    """Of an unknown kind each site gets a few from all over the sizes, one at a time, none of them twice."""
+    records: list[Record] = []
+    cloud, onboard = ScriptedRunner(CLOUD, answers(CLOUD)), ScriptedRunner(ONBOARD, answers(ONBOARD, 10.0))
+    make(cloud, onboard, records=records).map(doubled, range(20, 60))
+    warming = [record for record in records if record.decision.reason.startswith("warm-up")]
+    for site in (ONBOARD, CLOUD):
+        sizes = [record.size for record in warming if record.decision.site == site]
+        assert len(sizes) == WARM_UP
+        assert max(sizes) - min(sizes) >= 10
+    assert len({one.args[0] for one in cloud.tasks + onboard.tasks}) == len(cloud.tasks + onboard.tasks) == 40
+
+
+@pytest.fixture
+def mapped() -> Iterator[Mapped]:
+    """Maps in a thread, so that the test can release what is held."""
+    with ThreadPoolExecutor(1) as pool:
+
+        def start(offload: Offloader, *args: Any, **options: Any) -> "Future[list[Any]]":
+            return pool.submit(offload.map, *args, **options)
+
+        yield start
+
+
+def test_the_largest_tasks_come_first(make: Make, mapped: Mapped) -> None:
+    """What takes long is not left for the end: the more tasks wait when one is placed, the larger it is."""
+    records: list[Record] = []
+    cloud = HeldRunner(CLOUD, answers(CLOUD))
+    offload = make(cloud, ScriptedRunner(ONBOARD, answers(ONBOARD, 0.01)), records=records)  # far too slow
+    warm(offload)
+    records.clear()
+    cloud.holding = True
+    done = mapped(offload, doubled, [1, 5, 3, 4, 2])
+    for _ in range(5):
+        cloud.release()
+    assert done.result(WAIT_S) == [2, 10, 6, 8, 4]
+    waiting = {record.size: re.search(r"(\d+) tasks wait$", record.decision.reason) for record in records}
+    assert {size: found and found[1] for size, found in waiting.items()} == {
+        n: str(int(n)) for n in range(1, 6)
+    }
+
+
+def test_a_server_never_has_more_than_its_limit(make: Make, mapped: Mapped) -> None:
+    """Its queue stays empty, so it gets more at once, up to the limit; onboard has one."""
+    cloud, onboard = HeldRunner(CLOUD, answers(CLOUD)), HeldRunner(ONBOARD, answers(ONBOARD))
+    offload = make(cloud, onboard)
+    warm(offload)
+    cloud.holding = onboard.holding = True
+    done = mapped(offload, doubled, [20] * 60)
+    while not done.done():
+        with_tasks = [runner for runner in (cloud, onboard) if runner.held]
+        if with_tasks:
+            max(with_tasks, key=lambda runner: len(runner.held)).release()
+    assert done.result(WAIT_S) == [40] * 60
+    assert 2 < cloud.most <= SERVER_IN_FLIGHT_MAX
+    assert onboard.most == 1
+
+
+def straggling(
+    make: Make, function: Callable[..., Any] = doubled, **options: Any
+) -> tuple[Offloader, HeldRunner, HeldRunner, list[Record]]:
+    """A cloud that holds what it gets, an onboard as quick, and all second runs that may be saved up."""
+    records: list[Record] = []
+    cloud, onboard = HeldRunner(CLOUD, answers(CLOUD)), HeldRunner(ONBOARD, answers(ONBOARD))
+    offload = make(cloud, onboard, records=records, **options)
+    for _ in range(10):
+        warm(offload, function)
+    cloud.holding = True
+    return offload, cloud, onboard, records
+
+
+def test_an_idle_site_takes_over_the_last_task(make: Make, mapped: Mapped) -> None:
+    """A server that does not answer is overtaken, in the one record of the task, and told to stop."""
+    offload, cloud, onboard, records = straggling(make)
+    before = len(onboard.tasks)
+    assert mapped(offload, doubled, [2, 2]).result(WAIT_S) == [4, 4]
+    assert len(onboard.tasks) == before + 2
+    assert [len(one.executions) for one in records[-2:]] == [1, 2]
+    assert records[-1].used == ONBOARD
+    assert [one.args for one in cloud.cancelled] == [(2,)]
+
+
+@pytest.mark.parametrize(
+    ("function", "options"),
+    [(doubled, {"allowance": Allowance(duplicates=0.0)}), (stamp_once, {})],
+    ids=["no allowance", "never twice"],
+)
+def test_no_task_runs_twice_where_none_may(
+    make: Make,
+    mapped: Mapped,
+    function: Callable[..., Any],
+    options: dict[str, Any],
+) -> None:
+    """Without an allowance for second runs, and of a kind that allows none, the straggler is waited for."""
+    offload, cloud, onboard, _ = straggling(make, function, **options)
+    done = mapped(offload, function, [2, 2])
+    cloud.wait_for(1)
+    before = len(onboard.tasks)
+    with pytest.raises(TimeoutError):
+        done.result(0.3)
+    cloud.release()
+    assert len(done.result(WAIT_S)) == 2
+    assert len(onboard.tasks) == before
+    assert not cloud.cancelled
+
+
+def test_second_runs_are_paid_for(make: Make, mapped: Mapped) -> None:
+    """Take-overs come out of the allowance of all second runs."""
+    allowance = Allowance()
+    offload, *_ = straggling(make, allowance=allowance)
+    before = allowance.duplicates
+    assert before == pytest.approx(DUPLICATES_MAX)
+    mapped(offload, doubled, [2, 2]).result(WAIT_S)
+    assert before - 1 <= allowance.duplicates < before - 0.5
+
+
+def test_a_pinned_batch_stays_where_it_was_pinned(make: Make) -> None:
+    """Onboard, in the cloud, or each on both; a site that is not there is the usual error, at once."""
+    for where, sites in ((ONBOARD, [ONBOARD]), (CLOUD, [CLOUD]), ("both", [CLOUD, ONBOARD])):
+        records: list[Record] = []
+        offload = make(
+            ScriptedRunner(CLOUD, answers(CLOUD)), ScriptedRunner(ONBOARD, answers(ONBOARD)), records=records
+        )
+        assert offload.map(doubled, range(10), where=where) == list(range(0, 20, 2))
+        assert all([one.site for one in record.executions] == sites for record in records)
+    with pytest.raises(ConfigError, match="'edge' is not one of cloud, onboard, both"):
+        offload.map(doubled, [1], where="edge")
+    with pytest.raises(ConfigError, match="duplicate=False"):
+        offload.map(stamp_once, [1], where="both")
+
+
+def test_a_site_that_cannot_take_the_kind_is_left_out(make: Make) -> None:
+    """While it is absent onboard does the batch, also where it was pinned there, as with a single call."""
+    cloud = ScriptedRunner(CLOUD, answers(CLOUD), unavailable="not connected")
+    assert make(cloud, ScriptedRunner(ONBOARD, answers(ONBOARD))).map(doubled, range(20)) == [
+        2 * one for one in range(20)
+    ]
+    assert not cloud.tasks
+    assert make(cloud, ScriptedRunner(ONBOARD, answers(ONBOARD))).map(doubled, [1, 2], where=CLOUD) == [2, 4]
+
+
+def test_a_silent_site_is_left_out() -> None:
+    """Its heartbeats go unanswered: nothing is sent there."""
+    cloud = ScriptedRunner(CLOUD, answers(CLOUD))
+    offload = Offloader(
+        [cloud, ScriptedRunner(ONBOARD, answers(ONBOARD, 1.0))],
+        policy=policies.make(policies.DEFAULT),
+        predictor=lambda: predictors.make("average", 20),
+    )
+    with offload:
+        warm(offload)
+        before, cloud.measured = len(cloud.tasks), Condition(silent=True)
+        assert offload.map(doubled, range(20)) == [2 * one for one in range(20)]
+        assert len(cloud.tasks) == before
+        cloud.measured = UNMEASURED
+        offload.map(doubled, range(20))
+        assert len(cloud.tasks) > before
+
+
+def test_caps_hold_for_a_batch(make: Make) -> None:
+    """Without bytes left in this minute every task runs onboard."""
+    cloud = ScriptedRunner(CLOUD, answers(CLOUD, bytes_out=1000))
+    offload = make(
+        cloud, ScriptedRunner(ONBOARD, answers(ONBOARD, 1.0)), allowance=Allowance(bytes_a_minute=10_000)
+    )
+    warm(offload)
+    offload.map(doubled, range(20))
+    assert WARM_UP < len(cloud.tasks) <= 11
+    before = len(cloud.tasks)
+    offload.map(doubled, range(20))
+    assert len(cloud.tasks) == before
+
+
+@pytest.mark.parametrize("failure", [CloudBroken("gone"), CloudTimeout("late")])
+def test_a_failing_site_costs_no_answer(make: Make, failure: Exception) -> None:
+    """What fails there runs onboard, and the batch is whole."""
+    records: list[Record] = []
+    cloud = ScriptedRunner(CLOUD, lambda _: Execution(CLOUD, 2.0, failure=failure))  # type: ignore[arg-type]
+    offload = make(cloud, ScriptedRunner(ONBOARD, answers(ONBOARD)), records=records)
+    assert offload.map(doubled, range(40)) == [2 * one for one in range(40)]
+    tried = sum(len(record.executions) > 1 for record in records)
+    assert WARM_UP <= tried <= 8, tried
+
+
+def test_observers_and_last_see_every_task(make: Make) -> None:
+    """A record for each, numbered once, and the last of them is `last`."""
+    records: list[Record] = []
+    offload = make(
+        ScriptedRunner(CLOUD, answers(CLOUD)), ScriptedRunner(ONBOARD, answers(ONBOARD)), records=records
+    )
+    offload.map(doubled, range(12))
+    assert sorted(record.i for record in records) == list(range(12))
+    assert offload.last in records

@@ -1,0 +1,177 @@
+"""What others take of the CPU, from files laid out as a kernel shows them."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from robot_client import load
+from robot_client.load import EVERY_S, TICK_S, Load
+from tests.unit.test_cpu import Machine
+
+CPUS = os.cpu_count() or 1
+
+
+class Times:
+    """What the process reads of clocks, as the test says."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now_s, self.own_s = 100.0, 5.0
+        monkeypatch.setattr(load.time, "monotonic", lambda: self.now_s)
+        monkeypatch.setattr(load.time, "process_time", lambda: self.own_s)
+
+
+@pytest.fixture
+def times(monkeypatch: pytest.MonkeyPatch) -> Times:
+    return Times(monkeypatch)
+
+
+class Host:
+    """A /proc of a machine without cgroups."""
+
+    def __init__(self, folder: Path) -> None:
+        self.root = folder / "proc"
+        (self.root / "self").mkdir(parents=True)
+        self.busy_s(0.0)
+
+    def busy_s(self, seconds: float) -> None:
+        """All of it that was not idle, half of it the system's; guests are users already."""
+        half = round(seconds / 2 / TICK_S)
+        (self.root / "stat").write_text(f"cpu  {half} 0 {half} 99999 500 0 0 0 777 0\ncpu0 1 2 3\n")
+
+    def load(self) -> Load:
+        return Load(self.root / "self", self.root)
+
+
+def later(times: Times, seconds: float, own_s: float = 0.0) -> None:
+    times.now_s += seconds
+    times.own_s += own_s
+
+
+def test_the_share_of_others_is_that_of_what_is_left(tmp_path: Path, times: Times) -> None:
+    """Others who take half of what this process leaves are a load of a half, once that lasted."""
+    host = Host(tmp_path)
+    host.busy_s(50.0)
+    one = host.load()
+    assert one.share() == 0.0
+    total, own = 50.0, 0.25
+    for _ in range(60):
+        later(times, 0.5, own)
+        total += own + 0.5 * (0.5 * CPUS - own)
+        host.busy_s(total)
+        share = one.share()
+    assert share == pytest.approx(0.5, abs=0.01 + TICK_S)
+
+
+def test_what_this_process_takes_is_no_load(tmp_path: Path, times: Times) -> None:
+    """However busy the robot itself is, the load is that of others."""
+    host = Host(tmp_path)
+    host.busy_s(50.0)
+    one = host.load()
+    one.share()
+    total = 50.0
+    for _ in range(20):
+        later(times, 0.5, 0.4)
+        total += 0.4
+        host.busy_s(total)
+    assert one.share() == pytest.approx(0.0, abs=2 * TICK_S)
+
+
+def test_it_is_read_no_more_often_than_it_says(tmp_path: Path, times: Times) -> None:
+    """Between two readings the last share is the answer, at no cost."""
+    host = Host(tmp_path)
+    one = host.load()
+    one.share()
+    host.busy_s(1000.0)
+    later(times, 0.9 * EVERY_S)
+    assert one.share() == 0.0
+    later(times, 0.2 * EVERY_S)
+    assert one.share() > 0.0
+
+
+def test_the_share_moves_over_half_a_second(tmp_path: Path, times: Times) -> None:
+    """A quarter of a busy second moves it half the way; it never leaves 0 to 1."""
+    host = Host(tmp_path)
+    one = host.load()
+    one.share()
+    later(times, 0.25)
+    host.busy_s(100.0)
+    assert one.share() == pytest.approx(0.5)
+    for _ in range(20):
+        later(times, 0.5)
+        assert 0.0 <= one.share() <= 1.0
+    assert one.share() == pytest.approx(0.0, abs=1e-3)
+
+
+def test_where_nothing_is_left_the_last_share_stays(tmp_path: Path, times: Times) -> None:
+    """A process that has all the CPU learns nothing of what others would take."""
+    host = Host(tmp_path)
+    one = host.load()
+    one.share()
+    later(times, 0.5)
+    host.busy_s(100.0)
+    before = one.share()
+    assert before > 0
+    later(times, 0.5, 0.5 * CPUS)
+    host.busy_s(1000.0)
+    assert one.share() == before
+
+
+@pytest.mark.parametrize("text", ["", "cpu a b c d\n", "intr 5\n"])
+def test_what_cannot_be_read_is_no_load(tmp_path: Path, times: Times, text: str) -> None:
+    """A machine without /proc/stat, or with another one, has load 0 and goes on."""
+    host = Host(tmp_path)
+    (host.root / "stat").write_text(text)
+    one = host.load()
+    for _ in range(3):
+        later(times, 0.5)
+        assert one.share() == 0.0
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Machine:
+    return Machine(tmp_path)
+
+
+def test_in_a_group_with_a_quota_the_cpu_is_the_quota(machine: Machine, times: Times) -> None:
+    """Others who take a quarter CPU of a quota of a half are a load of a half."""
+    point = machine.mount("", "cgroup2")
+    machine.process("", "/robot")
+    group = machine.write(point / "robot", cpu_max="50000 100000\n", cpu_stat="usage_usec 6000000\n")
+    one = Load(machine.proc, machine.proc)
+    assert one.share() == 0.0
+    used_us = 6_000_000
+    for _ in range(10):
+        later(times, 0.5)
+        used_us += 125_000
+        machine.write(group, cpu_stat=f"usage_usec {used_us}\n")
+        share = one.share()
+    assert share == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_group_that_counts_nothing_is_the_sum_of_its_processes(machine: Machine, times: Times) -> None:
+    """Quota and count in other hierarchies: CPU times come from /proc/PID/stat, odd names too."""
+    limited = machine.mount("cpu", "cgroup", "rw,cpu")
+    machine.mount("cpuacct", "cgroup", "rw,cpuacct")
+    machine.process("cpuacct", "/")
+    machine.process("cpu", "/offboard")
+    group = machine.write(limited / "offboard", cpu_cfs_quota_us="50000\n")
+    (group / "cpu.cfs_period_us").write_text("100000\n")
+    (group / "cgroup.procs").write_text(f"{os.getpid()}\n41\n42\n")  # 42 has just ended
+    root = machine.proc.parent / "all"
+    (root / "41").mkdir(parents=True)
+
+    def other(seconds: float) -> None:
+        ticks = round(seconds / 2 / TICK_S)
+        (root / "41" / "stat").write_text(
+            f"41 (a busy (one)) R 1 1 1 0 -1 4 0 0 0 0 {ticks} {ticks} 0 0 20\n"
+        )
+
+    other(1.0)
+    one = Load(machine.proc, root)
+    assert one.share() == 0.0
+    for n in range(1, 11):
+        later(times, 0.5)
+        other(1.0 + 0.125 * n)
+        share = one.share()
+    assert share == pytest.approx(0.5, abs=0.05)

@@ -1,0 +1,169 @@
+"""What a kind's memory learns of each execution, and what it says of a site."""
+
+import math
+
+import pytest
+
+from common.errors import CloudBroken, CloudBusy, CloudError, CloudTimeout, Overtaken, TaskFailed
+from common.tasks import kind_of, task
+from robot_client import objectives, predictors
+from robot_client.energy import Energy
+from robot_client.memory import KindMemory
+from robot_client.policies import Outlook
+from robot_client.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
+
+SILENT = Condition(silent=True)
+
+
+@task("memory_worked", size=lambda size: size, work=lambda result: result["work"])
+def memory_worked(size: float) -> dict[str, float]:
+    return {"work": 10 * size}
+
+
+def memory(predictor: str = predictors.AVERAGE, *, shared_work: bool = False) -> KindMemory:
+    return KindMemory(
+        kind_of(memory_worked),
+        lambda: predictors.make(predictor, 50),
+        objective=objectives.Mean(),
+        energy=Energy(),
+        shared_work=shared_work,
+    )
+
+
+def outlook(of: KindMemory, site: str = CLOUD, condition: Condition = UNMEASURED) -> Outlook:
+    return of.site(site).outlook(1.0, condition, in_flight=0, timeout_s=2.0)
+
+
+def learn(
+    of: KindMemory, execution: Execution, *, silent: bool = False, condition: Condition = UNMEASURED
+) -> None:
+    site = of.site(execution.site)
+    expected = outlook(of, execution.site, condition)
+    of.pass_by()
+    site.learn(1.0, execution, expected, silent=silent, size=1.0)
+
+
+def known(predictor: str = predictors.AVERAGE) -> KindMemory:
+    """The cloud takes 0.2 s."""
+    one = memory(predictor)
+    for _ in range(20):
+        learn(one, Execution(CLOUD, 0.2))
+    return one
+
+
+def lost(failure: CloudError, seconds: float) -> Execution:
+    return Execution(CLOUD, seconds, failure=failure, censored=isinstance(failure, CloudTimeout | Overtaken))
+
+
+@pytest.mark.parametrize("failure", [CloudBusy("full"), CloudBroken("gone"), CloudTimeout("late")])
+def test_a_site_that_refuses_at_once_is_not_taken_for_a_fast_one(failure: CloudError) -> None:
+    """The time until a refusal, or until a short budget was over, is no time of a task: predictions stay."""
+    one = known()
+    for n in range(50):
+        learn(one, lost(failure, 0.004))
+        assert outlook(one).failures == n + 1
+    assert outlook(one).predicted_s == pytest.approx(0.2)
+    fresh = memory()
+    for failure in (CloudBusy("full"), CloudBroken("gone")):
+        learn(fresh, lost(failure, 0.004))
+    assert outlook(fresh).predicted_s is None
+
+
+def test_by_the_published_rule_every_lost_time_is_learnt() -> None:
+    """A plain predictor learns the time until the run was given up, however short."""
+    one = memory(predictors.LEAST_SQUARES)
+    learn(one, lost(CloudBusy("full"), 0.004))
+    assert outlook(one).predicted_s == 0.004
+
+
+def test_a_lost_time_that_is_longer_than_expected_is_learnt() -> None:
+    """After timeouts of 2 s the site is no longer expected to take 0.2 s."""
+    one = known()
+    for _ in range(30):
+        learn(one, lost(CloudTimeout("late"), 2.0))
+    predicted_s = outlook(one).predicted_s
+    assert predicted_s is not None
+    assert predicted_s > 1.0
+
+
+def test_an_overtaken_run_takes_at_least_what_was_expected() -> None:
+    """Given up early it teaches the prediction itself, given up late its own time; and it is no failure."""
+    one = known()
+    for _ in range(20):
+        learn(one, lost(Overtaken("late"), 0.05))
+    assert outlook(one).predicted_s == pytest.approx(0.2)
+    assert outlook(one).failures == 0
+    for _ in range(20):
+        learn(one, lost(Overtaken("late"), 0.6))
+    predicted_s = outlook(one).predicted_s
+    assert predicted_s is not None
+    assert predicted_s > 0.3
+
+
+def test_failures_of_a_silent_site_teach_nothing() -> None:
+    """While heartbeats go unanswered the timeout is expected anyway, and over when they are heard again."""
+    one = known()
+    for _ in range(30):
+        learn(one, lost(CloudTimeout("late"), 2.0), silent=True, condition=SILENT)
+        assert outlook(one, condition=SILENT).predicted_s == 2.0
+    assert outlook(one).predicted_s == pytest.approx(0.2)
+
+
+def test_the_tasks_own_failure_is_no_time() -> None:
+    """It is news of the site and nothing else."""
+    one = known()
+    one.pass_by()
+    learn(one, Execution(CLOUD, 0.001, failure=TaskFailed("no")))
+    assert outlook(one).predicted_s == pytest.approx(0.2)
+    assert (outlook(one).age, outlook(one).failures) == (0, 0)
+
+
+def test_age_counts_tasks_without_news() -> None:
+    """Of each site by itself."""
+    one = known()
+    learn(one, Execution(ONBOARD, 0.5))
+    for _ in range(3):
+        learn(one, Execution(ONBOARD, 0.5))
+    assert (outlook(one, CLOUD).age, outlook(one, ONBOARD).age) == (4, 0)
+
+
+def test_own_waiting_is_added_and_not_learnt() -> None:
+    """Time in the robot's own queue is told by what is under way: learnt is the run alone."""
+    one = memory()
+    for _ in range(10):
+        learn(one, Execution(ONBOARD, 0.7, queue_s=0.5))
+    assert outlook(one, ONBOARD).predicted_s == pytest.approx(0.2)
+    assert outlook(one, ONBOARD, Condition(wait_s=0.3)).predicted_s == pytest.approx(0.5)
+
+
+def test_work_is_told_by_results_and_shared() -> None:
+    """One result on any site tells all of them what a size is; a failed run tells nothing."""
+    one = memory(shared_work=True)
+    assert one.amount(3.0) is None
+    assert one.learn_work(3.0, [lost(CloudTimeout("late"), 2.0)]) is None
+    assert (
+        one.learn_work(3.0, [lost(CloudTimeout("late"), 2.0), Execution(ONBOARD, 0.1, {"work": 30.0})])
+        == 30.0
+    )
+    assert one.amount(3.0) == 30.0
+    assert memory().amount(3.0) == 3.0
+
+
+def test_a_work_function_that_fails_costs_no_answer(caplog: pytest.LogCaptureFixture) -> None:
+    """It is the user's own: logged, and the work unknown."""
+    one = memory(shared_work=True)
+    assert one.learn_work(3.0, [Execution(ONBOARD, 0.1, {})]) is None
+    assert "cannot be told" in caplog.text
+
+
+def test_bytes_and_joules_are_those_that_were_usual() -> None:
+    """The mean of the first ones, then one that fades; joules onboard by CPU time, away by bytes."""
+    one = memory()
+    for bytes_out in (100, 300):
+        learn(one, Execution(CLOUD, 0.2, bytes_out=bytes_out, bytes_in=50))
+    found = outlook(one)
+    assert found.bytes == 250.0
+    assert found.joules == pytest.approx(250 * Energy().radio_j_byte)
+    learn(one, Execution(ONBOARD, 0.5, cpu_s=0.4))
+    assert outlook(one, ONBOARD).joules == pytest.approx(0.4 * Energy().compute_w)
+    assert math.isfinite(outlook(one, ONBOARD).cost or 0.0)

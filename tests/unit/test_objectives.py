@@ -1,0 +1,109 @@
+"""What a policy is to make small, and what tasks take from the battery."""
+
+import pytest
+
+from common.errors import ConfigError
+from robot_client import objectives
+from robot_client.conformal import Conformal
+from robot_client.energy import Energy
+from robot_client.objectives import Expected
+
+
+def expected(seconds: float, spread_s: float | None = None, joules: float = 0.0) -> Expected:
+    return Expected(seconds, spread_s, joules)
+
+
+def erring(*errors_s: float) -> Conformal:
+    """The errors of a site that was always predicted to take 1 s, the first one taken twice."""
+    found = Conformal()
+    for error_s in (errors_s[0], *errors_s):
+        found.learn(1.0, 1.0 + error_s)
+    return found
+
+
+def cost(name: str, of: Expected, errors: Conformal | None = None, **needs: float) -> float:
+    return objectives.make(name, **needs).cost(of, errors or Conformal())
+
+
+def test_the_mean_is_the_prediction() -> None:
+    """Expected seconds, whatever the spread and the errors."""
+    assert cost("mean", expected(0.3, 0.9), erring(*[5.0] * 20)) == 0.3
+
+
+def test_the_tail_is_what_95_percent_stay_below() -> None:
+    """From the errors once enough are known; before from the spread, if there is one."""
+    rare = erring(*[0.0] * 90, *[2.0] * 10)
+    assert cost("p95", expected(1.0), rare) > 2.0
+    assert cost("p95", expected(1.0), erring(*[0.0] * 100)) == pytest.approx(1.0)
+    assert cost("p95", expected(0.3, 0.1)) == pytest.approx(0.3 + 0.1645)
+    assert cost("p95", expected(0.3)) == 0.3
+
+
+def test_a_steadier_site_wins_by_its_tail() -> None:
+    """The site with the larger mean and the smaller tail is better for p95, and worse for mean."""
+    steady, wild = (expected(1.2), erring(*[0.0] * 50)), (expected(1.0), erring(*[-0.1, 1.0] * 25))
+    assert cost("p95", *steady) < cost("p95", *wild)
+    assert cost("mean", *steady) > cost("mean", *wild)
+
+
+def test_the_deadline_counts_what_misses_it() -> None:
+    """The site that misses less often wins, however slow; between equals the faster one does."""
+    sure, unsure = erring(*[0.0] * 50), erring(*[0.0] * 40, *[5.0] * 10)
+    assert cost("deadline", expected(1.4), sure, deadline_s=2.0) < cost(
+        "deadline", expected(1.0), unsure, deadline_s=2.0
+    )
+    assert cost("deadline", expected(1.4), sure, deadline_s=2.0) > cost(
+        "deadline", expected(1.0), sure, deadline_s=2.0
+    )
+
+
+def test_before_errors_are_known_the_prediction_tells_of_the_deadline() -> None:
+    """A site that is expected beyond it misses, one before it does not."""
+    assert cost("deadline", expected(0.6), deadline_s=0.5) > 1
+    assert cost("deadline", expected(0.4), deadline_s=0.5) < 1e-3
+
+
+@pytest.mark.parametrize("seconds", [-0.5, -2.0])
+def test_a_prediction_below_zero_is_no_cost_below_zero(seconds: float) -> None:
+    """A line may go below 0, also to minus the deadline itself: it counts as no time at all."""
+    assert cost("deadline", expected(seconds), deadline_s=0.5) == 0.0
+
+
+def test_energy_weighs_joules_in_seconds() -> None:
+    """Cheap waiting beats fast computing where a joule is worth enough."""
+    onboard, cloud = expected(0.2, joules=0.5), expected(0.4, joules=0.01)
+    assert cost("energy", onboard, s_a_joule=0.1) < cost("energy", cloud, s_a_joule=0.1)
+    assert cost("energy", onboard, s_a_joule=1.0) > cost("energy", cloud, s_a_joule=1.0)
+    assert cost("energy", onboard, s_a_joule=2.0) == pytest.approx(0.2 + 2 * 0.5)
+
+
+@pytest.mark.parametrize(
+    ("name", "needs", "says"),
+    [
+        ("median", {}, "objective 'median' is not one of mean, p95, deadline, energy"),
+        ("deadline", {}, "needs a deadline above 0 s, not None"),
+        ("deadline", {"deadline_s": 0.0}, "needs a deadline above 0 s, not 0.0"),
+        ("energy", {}, "needs the seconds that a joule is worth, not None"),
+        ("energy", {"s_a_joule": -1.0}, "not -1.0"),
+    ],
+)
+def test_an_objective_says_what_it_needs(name: str, needs: dict[str, float], says: str) -> None:
+    """A wrong name, or one without what it needs, is one line."""
+    with pytest.raises(ConfigError, match=says):
+        objectives.make(name, **needs)
+
+
+def test_computing_takes_cpu_seconds_and_offloading_bytes_and_waiting() -> None:
+    """The model is linear in each."""
+    energy = Energy(compute_w=2.0, idle_w=0.5, radio_j_byte=1e-6)
+    assert energy.onboard_j(3.0) == 6.0
+    assert energy.remote_j(2.0, 1e6) == 2.0
+    assert Energy().onboard_j(1.0) == 0.9
+    assert Energy().remote_j(100.0, 1000) == pytest.approx(0.007)
+
+
+@pytest.mark.parametrize("field", ["compute_w", "idle_w", "radio_j_byte"])
+def test_no_watt_is_below_zero(field: str) -> None:
+    """Anything else is refused by name."""
+    with pytest.raises(ConfigError, match=field.replace("_", "-")):
+        Energy(**{field: -1.0})

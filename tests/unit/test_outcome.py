@@ -1,0 +1,156 @@
+"""Figures of a played scenario, worked out by hand, and the verdicts over them."""
+
+from collections.abc import Callable
+
+import pytest
+
+from loadgen.check import Check
+from loadgen.compare import CompareConfig, table, turned
+from loadgen.outcome import FIGURES, Answered, Outcome, Reading, Reference
+from loadgen.scenario import Scenario, Workload
+
+
+def answered(i: int, response_s: float, chosen: str = "cloud", **more: object) -> Answered:
+    """Task `i`, due at second `i`."""
+    fields = {"error": None, "answer": None, "both": False, "sites": (chosen,)} | more
+    return Answered(i=i, robot="robot", due_s=i, ended_s=i + response_s, chosen=chosen, **fields)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def run() -> Outcome:
+    """Ten tasks asked, task 9 lost: 0.1 to 0.9 s, the first two on both sites, the even ones onboard."""
+    tasks = [
+        answered(
+            i,
+            0.1 * (i + 1),
+            "onboard" if i % 2 == 0 else "cloud",
+            both=i < 2,
+            sites=("onboard", "cloud") if i < 2 else ("cloud",),
+            wrong="too long" if i == 3 else None,
+            error="TaskFailed: no" if i == 4 else None,
+        )
+        for i in range(9)
+    ]
+    references = [
+        Reference(3, "cloud", False, {"onboard": 0.2, "cloud": 0.1}, {}),
+        Reference(5, "cloud", False, {"onboard": 0.1, "cloud": 0.3}, {}),
+        Reference(7, "cloud", False, {"onboard": 0.1}, {"cloud": 0.5}),
+        Reference(8, "onboard", True, {"onboard": 0.2, "cloud": 0.1}, {}),
+    ]
+    return Outcome({"robot": 10}, tasks, references, deadline_s=0.75)
+
+
+@pytest.mark.parametrize(
+    ("figure", "expected"),
+    [
+        ("lost", 1),
+        ("wrong", 1),
+        ("failed", 1),
+        ("mean_ms", 500),
+        ("p95_ms", 900),
+        ("p99_ms", 900),
+        ("late_percent", 100 * 2 / 9),
+        ("cloud_percent", 100 * 3 / 7),  # of the seven that went to one site
+        ("twice_percent", 100 * 2 / 9),
+        ("accuracy_percent", 50),  # tasks 3 and 5; 7 has one time, 8 ran on both
+        ("time_over_oracle", (0.1 + 0.3 + (0.5 + 0.1) + 0.1) / (0.1 + 0.1 + 0.1 + 0.1)),
+        ("regret_ms", 1e3 * (0.0 + 0.2 + 0.5 + 0.0) / 4),
+    ],
+)
+def test_a_figure_is_what_it_says(run: Outcome, figure: str, expected: float) -> None:
+    """By hand, from ten tasks."""
+    assert FIGURES[figure].compute(run) == pytest.approx(expected)
+
+
+def test_a_part_of_a_run_counts_its_own_tasks(run: Outcome) -> None:
+    """Between two tasks only those are asked for, answered and referenced."""
+    part = run.between(4, 8)
+    assert FIGURES["lost"].compute(part) == 0
+    assert [one.i for one in part.answered] == [4, 5, 6, 7]
+    assert [one.i for one in part.references] == [5, 7]
+    assert FIGURES["lost"].compute(run.between(8)) == 1
+
+
+@pytest.mark.parametrize("figure", ["mean_ms", "cloud_percent", "time_over_oracle", "memory_growth_percent"])
+def test_a_figure_of_nothing_is_undefined(figure: str) -> None:
+    """Without tasks, references or readings there is none, and a check on it does not hold."""
+    nothing = Outcome({"robot": 0}, [])
+    assert FIGURES[figure].compute(nothing) is None
+    verdict = Check(figure=figure, at_most=1e9).judge(nothing)
+    assert not verdict.holds
+    assert str(verdict).endswith("no task tells")
+
+
+def test_growth_is_that_of_the_part_that_grew_most() -> None:
+    """Medians of the first and the last third of the last two thirds: a peak is no growth."""
+    flat = [Reading(t, "wan", 100, 10) for t in range(30)]
+    grown = [Reading(t, "cloud", 100 + t, 10 + (t == 25)) for t in range(30)]
+    run = Outcome({"robot": 0}, [], readings=flat + grown)
+    early, late = 100 + 12.5, 100 + 26.5  # of readings 10 to 29, thirds of 6
+    assert FIGURES["memory_growth_percent"].compute(run) == pytest.approx(100 * (late / early - 1))
+    assert FIGURES["handles_growth_percent"].compute(run) == 0
+
+
+@pytest.mark.parametrize(
+    ("check", "said"),
+    [
+        (Check(figure="lost", at_most=1), "holds  lost at most 1 tasks: 1"),
+        (Check(figure="lost", at_most=0), "FAILS  lost at most 0 tasks: 1, 1 too much"),
+        (
+            Check(figure="cloud_percent", at_least=80, from_task=2, to_task=6, note="known"),
+            "FAILS  cloud_percent at least 80 % from task 2 before task 6: 50, 30 too little (known)",
+        ),
+    ],
+)
+def test_a_verdict_says_by_how_much(run: Outcome, check: Check, said: str) -> None:
+    """What was looked at, what it is, and how far it is from what is allowed."""
+    assert str(check.judge(run)) == said
+
+
+def test_each_policy_comes_first_equally_often() -> None:
+    """Whatever the machine does besides meets all alike."""
+    assert [turned("abc", n) for n in range(4)] == [list("abc"), list("bca"), list("cab"), list("abc")]
+
+
+@pytest.fixture
+def outcome() -> Callable[[float], Outcome]:
+    """Forty tasks in the cloud that take so long, give or take, every fourth of them referenced."""
+
+    def make(seconds: float) -> Outcome:
+        tasks = [answered(i, seconds * (1 + 0.1 * (i % 3))) for i in range(40)]
+        references = [
+            Reference(i, "cloud", False, {"cloud": seconds, "onboard": 0.1}, {}) for i in range(0, 40, 4)
+        ]
+        return Outcome({"robot": 40}, tasks, references, deadline_s=0.3)
+
+    return make
+
+
+def test_a_comparison_pairs_the_same_tasks(outcome: Callable[[float], Outcome]) -> None:
+    """Twice the time on every task is a ratio of 2 with an interval of nothing; regret is as by hand."""
+    config = CompareConfig(policies=("paper", "cloud"), seeds=2)
+    runs = {"paper": [outcome(0.1)] * 2, "cloud": [outcome(0.2)] * 2}
+    compared = table(Scenario("small", 1, Workload(task="m:f", sizes=("constant:1",))), config, runs)
+    paper, *_, cloud, low, high = compared.lines
+    assert (paper.policy, paper.tasks, paper.over_first) == ("paper", 80, 1.0)
+    assert cloud.over_first == pytest.approx(2.0)
+    assert (low.over_first, high.over_first) == (pytest.approx(2.0), pytest.approx(2.0))
+    assert low.mean_ms < cloud.mean_ms < high.mean_ms
+    assert (cloud.referenced, cloud.time_over_oracle) == (20, pytest.approx(2.0))
+    assert cloud.regret_ms == pytest.approx(100)
+    assert (cloud.late_percent, cloud.lost, cloud.cloud_percent) == (0.0, 0, 100.0)
+
+
+def test_a_lost_task_is_counted_and_not_paired(outcome: Callable[[float], Outcome]) -> None:
+    """A policy that lost tasks is compared on those that it answered."""
+    config = CompareConfig(policies=("paper", "cloud"), seeds=1)
+    whole, part = outcome(0.1), outcome(0.2)
+    part = Outcome(part.asked, part.answered[5:], part.references, deadline_s=part.deadline_s)
+    compared = table(
+        Scenario("small", 1, Workload(task="m:f", sizes=("constant:1",))),
+        config,
+        {"paper": [whole], "cloud": [part]},
+    )
+    cloud = next(line for line in compared.lines if line.policy == "cloud" and not line.bound)
+    assert (cloud.lost, cloud.tasks) == (5, 35)
+    assert cloud.over_first == pytest.approx(2.0)

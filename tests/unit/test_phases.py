@@ -1,0 +1,321 @@
+"""Faults in every phase: no answer lost, none given twice, and each site learns of its own tasks only.
+
+Time is virtual. Each case runs three tasks of different sizes: a plain one, the one with the fault, and a
+plain one while what is left of it may still be under way.
+"""
+
+from collections.abc import Callable
+from random import Random
+from typing import NamedTuple
+
+import pytest
+
+from common.errors import CloudBroken, CloudBusy, CloudTimeout, OffloadError, TaskFailed
+from common.tasks import task
+from robot_client import policies, predictors
+from robot_client.allowance import DUPLICATES_MAX, Allowance
+from robot_client.offloader import Offloader
+from robot_client.policies import Decision, Forecast, Policy
+from robot_client.predictors.linear import LeastSquares
+from robot_client.runner import CLOUD, ONBOARD, Condition
+from robot_client.trace import Late, Record
+from tests.virtual import VirtualClock, VirtualRunner
+
+EDGE = "edge"
+PLAIN_S = {ONBOARD: 0.01, CLOUD: 0.02}  # of tasks without a fault
+TIMEOUT_S = 2.0
+HEDGE_S = 0.4
+
+WARM_UP = Decision(ONBOARD, True, "warm-up", "scripted")
+PROBE = Decision(ONBOARD, False, "probe", "scripted", CLOUD)
+PROBE_BACK = Decision(CLOUD, False, "probe", "scripted", ONBOARD)
+HEDGE = Decision(CLOUD, False, "hedge", "scripted", ONBOARD, HEDGE_S)
+HEDGE_AWAY = Decision(ONBOARD, False, "hedge", "scripted", CLOUD, HEDGE_S)
+
+BROKEN, BUSY, LATE = CloudBroken("gone"), CloudBusy("full"), CloudTimeout("late")
+FAILED = TaskFailed("ValueError: no")
+OK = None
+NEVER = (None, None)  # no answer: a server is given up at the end of the budget
+
+
+@task("phase_echo", size=lambda number: number)
+def phase_echo(number: int) -> int:
+    return 100 * number
+
+
+class Scripted:
+    """Decides as it is told."""
+
+    def __init__(self) -> None:
+        self.next = Decision(ONBOARD, False, "plain", "scripted")
+
+    def decide(self, forecast: Forecast) -> Decision:  # noqa: ARG002
+        return self.next
+
+
+class Scene:
+    """An offloader in virtual time, with the window of each site in sight."""
+
+    def __init__(self, policy: Policy | None = None) -> None:
+        self.clock = VirtualClock()
+        self.sites = {site: VirtualRunner(site, self.clock, PLAIN_S[site]) for site in (ONBOARD, CLOUD)}
+        self.policy = Scripted()
+        self.allowance = Allowance(1.0, first=0.0)
+        self.records: list[Record] = []
+        self._made: list[LeastSquares] = []
+        self.offload = Offloader(
+            list(self.sites.values()),
+            policy=policy or self.policy,
+            predictor=self._remember,
+            allowance=self.allowance,
+            timeout_s=TIMEOUT_S,
+            observers=[self.records.append],
+            clock=self.clock,
+        )
+
+    def _remember(self) -> LeastSquares:
+        self._made.append(LeastSquares(50))
+        return self._made[-1]
+
+    def ask(self, number: int, decision: Decision) -> int | str:
+        """The answer, or the type of what was raised."""
+        self.policy.next = decision
+        try:
+            answer: int = self.offload(phase_echo, number)
+        except OffloadError as error:
+            return type(error).__name__
+        return answer
+
+    def learnt(self, site: str) -> list[tuple[float, float]]:
+        """Size and seconds, in microseconds; memories are made in the order of the runners."""
+        return [(size, round(seconds, 6)) for size, seconds in self._made[[*self.sites].index(site)].window]
+
+    def in_flight(self) -> int:
+        return sum(len(flights) for flights in self.offload._flights.values())
+
+
+Run = tuple[float | None, OffloadError | None]
+
+
+class Case(NamedTuple):
+    """What the sites do with task 2, and what must come of it.
+
+    `runs`: in the order in which they began, each with its failure; seconds are those learnt, None: nothing.
+    """
+
+    name: str
+    decision: Decision
+    onboard: Run
+    cloud: Run
+    runs: str
+    onboard_s: float | None
+    cloud_s: float | None
+    duplicates: int = 1
+    answer: int | str = 200
+
+
+def lost(fault: OffloadError) -> list[Case]:
+    """The cases of a cloud that is broken, busy or late: alike but for the name of the failure."""
+    name = type(fault).__name__
+    onboard_first, cloud_first = f"onboard, cloud {name}", f"cloud {name}, onboard"
+    left = "onboard, cloud Overtaken"
+    return [
+        Case(f"warm-up {name}", WARM_UP, (0.3, OK), (0.2, fault), onboard_first, 0.3, 0.2),
+        Case(f"probe {name}", PROBE, (0.3, OK), (0.2, fault), onboard_first, 0.3, 0.2),
+        Case(f"probe {name} after the answer", PROBE, (0.3, OK), (0.9, fault), left, 0.3, 0.9),
+        Case(f"probe back {name}", PROBE_BACK, (0.3, OK), (0.2, fault), cloud_first, 0.3, 0.2),
+        Case(f"hedge {name} before the second", HEDGE, (0.3, OK), (0.2, fault), cloud_first, 0.3, 0.2, 0),
+        Case(f"hedge {name} while both run", HEDGE, (0.3, OK), (0.6, fault), cloud_first, 0.3, 0.6),
+        Case(f"hedge away {name}", HEDGE_AWAY, (0.6, OK), (0.1, fault), onboard_first, 0.6, 0.1),
+    ]
+
+
+OWN = "TaskFailed"  # the task's own failure is raised, from whichever site it comes first
+CASES = [
+    *(case for fault in (BROKEN, BUSY, LATE) for case in lost(fault)),
+    Case("warm-up", WARM_UP, (0.3, OK), (0.2, OK), "onboard, cloud", 0.3, 0.2),
+    Case("warm-up, silent", WARM_UP, (0.3, OK), NEVER, "onboard, cloud CloudTimeout", 0.3, 2.0),
+    Case("warm-up, cloud fails", WARM_UP, (0.3, OK), (0.2, FAILED), "onboard, cloud TaskFailed", 0.3, None),
+    Case("warm-up, onboard fails", WARM_UP, (0.3, FAILED), (0.2, OK), "onboard TaskFailed, cloud", None, 0.2),
+    Case(
+        *("warm-up, task fails", WARM_UP, (0.3, FAILED), (0.2, FAILED)),
+        *("onboard TaskFailed, cloud TaskFailed", None, None),
+        answer=OWN,
+    ),
+    Case(
+        *("warm-up, cloud broken and task fails", WARM_UP, (0.3, FAILED), (0.2, BROKEN)),
+        *("onboard TaskFailed, cloud CloudBroken", None, 0.2),
+        answer=OWN,
+    ),
+    Case("probe", PROBE, (0.3, OK), (0.2, OK), "onboard Overtaken, cloud", 0.3, 0.2),
+    Case("probe slow", PROBE, (0.3, OK), (0.9, OK), "onboard, cloud Overtaken", 0.3, 0.9),
+    Case("probe silent", PROBE, (0.3, OK), NEVER, "onboard, cloud Overtaken", 0.3, 2.0),
+    Case("probe fails late", PROBE, (0.3, OK), (0.9, FAILED), "onboard, cloud Overtaken", 0.3, None),
+    Case(
+        *("probe fails first", PROBE, (0.3, OK), (0.2, FAILED)),
+        *("onboard Overtaken, cloud TaskFailed", 0.3, None),
+        answer=OWN,
+    ),
+    Case("probe back lost late", PROBE_BACK, (0.3, OK), (0.9, BROKEN), "cloud Overtaken, onboard", 0.3, 0.9),
+    Case("hedge in time", HEDGE, (0.3, OK), (0.2, OK), "cloud", None, 0.2, 0),
+    Case("hedge, early failure", HEDGE, (0.3, OK), (0.2, FAILED), "cloud TaskFailed", None, None, 0, OWN),
+    Case(
+        *("hedge, first fails", HEDGE, (0.3, OK), (0.6, FAILED)),
+        *("cloud TaskFailed, onboard Overtaken", 0.3, None),
+        answer=OWN,
+    ),
+    Case(
+        *("hedge, second fails", HEDGE, (0.1, FAILED), (0.6, OK)),
+        *("cloud Overtaken, onboard TaskFailed", None, 0.5),
+        answer=OWN,
+    ),
+    Case("hedge, second wins", HEDGE, (0.1, OK), (0.9, OK), "cloud Overtaken, onboard", 0.1, 0.5),
+    Case("hedge, silent", HEDGE, (0.3, OK), NEVER, "cloud Overtaken, onboard", 0.3, 0.7),
+    Case("hedge, first wins", HEDGE, (0.3, OK), (0.6, OK), "cloud, onboard Overtaken", 0.3, 0.6),
+    Case("hedge, loser fails", HEDGE, (0.3, FAILED), (0.6, OK), "cloud, onboard Overtaken", None, 0.6),
+    Case("hedge away, second wins", HEDGE_AWAY, (0.9, OK), (0.1, OK), "onboard Overtaken, cloud", 0.9, 0.1),
+    Case("hedge away, first wins", HEDGE_AWAY, (0.6, OK), (0.9, OK), "onboard, cloud Overtaken", 0.6, 0.2),
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_a_fault_costs_no_answer_and_teaches_nobody_a_wrong_time(case: Case) -> None:
+    """Answers, records, executions, duplicates and what was learnt are those of the case, no more."""
+    scene = Scene()
+    sites = scene.sites
+    assert scene.ask(1, Decision(CLOUD, False, "plain", "scripted")) == 100
+    sites[ONBOARD].scripts.append(case.onboard)
+    sites[CLOUD].scripts.append(case.cloud)
+    assert scene.ask(2, case.decision) == case.answer
+    for site in sites.values():
+        site.scripts.clear()
+    assert scene.ask(3, Decision(CLOUD, False, "plain", "scripted")) == 300
+    scene.clock.run_out()
+
+    assert [(one.size, one.waited_s >= 0) for one in scene.records] == [(1, True), (2, True), (3, True)]
+    assert len({one.id for one in scene.records}) == 3
+    record = scene.records[1]
+    runs = [
+        f"{one.site} {type(one.failure).__name__ if one.failure else ''}".strip() for one in record.executions
+    ]
+    assert ", ".join(runs) == case.runs
+    assert (record.used is None) == (case.answer == OWN)
+    assert scene.learnt(ONBOARD) == ([] if case.onboard_s is None else [(2, case.onboard_s)])
+    cloud_of_2 = [] if case.cloud_s is None else [(2, case.cloud_s)]
+    assert sorted(scene.learnt(CLOUD)) == [(1, 0.02), *cloud_of_2, (3, 0.02)]
+    assert scene.in_flight() == 0
+    assert 3 - scene.allowance.duplicates == case.duplicates
+    assert len(sites[ONBOARD].tasks) + len(sites[CLOUD].tasks) == 2 + len(runs)
+
+
+@pytest.mark.parametrize(
+    "decision", [WARM_UP, PROBE, PROBE_BACK, HEDGE, HEDGE_AWAY], ids=lambda one: one.reason
+)
+@pytest.mark.parametrize("at_s", [0.1, 0.5])
+def test_a_close_ends_the_task_under_way_and_teaches_nothing(decision: Decision, at_s: float) -> None:
+    """In every phase the caller gets one error, no site learns anything, and no run is left."""
+    scene = Scene()
+    for site in scene.sites.values():
+        site.takes = 1.0
+    scene.clock.after(at_s, scene.offload.close)
+    assert scene.ask(2, decision) in ("OffloadError", "CloudBroken")
+    scene.clock.run_out()
+    assert len(scene.records) <= 1
+    assert scene.learnt(ONBOARD) == scene.learnt(CLOUD) == []
+    assert scene.in_flight() == 0
+
+
+def test_what_ended_late_is_in_the_next_record_with_its_own_tasks_id() -> None:
+    """The trace tells of it once, under the task that it belongs to."""
+    scene = Scene()
+    scene.sites[CLOUD].scripts.append((0.7, OK))
+    scene.ask(1, PROBE)
+    scene.clock.run_out()
+    plain = Decision(ONBOARD, False, "plain", "scripted")
+    scene.ask(2, plain)
+    scene.ask(3, plain)
+    first, second, third = scene.records
+    assert first.late == third.late == ()
+    assert second.late == (Late(first.id, CLOUD, pytest.approx(0.7), True, False),)
+
+
+def test_an_interrupted_call_leaves_nothing_in_flight() -> None:
+    """Ctrl-C while a task waits: the site is not taken to be busy with it for ever."""
+    scene = Scene()
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    scene.clock.after(0.001, interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        scene.ask(1, HEDGE)
+    assert scene.in_flight() == 0
+    assert scene.ask(2, WARM_UP) == 200
+
+
+@pytest.mark.parametrize(
+    ("where", "cloud"), [("both", OK), (CLOUD, BROKEN)], ids=["measured on both", "fallen back"]
+)
+def test_what_is_no_choice_of_the_policys_is_no_duplicate(where: str, cloud: OffloadError | None) -> None:
+    """Neither measuring, which the caller asked for, nor a fallback after a failure eats the allowance."""
+    scene = Scene()
+    scene.sites[CLOUD].failure = cloud
+    for number in range(30):
+        scene.offload(phase_echo, number, where=where)
+    assert scene.allowance.duplicates == DUPLICATES_MAX
+
+
+def test_an_overtaken_site_did_not_fail() -> None:
+    """Three lost hedges in a row are no reason to break with a site."""
+    scene = Scene()
+    scene.sites[CLOUD].takes = 1.0
+    for number in range(4):
+        scene.ask(number, HEDGE)
+    assert scene.records[-1].sites[CLOUD].failures == 0
+    assert scene.records[-1].sites[CLOUD].predicted_s is not None
+
+
+FAULTS: list[Callable[[Random], Run]] = [
+    lambda rng: (rng.uniform(0.0, 0.3), BROKEN),
+    lambda rng: (rng.uniform(0.0, 0.05), BUSY),
+    lambda rng: (rng.uniform(0.1, 1.0), LATE),
+    lambda _: NEVER,
+    lambda rng: (rng.uniform(1.0, 1.9), OK),
+]
+
+
+@pytest.mark.parametrize(
+    "policy", ["hedge:probe:greedy", "probe:hedge:breaker:epsilon", "hedge:thompson", "paper"]
+)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_no_answer_is_lost_among_random_faults(policy: str, seed: int) -> None:
+    """Of 600 tasks on three sites with faults of all kinds each is answered once, by its own result."""
+    rng, clock = Random(seed), VirtualClock()
+    sites = {site: VirtualRunner(site, clock) for site in (ONBOARD, CLOUD, EDGE)}
+    records: list[Record] = []
+    name = policies.predictor_of(policy)
+    offload = Offloader(
+        list(sites.values()),
+        policy=policies.make(policy, seed),
+        predictor=lambda: predictors.make(name, 20),
+        timeout_s=TIMEOUT_S,
+        observers=[records.append],
+        clock=clock,
+    )
+    for number in range(600):
+        for site, runner in sites.items():
+            runner.scripts.clear()
+            runner.takes = rng.uniform(0.05, 0.3)
+            if site != ONBOARD and rng.random() < 0.2:
+                runner.scripts.append(rng.choice(FAULTS)(rng))
+                runner.measured = Condition(rng.uniform(0, 0.1), silent=rng.random() < 0.3)
+        assert offload(phase_echo, number) == 100 * number
+    clock.run_out()
+    offload(phase_echo, 600, where=ONBOARD)
+    assert [one.size for one in records] == list(range(601))
+    assert all(len({run.site for run in one.executions}) == len(one.executions) for one in records)
+    assert all(not flights for flights in offload._flights.values())
+    overtaken = sum("Overtaken" in (run.error or "") for one in records for run in one.executions)
+    assert sum(len(one.late) for one in records) == overtaken
+    assert overtaken > 0 or policy == "paper"
+    offload.close()

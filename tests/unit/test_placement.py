@@ -1,0 +1,193 @@
+"""Where a batch's tasks go, by hand-made predictions and in virtual time."""
+
+import heapq
+import itertools
+from collections.abc import Mapping, Sequence
+from random import Random
+
+import pytest
+
+from robot_client.placement import (
+    BUDGET_SHARE,
+    ONBOARD_IN_FLIGHT,
+    SERVER_IN_FLIGHT,
+    SERVER_IN_FLIGHT_MAX,
+    Queue,
+    next_start,
+    takeover,
+)
+
+WITHIN_S = 1e6
+
+
+def queues(*sites: str, within_s: float = WITHIN_S) -> dict[str, Queue]:
+    return {site: Queue(site, within_s) for site in sites}
+
+
+def makespan(
+    predicted: Sequence[Mapping[str, float]],
+    sites: Sequence[str],
+    true: Sequence[Mapping[str, float]] | None = None,
+    workers: Mapping[str, int] | None = None,
+) -> float:
+    """When the last task ends where each takes its true time, each site first come first served."""
+    true = true or predicted
+    held = queues(*sites)
+    waiting = sorted(range(len(predicted)), key=lambda n: -min(predicted[n].values()))
+    free_s = {site: [0.0] * (workers or {}).get(site, 1) for site in sites}
+    ends: list[tuple[float, int, str]] = []
+    now_s = 0.0
+    while waiting or ends:
+        while (start := next_start([predicted[n] for n in waiting], held, now_s)) is not None:
+            site, number = start.site, waiting.pop(start.place)
+            held[site].start(number, predicted[number][site], now_s)
+            begin_s = max(now_s, heapq.heappop(free_s[site]))
+            heapq.heappush(free_s[site], begin_s + true[number][site])
+            heapq.heappush(ends, (begin_s + true[number][site], number, site))
+            assert len(held[site].running) <= held[site].limit
+        now_s, number, site = heapq.heappop(ends)
+        held[site].end(number, now_s)
+        held[site].hear(0.0, true[number][site])
+    return now_s
+
+
+def shortest(times: Sequence[float], sites: int) -> float:
+    """The least makespan on so many equal sites, by trying all."""
+    return min(
+        max(sum(one for one, at in zip(times, places, strict=True) if at == site) for site in range(sites))
+        for places in itertools.product(range(sites), repeat=len(times))
+    )
+
+
+def test_the_longest_come_first_as_in_grahams_example() -> None:
+    """Two tasks of 5, 4 and 3 s and one more of 3 s on three equal sites: 11 s where 9 s is the shortest."""
+    times = [5.0, 5.0, 4.0, 4.0, 3.0, 3.0, 3.0]
+    sites = ("onboard", "edge", "cloud")
+    found = makespan([dict.fromkeys(sites, one) for one in times], sites)
+    assert shortest(times, 3) == 9
+    assert found == pytest.approx(11)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_last_task_ends_within_grahams_bound(seed: int) -> None:
+    """On equal sites at most 4/3 - 1/(3 m) of the shortest time (Graham 1969)."""
+    random = Random(seed)
+    sites = ("onboard", "edge", "cloud")[: random.choice((2, 3))]
+    times = [random.uniform(0.1, 1.0) for _ in range(random.randrange(3, 9))]
+    found = makespan([dict.fromkeys(sites, one) for one in times], sites)
+    bound = (4 / 3 - 1 / (3 * len(sites))) * shortest(times, len(sites))
+    assert found <= bound + 1e-9
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_two_sites_of_any_speed_share_the_work(seed: int) -> None:
+    """Of many tasks the last ends within a tenth of what perfectly shared work would take."""
+    random = Random(seed)
+    factor = random.uniform(1, 8)
+    predicted = [{"onboard": factor * one, "cloud": one} for one in (random.uniform(1, 3) for _ in range(60))]
+    perfect = sum(one["cloud"] for one in predicted) / (1 + 1 / factor)
+    assert perfect <= makespan(predicted, ("onboard", "cloud")) <= 1.1 * perfect
+
+
+def test_a_site_that_is_too_slow_gets_nothing() -> None:
+    """Three tasks that the cloud has done before onboard were done with one of them."""
+    predicted = [{"onboard": 10.0, "cloud": 1.0}] * 3
+    held = queues("onboard", "cloud")
+    placed = []
+    while (start := next_start(predicted[len(placed) :], held, 0.0)) is not None:
+        placed.append(start.site)
+        held[start.site].start(len(placed), 1.0, 0.0)
+    assert placed == ["cloud"] * SERVER_IN_FLIGHT
+
+
+def test_a_task_waits_for_a_better_site_and_the_next_does_not() -> None:
+    """Onboard takes the task that would be done there before the cloud has done those ahead of it."""
+    predicted = [{"onboard": 4.0, "cloud": 1.0}] * 6
+    held = queues("onboard", "cloud")
+    for task in range(SERVER_IN_FLIGHT):
+        held["cloud"].start(task, 1.0, 0.0)
+    assert next_start(predicted[:1], held, 0.0) is None
+    # Behind two others the first is done there after 3 s, the second after 4 s as onboard: a tie.
+    start = next_start(predicted, held, 0.0)
+    assert start is not None
+    assert (start.place, start.site) == (1, "onboard")
+
+
+def test_wrong_predictions_are_mended_by_what_has_ended() -> None:
+    """A cloud that takes three times what was predicted gets its share of the rest only."""
+    predicted = [{"onboard": 1.0, "cloud": 1.0}] * 80
+    true = [{"onboard": 1.0, "cloud": 3.0}] * 80
+    assert makespan(predicted, ("onboard", "cloud"), true) <= 1.1 * 80 / (1 + 1 / 3)
+
+
+def test_a_server_of_several_workers_gets_several_tasks() -> None:
+    """Its pace is learnt: four workers and onboard make five of the work."""
+    predicted = [{"onboard": 1.0, "cloud": 1.0}] * 100
+    found = makespan(predicted, ("onboard", "cloud"), workers={"cloud": 4})
+    assert 20 <= found <= 1.25 * 20
+
+
+@pytest.mark.parametrize(
+    ("heard", "limit"),
+    [
+        ([(0.0, 1.0)], SERVER_IN_FLIGHT + 1),  # it was idle when the task came
+        ([(0.0, 1.0)] * 20, SERVER_IN_FLIGHT_MAX),
+        ([(0.5, 1.0)] * 20, SERVER_IN_FLIGHT),
+        ([(0.0, 1.0)] * 2 + [(2.0, 1.0)], SERVER_IN_FLIGHT + 1),
+        ([(2.0, 1.0)] * 20, SERVER_IN_FLIGHT),
+        ([(None, None)], 1),  # it failed
+    ],
+)
+def test_its_own_queue_tells_how_many_a_server_gets(
+    heard: list[tuple[float | None, float | None]], limit: int
+) -> None:
+    """One more where a task did not wait there, one less where it waited longer than it ran."""
+    queue = Queue("cloud", WITHIN_S)
+    for one in heard:
+        queue.running = dict.fromkeys(range(queue.limit), 1.0)
+        queue.hear(*one)
+    assert queue.limit == limit
+
+
+def test_onboard_runs_one_at_a_time() -> None:
+    """Whatever it says of its queue."""
+    queue = Queue("onboard", WITHIN_S)
+    queue.hear(0.0, 1.0)
+    queue.start(1, 1.0, 0.0)
+    assert queue.limit == ONBOARD_IN_FLIGHT == 1
+    assert not queue.can_begin(1.0, 0.0)
+
+
+def test_no_task_is_put_behind_others_until_its_answer_would_be_given_up() -> None:
+    """A server that needs long for each gets one at a time."""
+    timeout_s = 2.0
+    queue = Queue("cloud", BUDGET_SHARE * timeout_s)
+    assert queue.can_begin(0.6, 0.0)
+    queue.start(1, 0.6, 0.0)
+    assert not queue.can_begin(0.6, 0.0)
+    assert queue.can_begin(0.3, 0.0)
+    assert Queue("cloud", BUDGET_SHARE * timeout_s).can_begin(5.0, 0.0)
+
+
+def test_an_idle_site_takes_over_what_it_would_finish_sooner() -> None:
+    """Of two tasks in the cloud the one that waits longer; none where the cloud is sooner."""
+    held = queues("onboard", "cloud")
+    held["cloud"].start(1, 4.0, 0.0)
+    held["cloud"].start(2, 4.0, 0.0)
+    both = {1: {"onboard": 3.0, "cloud": 4.0}, 2: {"onboard": 3.0, "cloud": 4.0}}
+    assert takeover(both, held, 0.0) == (2, "onboard")
+    assert takeover({1: both[1]}, held, 0.0) == (1, "onboard")
+    assert takeover({1: {"onboard": 5.0, "cloud": 4.0}}, held, 0.0) is None
+    assert takeover({1: {"onboard": 3.0, "cloud": 4.0}}, held, 2.0) is None  # 2 s are left
+    held["onboard"].start(3, 1.0, 0.0)
+    assert takeover(both, held, 0.0) is None, "nobody is idle"
+
+
+def test_a_task_that_is_overdue_is_taken_over() -> None:
+    """It may need as long again as it is late: after that the idle site is sooner."""
+    held = queues("onboard", "cloud")
+    held["cloud"].start(1, 1.0, 0.0)
+    slow = {1: {"onboard": 3.0, "cloud": 1.0}}
+    assert takeover(slow, held, 0.5) is None
+    assert takeover(slow, held, 3.9) is None
+    assert takeover(slow, held, 4.1) == (1, "onboard")

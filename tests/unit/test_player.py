@@ -1,0 +1,95 @@
+"""What a run is given: flags that the parts take, a clean folder, and scenarios that fit together."""
+
+import tomllib
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from cloud_server.config import ServerConfig
+from common.config import load
+from loadgen.player import Files, Lines, make_room, setups
+from loadgen.relay.flags import as_flags
+from loadgen.relay.wan import WanConfig
+from loadgen.scenario import Scenario, Workload, find_scenario, read_scenario, shipped
+from loadgen.testbed import CLOUD, ROBOT, WAN
+from robot_client.config import RobotConfig
+from robot_client.trace import alone_path, reference_path
+
+CONFIGS = {CLOUD: ServerConfig, WAN: WanConfig, ROBOT: RobotConfig}
+
+
+def scenario(**workload: int) -> Scenario:
+    return Scenario("small", 7, Workload(map=Path("m.yaml"), **workload))
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_the_parts_take_what_the_scenario_says(name: str, tmp_path: Path) -> None:
+    """Every flag of every part is one that its command knows, and carries the scenario's value."""
+    read = read_scenario(find_scenario(name))
+    made = {part: setup.flags for part, setup in setups(read, tmp_path).items()}
+    configs = {
+        part: load(
+            CONFIGS[part.partition("-")[0]],
+            [*as_flags(flags), *(["--cloud=tcp://wan:5555"] if part not in (CLOUD, WAN) else [])],
+            prog="",
+            description="",
+            environ={},
+            prefix="X",
+        )
+        for part, flags in made.items()
+    }
+    robot, wan = configs[ROBOT], configs[WAN]
+    assert isinstance(robot, RobotConfig)
+    assert isinstance(wan, WanConfig)
+    assert (robot.tasks, robot.seed, robot.alone) == (read.workload.tasks, read.seed, read.workload.alone)
+    assert (robot.map, robot.sizes) == (read.workload.map, read.workload.sizes)
+    assert (robot.trace, robot.answers) == (tmp_path / "trace.jsonl", tmp_path / "answers.jsonl")
+    assert (wan.delay_ms, wan.seed) == (read.link["delay_ms"], read.seed)
+    assert len(configs) == 2 + read.workload.robots
+
+
+def test_every_key_of_the_shipped_scenarios_is_one_of_the_field() -> None:
+    """What a scenario holds is what `Scenario` and its parts have: nothing is read and forgotten."""
+    known = {"event", "check", *(field.name for field in fields(Scenario))}
+    for name in shipped():
+        assert tomllib.loads(find_scenario(name).read_text()).keys() <= known
+
+
+def test_robots_differ_and_the_first_has_plain_names(tmp_path: Path) -> None:
+    """Each robot has files and a seed of its own."""
+    files = list(Files.of(scenario(robots=3), tmp_path))
+    assert [one.trace.name for one in files] == ["trace.jsonl", "trace-2.jsonl", "trace-3.jsonl"]
+    assert [one.answers.name for one in files] == ["answers.jsonl", "answers-2.jsonl", "answers-3.jsonl"]
+    assert files[0].seed == 7
+    assert len({one.seed for one in files}) == 3
+
+
+def test_nothing_of_an_earlier_run_is_left(tmp_path: Path) -> None:
+    """All that a run writes goes, also what the next one will not write; what else is there stays."""
+    out = tmp_path / "new" / "out"
+    make_room(out)
+    trace = out / "trace.jsonl"
+    for path in (trace, alone_path(trace), reference_path(trace), out / "answers-2.jsonl", out / "table.md"):
+        path.write_text("old")
+    make_room(out)
+    assert [path.name for path in out.iterdir()] == ["table.md"]
+
+
+@pytest.mark.parametrize(("tasks", "alone"), [(None, 20), (50, 20), (6, 6)])
+def test_fewer_tasks_mean_fewer_plans_alone(tasks: int | None, alone: int) -> None:
+    """A shortened scenario stays one that a robot takes."""
+    changed = scenario(tasks=40, alone=20).changed(seed=None, tasks=tasks, measure_all=False)
+    assert changed.workload.alone == alone
+
+
+def test_lines_are_counted_as_they_come(tmp_path: Path) -> None:
+    """Whole lines count, half a one when it is finished, and a file that is not there has none."""
+    lines = Lines(tmp_path / "a")
+    assert lines.count() == 0
+    with (tmp_path / "a").open("w", buffering=1) as file:
+        file.write("one\ntwo\nthr")
+        file.flush()
+        assert lines.count() == 2
+        file.write("ee\n")
+        assert lines.count() == 3

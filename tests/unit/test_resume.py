@@ -1,0 +1,160 @@
+"""Which runs of an earlier comparison are taken, and which are played again."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from loadgen.check import Check
+from loadgen.digest import digests, of_scenario, of_software
+from loadgen.play import SUMMARY, judge, write_summary
+from loadgen.resume import played_before
+from loadgen.scenario import RobotPart, Scenario, Workload, find_scenario, read_scenario
+from loadgen.work import hash_rounds
+from robot_client.answers import of_value
+
+TASKS = 3
+SCENARIO = Scenario(
+    "small", 1, Workload(task="loadgen.work:hash_rounds", sizes=("constant:5",), tasks=TASKS, obstacles=0)
+)
+
+
+def answer(i: int) -> str:
+    fields = {"v": 1, "i": i, "id": f"a-{i}", "due_s": i, "began_s": i, "ended_s": i + 0.5, "error": None}
+    return json.dumps({**fields, "answer": of_value(hash_rounds(5), ())}) + "\n"
+
+
+@pytest.fixture
+def finished(tmp_path: Path) -> Path:
+    """The folder of a run that came to its end, by the code that writes one."""
+    (tmp_path / "answers.jsonl").write_text("".join(map(answer, range(TASKS))))
+    about = {"testbed": "local", **digests(SCENARIO)}
+    write_summary(tmp_path, judge(SCENARIO, tmp_path, {"robot": 0}), about)
+    return tmp_path
+
+
+def taken(scenario: Scenario, out: Path, testbed: str = "local") -> tuple[bool, list[str]]:
+    said: list[str] = []
+    return played_before(scenario, out, testbed, said.append) is not None, said
+
+
+def test_a_finished_run_is_taken_and_judged_from_its_files(finished: Path) -> None:
+    """All its tasks are there, verified, and it is said where they come from."""
+    said: list[str] = []
+    played = played_before(SCENARIO, finished, "local", said.append)
+    assert played is not None
+    assert [one.response_s for one in played.outcome.answered] == [0.5] * TASKS
+    assert [one.wrong for one in played.outcome.answered] == [None] * TASKS
+    assert said == [f"taken from before: {finished}"]
+
+
+@pytest.mark.parametrize(
+    ("scenario", "testbed"),
+    [
+        (replace(SCENARIO, seed=2), "local"),
+        (SCENARIO.changed(tasks=TASKS - 1), "local"),
+        (SCENARIO.changed(policy="cloud"), "local"),
+        (SCENARIO.changed(predictor="huber"), "local"),
+        (SCENARIO.changed(reference=1), "local"),
+        (replace(SCENARIO, robot=RobotPart(cpus=0.3)), "local"),
+        (replace(SCENARIO, link={"delay_ms": 16}), "local"),
+        (SCENARIO, "docker"),
+    ],
+)
+def test_another_run_is_played(finished: Path, scenario: Scenario, testbed: str) -> None:
+    """Another seed, workload, policy, predictor, part, link or testbed is another run, and that is said."""
+    found, said = taken(scenario, finished, testbed)
+    assert not found
+    why = "another testbed" if testbed == "docker" else "scenario or settings were others"
+    assert why in said[0]
+
+
+def _stop(out: Path) -> None:
+    (out / SUMMARY).unlink()
+
+
+def _tear(out: Path) -> None:
+    (out / SUMMARY).write_text((out / SUMMARY).read_text()[:-20])
+
+
+def _lose_answers(out: Path) -> None:
+    (out / "answers.jsonl").write_text(answer(0))
+
+
+def _change(**fields: object) -> Callable[[Path], None]:
+    def change(out: Path) -> None:
+        (out / SUMMARY).write_text(json.dumps(json.loads((out / SUMMARY).read_text()) | fields))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("spoil", "why"),
+    [
+        (_stop, "it did not come to its end"),
+        (_tear, "summary.json cannot be read"),
+        (_lose_answers, "lost is 2 by its files, and 0 in summary.json"),
+        (_change(software_sha256="0" * 64), "its software was another"),
+        (_change(exit_codes={"robot": 1}), "robot ended with exit code 1"),
+    ],
+)
+def test_a_run_that_is_not_whole_is_played_again(
+    finished: Path, spoil: Callable[[Path], None], why: str
+) -> None:
+    """Stopped half way, torn, with files gone, by other software, or ended badly: it says which."""
+    spoil(finished)
+    found, said = taken(SCENARIO, finished)
+    assert not found
+    assert why in said[0]
+
+
+def test_where_nothing_was_played_nothing_is_said(tmp_path: Path) -> None:
+    """The first time is not another time."""
+    assert taken(SCENARIO, tmp_path / "new") == (False, [])
+
+
+def test_what_is_only_said_or_checked_makes_no_other_run() -> None:
+    """A text, or a check, changes nothing of what was played."""
+    same = replace(SCENARIO, about="Other words.", checks=(Check(figure="lost", at_most=0),))
+    assert of_scenario(same) == of_scenario(SCENARIO)
+
+
+def test_files_count_by_their_content_wherever_they_are(tmp_path: Path) -> None:
+    """A map that was moved is the same, one with another cell is not; so with sizes and delays."""
+    outage = read_scenario(find_scenario("outage"))
+    place = outage.workload.map
+    assert place is not None
+    for name in ("depot.yaml", "depot.pgm"):
+        (tmp_path / name).write_bytes(place.with_name(name).read_bytes())
+    moved = replace(outage, workload=replace(outage.workload, map=tmp_path / "depot.yaml"))
+    assert of_scenario(moved) == of_scenario(outage)
+    image = bytearray((tmp_path / "depot.pgm").read_bytes())
+    image[-1] ^= 0xFF
+    (tmp_path / "depot.pgm").write_bytes(image)
+    assert of_scenario(moved) != of_scenario(outage)
+    delays = tmp_path / "delays.txt"
+    delays.write_text("1\n2\n")
+    sampled = replace(SCENARIO, link={"samples": delays})
+    before = of_scenario(sampled)
+    delays.write_text("1\n3\n")
+    assert of_scenario(sampled) != before
+
+
+def test_the_software_is_that_of_the_parts_and_of_the_task() -> None:
+    """The module of a task counts where it is asked for; one that is not there is the parts' to refuse."""
+    planner = read_scenario(find_scenario("outage"))
+    assert of_software(planner) != of_software(SCENARIO)
+    absent = replace(SCENARIO, workload=Workload(task="no_such_module:task", sizes=("constant:1",)))
+    assert of_software(absent) == of_software(planner)
+
+
+def test_without_references_a_scenario_has_no_checks_of_them() -> None:
+    """--reference 0 leaves out what could not be computed, and keeps the rest."""
+    outage, calm = (read_scenario(find_scenario(name)) for name in ("outage", "calm"))
+    assert any(one.figure == "time_over_oracle" for one in calm.checks)
+    quick = calm.changed(reference=0)
+    assert quick.workload.reference == 0
+    assert not any(one.figure == "time_over_oracle" for one in quick.checks)
+    assert outage.changed(reference=0).checks == outage.checks

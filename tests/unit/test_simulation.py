@@ -1,0 +1,218 @@
+"""Simulated scenarios: the same run each time, times that can be added up by hand, and nothing lost."""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from common.errors import ConfigError
+from loadgen.outcome import FIGURES, Outcome
+from loadgen.scenario import Scenario, find_scenario, read_scenario, shipped
+from loadgen.simulation.batch import Batch
+from loadgen.simulation.costs import DECIDING_CPU_S, HASH, START_S
+from loadgen.simulation.run import simulate
+from loadgen.simulation.tasks import Tasks, find_tasks
+from loadgen.simulation.world import check_simulated
+from loadgen.testbed import ROBOT
+from robot_client.cloud import RECONNECT_MAX_MS
+
+HEAD = """name = "small"
+[workload]
+task = "loadgen.work:hash_rounds"
+sizes = ["{sizes}"]
+tasks = 60
+{workload}
+[robot]
+cpus = 0.2
+window = 5
+timeout = 0.5
+[link]
+delay_ms = 15
+bandwidth_mbps = 8
+"""
+CLOSED = [
+    name
+    for name in shipped()
+    if name not in ("demo", "paper", "congested")
+    and read_scenario(find_scenario(name)).workload.arrivals == "closed"
+]
+
+
+@pytest.fixture
+def read(tmp_path: Path) -> Callable[..., Scenario]:
+    """Reads a scenario of the head above and what is given."""
+
+    def factory(text: str = "", workload: str = "", sizes: str = "uniform:1000:30000") -> Scenario:
+        path = tmp_path / "small.toml"
+        path.write_text(HEAD.format(workload=workload, sizes=sizes) + text)
+        return read_scenario(path)
+
+    return factory
+
+
+def tasks_of(scenario: Scenario) -> dict[str, Tasks]:
+    """Those of its robots, all alike."""
+    workload = scenario.workload
+    return {name: find_tasks(workload, scenario.seed, workload.tasks) for name in scenario.robots()}
+
+
+def played(scenario: Scenario, policy: str = "paper", **more: float) -> Outcome:
+    return simulate(scenario.changed(policy=policy), tasks_of(scenario), **more)
+
+
+def onboard_s(rounds: float, hogs: int = 0) -> float:
+    return (1 + hogs) / 0.2 * (DECIDING_CPU_S + HASH.cpu_s(rounds))
+
+
+def cloud_s(rounds: float, bytes_moved: int) -> float:
+    robot_s = (DECIDING_CPU_S + HASH.sending_s) / 0.2
+    return robot_s + 2 * 0.015 + bytes_moved * 8e-6 / 8 + HASH.cpu_s(rounds)
+
+
+@pytest.mark.parametrize("policy", ["paper", "hedge:probe:greedy", "thompson", "epsilon"])
+@pytest.mark.parametrize("arrivals", ["", 'arrivals = "bursts"\nrate = 12\nburst = 6'])
+def test_a_seed_gives_the_same_run(read: Callable[..., Scenario], policy: str, arrivals: str) -> None:
+    """To the bit, also with several tasks at a time; another seed gives another run."""
+    scenario = read("jitter_ms = 5\n", workload=arrivals)
+    assert played(scenario, policy) == played(scenario, policy)
+    assert played(scenario, policy) != played(scenario.changed(seed=2), policy)
+
+
+def test_the_number_of_processes_changes_nothing(read: Callable[..., Scenario]) -> None:
+    """What two of them play is what one plays."""
+    seeds = [read().changed(seed=seed) for seed in (1, 2, 3)]
+    strategies = {"paper": {"policy": "paper"}, "cloud": {"policy": "cloud"}}
+    with Batch(1) as one, Batch(2) as two:
+        assert one.play(seeds, strategies) == two.play(seeds, strategies)
+
+
+def test_constant_policies_take_what_can_be_added_up(read: Callable[..., Scenario]) -> None:
+    """Without noise: CPU over quota onboard, and in the cloud the way there, the work, and the way back."""
+    scenario = read()
+    asked = tasks_of(scenario)[ROBOT].asked
+    for policy, expected in (
+        ("onboard", [onboard_s(one.work) for one in asked]),
+        ("cloud", [cloud_s(one.work, one.bytes_out + one.bytes_in) for one in asked]),
+    ):
+        run = played(scenario, policy, noise=0.0)
+        assert [one.response_s for one in run.answered] == pytest.approx(expected, abs=1e-9), policy
+
+
+def test_references_are_what_each_site_alone_takes(read: Callable[..., Scenario]) -> None:
+    """With noise and jitter too: the constant policies' own times are those of everybody's references."""
+    scenario = read("jitter_ms = 5\nloss = 0.02\n")
+    alone = {site: played(scenario, site) for site in ("onboard", "cloud")}
+    for number, one in enumerate(played(scenario, "greedy").references):
+        for site, run in alone.items():
+            assert one.seconds[site] == pytest.approx(run.answered[number].response_s, abs=1e-9)
+
+
+def test_the_figure_is_of_what_the_robot_waited(read: Callable[..., Scenario]) -> None:
+    """Mean time over mean time of the better site; a policy that measures both waits for the slower one."""
+    run = played(read(workload="measure = 60"), noise=0.0)
+    for answered, one in zip(run.answered, run.references, strict=True):
+        assert one.sent_s == answered.response_s
+        assert answered.response_s == pytest.approx(max(one.seconds.values()), abs=1e-9)
+
+
+def test_an_outage_times_out_and_ends(read: Callable[..., Scenario]) -> None:
+    """Each task waits for its timeout and runs onboard; after it the cloud answers as before."""
+    scenario = read(
+        "[[event]]\nat_task = 20\nlink = {outage = true}\n[[event]]\nat_task = 24\nlink = {outage = false}\n"
+    )
+    asked = tasks_of(scenario)[ROBOT].asked
+    run = played(scenario, "cloud", noise=0.0)
+    for number, one in enumerate(run.answered):
+        expected = cloud_s(asked[number].work, asked[number].bytes_out + asked[number].bytes_in)
+        if 20 <= number < 24:
+            assert one.sites == ("cloud", "onboard")
+            expected = 0.5 + onboard_s(asked[number].work)
+            assert run.references[number].given_up_s["cloud"] > 0.5
+        # The server may still be at what it was sent in the outage.
+        behind = HASH.cpu_s(asked[20].work) if number == 24 else 0.0
+        assert expected - 1e-9 <= one.response_s <= expected + behind + 1e-9
+
+
+def test_a_dead_server_is_no_candidate_and_comes_back(read: Callable[..., Scenario]) -> None:
+    """What is in flight when it dies fails at once; tasks stay onboard until it is warm and connected."""
+    scenario = read(
+        "[[event]]\nat_s = 1.0\nkill = 'cloud'\n[[event]]\nat_s = 1.5\nstart = 'cloud'\n",
+        sizes="constant:30000",
+    ).changed(tasks=100)
+    run = played(scenario, "cloud", noise=0.0)
+    struck = next(one for one in run.answered if one.ended_s > 1.0)
+    assert struck.sites == ("cloud", "onboard")
+    assert struck.ended_s == pytest.approx(1.0 + HASH.cpu_s(30000) / 0.2, abs=1e-9)
+    back_s = min(one.due_s for one in run.answered if one.due_s > 1.0 and one.chosen == "cloud")
+    warm_s = 1.5 + START_S
+    assert warm_s < back_s < warm_s + RECONNECT_MAX_MS / 1e3 + 0.3
+    between = [one for one in run.answered if 1.0 < one.due_s < back_s]
+    assert between
+    assert {one.sites for one in between} == {("onboard",)}
+    assert all("cloud" not in run.references[one.i].seconds for one in between)
+
+
+def test_other_robots_make_a_queue(read: Callable[..., Scenario]) -> None:
+    """Beside three others the cloud takes longer, and while they are paused as long as alone."""
+    few = {"workload": "robots = 4", "sizes": "constant:60000"}
+    paused = "".join(f"[[event]]\nat_task = 0\npause = 'robot-{n}'\n" for n in (2, 3, 4))
+    alone, busy, quiet = (
+        played(scenario, "cloud", noise=0.0)
+        for scenario in (read(sizes="constant:60000"), read(**few), read(paused, **few))
+    )
+    assert quiet.answered == alone.answered
+    mean = FIGURES["mean_ms"].compute
+    assert (mean(busy) or 0) > 1.1 * (mean(alone) or 0)
+
+
+def test_measured_tasks_run_on_both_sites(read: Callable[..., Scenario]) -> None:
+    """As the workload asks, whatever the policy."""
+    run = played(read(workload="measure = 4"), "onboard")
+    assert [len(one.sites) for one in run.answered[:6]] == [2, 2, 2, 2, 1, 1]
+
+
+@pytest.mark.timeout(60)  # plans are truly planned, once
+def test_shipped_scenarios_play() -> None:
+    """Every one with tasks that follow each other: nothing is lost, and no rule beats the oracle by far."""
+    strategies = {name: {"policy": name} for name in ("paper", "hedge:probe:greedy")}
+    with Batch(1) as batch:
+        for name in CLOSED:
+            scenario = read_scenario(find_scenario(name))
+            check_simulated(scenario)
+            for policy, (run,) in batch.play([scenario], strategies).items():
+                assert [one.i for one in run.answered] == list(range(scenario.workload.tasks)), (name, policy)
+                over = FIGURES["time_over_oracle"].compute(run)
+                assert over is not None, (name, policy)
+                assert 0.95 < over < 3, (name, policy, over)
+
+
+def test_simulated_time_is_not_waited_for() -> None:
+    """A run takes less computing than a twentieth of what it plays; measured a hundred-and-fiftieth."""
+    scenario = read_scenario(find_scenario("nonlinear"))
+    tasks = tasks_of(scenario)
+    began_s = time.process_time()
+    run = simulate(scenario.changed(policy="hedge:probe:greedy"), tasks)
+    assert time.process_time() - began_s < run.answered[-1].ended_s / 20
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[[event]]\nat_task = 3\nkill = 'robot'\n", "event kill of robot is for real processes"),
+        ("[[event]]\nat_s = 3\npause = 'wan'\n", "event pause of wan is for real processes"),
+        ("truncate_bytes = 900\n", "link condition truncate_bytes = 900 is for real connections"),
+        ("[[event]]\nat_s = 3\nlink = {reset_after_ms = 50}\n", "link condition reset_after_ms = 50 is"),
+    ],
+)
+def test_what_has_no_counterpart_is_one_line(read: Callable[..., Scenario], text: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=f"^scenario small cannot be simulated: {said}"):
+        check_simulated(read(text))
+
+
+def test_a_task_of_unknown_cost_is_one_line(read: Callable[..., Scenario]) -> None:
+    """How long it takes would have to be made up."""
+    workload = replace(read().workload, task="tests.probes:zeros")
+    with pytest.raises(ConfigError, match=r"task zeros cannot be simulated: only the costs of plan_path"):
+        find_tasks(workload, 1, 3)

@@ -1,0 +1,147 @@
+"""The two kinds of work: plans of a robot on a map, and calls of a function by size."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from common import planner
+from common.errors import ConfigError, DataError
+from common.planner import Plan, plan_path, size_of_plan
+from robot_client.answers import cells_of
+from robot_client.config import RobotConfig
+from robot_client.work import Work, make_work
+from tests import probes
+
+DEPOT = Path(__file__).parents[2] / "maps/depot.yaml"
+NO_PATH = Plan("NO_VALID_PATH", np.zeros((0, 2), np.int32), np.zeros((0, 2), np.float32), 0.0, 0)
+planner.warm()  # compiles before the clock of any test runs
+
+
+def on_map(*sizes: str, seed: int = 3, jump: bool = True) -> Work:
+    return make_work(RobotConfig(map=DEPOT, resolution=0.05, seed=seed, jump=jump, sizes=sizes))
+
+
+def calls(*sizes: str, task: str = "tests.probes:zeros", **settings: Any) -> Work:
+    return make_work(RobotConfig(task=task, sizes=sizes, **settings))
+
+
+def asked(work: Work, answers: Sequence[Any]) -> list[Any]:
+    """The requests that so many answers lead to, in numbers."""
+    found = []
+    for answer in answers:
+        _, scan, pose, goal, radius = work.request()
+        found.append((scan.ranges.tolist(), pose, goal, radius))
+        work.advance(answer)
+    return found
+
+
+@pytest.mark.parametrize("sizes", [(), ("uniform:0:3",)])
+def test_with_jumps_answers_do_not_change_later_requests(sizes: tuple[str, ...]) -> None:
+    """Answered, failed or never asked: the tasks of a seed are the same; another seed has others."""
+    first = asked(on_map(*sizes), [None] * 8)
+    assert first == asked(on_map(*sizes), [NO_PATH] * 8)
+    work = on_map(*sizes)
+    assert first == [asked(work, [plan_path(*work.request())])[0] for _ in range(8)]
+    assert first != asked(on_map(*sizes, seed=4), [None] * 8)
+
+
+def test_without_jumps_the_robot_drives_what_it_gets() -> None:
+    """The robot stands where the plan took it, and goes for another goal where there was no answer."""
+    work = on_map(jump=False)
+    _, _, pose, goal, _ = request = work.request()
+    work.advance(plan_path(*request))
+    assert work.request()[2] != pose
+    pose, goal = work.request()[2:4]
+    work.advance(None)
+    assert work.request()[2] == pose
+    assert work.request()[3] != goal
+
+
+def test_goals_follow_the_sizes() -> None:
+    """Of 32 random goals the nearest in d: near ones for small sizes, from task 5 on far ones."""
+    work = on_map("constant:0.02", "5=constant:2")
+    found = []
+    for _ in range(10):
+        found.append(size_of_plan(*work.request()))
+        work.advance(None)
+    print(found)
+    assert max(found[:5]) < 0.2 < 0.8 < min(found[5:])
+
+
+def test_calls_get_whole_sizes() -> None:
+    """Each call gets int() of its drawn size; asking twice changes nothing, nor does an answer."""
+    work = calls("constant:2.9", "2=constant:7")
+    assert work.function is probes.zeros
+    found = []
+    for answer in (None, 1, "two"):
+        assert work.request() == work.request()
+        found.append(work.request())
+        work.advance(answer)
+    assert found == [(2,), (2,), (7,)]
+    assert all(type(size) is int for (size,) in found)
+
+
+def test_the_same_seed_makes_the_same_calls() -> None:
+    """Sizes are those of the seed."""
+
+    def story(seed: int) -> list[Any]:
+        work = calls("lognormal:1000:1", seed=seed)
+        found = []
+        for _ in range(20):
+            found.append(work.request())
+            work.advance(None)
+        return found
+
+    assert story(1) == story(1) != story(2)
+
+
+def test_answers_are_described_by_kind() -> None:
+    """A plan by its path, anything else by its digest; a plan without a path is an answer too."""
+    work = on_map()
+    plan = plan_path(*work.request())
+    assert cells_of(work.describe(plan)).tolist() == plan.cells.tolist()
+    assert work.got(plan)
+    assert not work.got(NO_PATH)
+    assert work.describe(NO_PATH)["status"] == "NO_VALID_PATH"
+    assert list(calls("constant:1").describe(probes.zeros(3))) == ["sha256"]
+
+
+@pytest.mark.parametrize(
+    ("task", "why"),
+    [
+        ("tests.probes", "one of the two is missing"),
+        (":zeros", "one of the two is missing"),
+        ("tests.probes:", "one of the two is missing"),
+        ("no_such_module:f", "cannot be imported: ModuleNotFoundError"),
+        ("tests.probes:ones", "tests.probes has no function 'ones'"),
+        ("tests.probes:np", "tests.probes has no function 'np'"),
+        ("math:sqrt", "sqrt is not a task; decorate it with @task"),
+        ("tests.probes:process_id", "too many positional arguments"),
+        ("common.planner:plan_path", "missing a required argument"),
+    ],
+)
+def test_a_task_that_cannot_be_called_is_named(task: str, why: str) -> None:
+    """--task says its value, what is allowed and why not, in one line."""
+    with pytest.raises(ConfigError) as caught:
+        calls("constant:1", task=task)
+    said = str(caught.value)
+    assert said.startswith(f"--task: {task!r} is not MODULE:FUNCTION with a @task function of one number: ")
+    assert why in said
+    assert "\n" not in said
+
+
+@pytest.mark.parametrize("flag", ["measure", "alone", "reference"])
+def test_a_task_that_never_runs_twice_is_not_measured(flag: str) -> None:
+    """What is declared duplicate=False is refused where a flag would run it again."""
+    settings: dict[str, Any] = {flag: 2, "cloud": "tcp://h:1", "trace": Path("t")}
+    with pytest.raises(ConfigError, match=f"--{flag}: 2: task mark_once is declared duplicate=False"):
+        calls("constant:1", task="tests.probes:mark_once", **settings)
+
+
+def test_bad_sizes_are_said_before_the_robot_is_made() -> None:
+    """A CSV that is not there is named."""
+    with pytest.raises(DataError, match=r"--sizes: 'none\.csv' is not"):
+        on_map("none.csv")

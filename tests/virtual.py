@@ -1,0 +1,112 @@
+"""Virtual time, and runners that live in it: what happens when is the test's to say, and nothing sleeps."""
+
+import heapq
+import itertools
+from collections import deque
+from collections.abc import Callable, Collection
+from concurrent.futures import Future
+from typing import Any
+
+from common.errors import CloudBroken, CloudTimeout, OffloadError, Overtaken
+from common.tasks import Kind, Task
+from robot_client.runner import ONBOARD, UNMEASURED, Condition, Execution
+
+
+class VirtualClock:
+    """Time passes only where somebody waits, from one planned happening to the next."""
+
+    def __init__(self) -> None:
+        self._now_s = 0.0
+        self._plans: list[tuple[float, int, Callable[[], None]]] = []
+        self._numbers = itertools.count()
+        self.waits: list[float | None] = []
+
+    def now_s(self) -> float:
+        return self._now_s
+
+    def after(self, seconds: float, act: Callable[[], None]) -> None:
+        heapq.heappush(self._plans, (self._now_s + seconds, next(self._numbers), act))
+
+    def wait(self, pending: "Collection[Future[Any]]", timeout_s: float | None = None) -> None:
+        self.waits.append(timeout_s)
+        until_s = float("inf") if timeout_s is None else self._now_s + timeout_s
+        while not any(run.done() for run in pending):
+            assert self._plans or timeout_s is not None, "waits for ever"
+            if not self._plans or self._plans[0][0] > until_s:
+                self._now_s = until_s
+                return
+            self._step()
+
+    def run_out(self) -> None:
+        """Let everything happen that is planned."""
+        while self._plans:
+            self._step()
+
+    def _step(self) -> None:
+        at_s, _, act = heapq.heappop(self._plans)
+        self._now_s = max(self._now_s, at_s)
+        act()
+
+
+class VirtualRunner:
+    """Runs each task for as long as `takes` says, in virtual time; then its future gets what `ends` says.
+
+    As the real ones: a server's run can be given up, and is at the end of its budget; one onboard goes on.
+    `takes` None: no answer ever comes.
+    """
+
+    def __init__(self, site: str, clock: VirtualClock, takes: float | None = 0.1) -> None:
+        self.site = site
+        self.takes = takes
+        self.failure: OffloadError | None = None
+        self.fields: dict[str, Any] = {}
+        self.measured = UNMEASURED
+        self.scripts: deque[tuple[float | None, OffloadError | None]] = (
+            deque()
+        )  # of the next tasks, before these
+        self.tasks: list[Task] = []
+        self.cancelled: list[Task] = []
+        self.closed = False
+        self._clock = clock
+        self._runs: dict[int, tuple[Future[Execution], float]] = {}
+
+    def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002
+        return None
+
+    def submit(self, task: Task, budget_s: float) -> "Future[Execution]":
+        if self.closed:
+            raise OffloadError(f"the runner of {self.site} is closed")
+        self.tasks.append(task)
+        future: Future[Execution] = Future()
+        self._runs[task.id] = future, self._clock.now_s()
+        takes, failure = self.scripts.popleft() if self.scripts else (self.takes, self.failure)
+        if takes is not None:
+            self._clock.after(takes, lambda: self._end(task, failure))
+        if self.site != ONBOARD:
+            self._clock.after(budget_s, lambda: self._end(task, CloudTimeout("late"), censored=True))
+        return future
+
+    def cancel(self, task: Task) -> None:
+        self.cancelled.append(task)
+        if self.site != ONBOARD:
+            self._end(task, Overtaken("another site answered first"), censored=True)
+
+    def condition(self) -> Condition:
+        return self.measured
+
+    def close(self) -> None:
+        self.closed = True
+        for future, _ in list(self._runs.values()):
+            if self.site == ONBOARD:
+                future.cancel()
+        if self.site == ONBOARD:
+            self._runs.clear()
+        for task in [task for task in self.tasks if task.id in self._runs]:
+            self._end(task, CloudBroken("closed while the task was in flight"))
+
+    def _end(self, task: Task, failure: OffloadError | None, *, censored: bool = False) -> None:
+        future, began_s = self._runs.pop(task.id, (None, 0.0))
+        if future is not None:
+            value = None if failure else task.kind.function(*task.args)
+            seconds = self._clock.now_s() - began_s
+            future.set_result(Execution(self.site, seconds, value, failure, censored, **self.fields))
