@@ -32,10 +32,11 @@ type: $(DEV_READY) ## mypy, strict on the four packages
 	$(BIN)/mypy
 
 test: $(DEV_READY) ## every test that this machine can run; what is skipped says why
-	$(BIN)/pytest
+	$(BIN)/pytest --numprocesses 2 tests/unit
+	$(BIN)/pytest --ignore tests/unit
 
 unit: $(DEV_READY) ## tests without sockets
-	$(BIN)/pytest tests/unit
+	$(BIN)/pytest --numprocesses 2 tests/unit
 
 integration: $(DEV_READY) ## tests with real sockets and processes
 	$(BIN)/pytest tests/integration

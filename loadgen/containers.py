@@ -25,7 +25,7 @@ from loadgen.owner import is_gone, owner, started
 from loadgen.part import KILL_S, POLL_S, TERMINATE_S, USAGE_EXIT, leave, uninterrupted
 from loadgen.relay.client import RelayClient, ask
 from loadgen.relay.flags import as_flags
-from loadgen.testbed import CLOUD, WAN, Setup, Usage
+from loadgen.testbed import CLOUD, PART, WAN, Setup, Usage
 
 try:
     import docker
@@ -257,6 +257,7 @@ class DockerTestbed:
             [*kind.command, *as_flags(flags)],
             name=f"{PREFIX}-{self.run}-{name}",
             labels=self._labels(),
+            environment={PART: name},
             network=self._networks[first].name,
             user=f"{os.getuid()}:{os.getgid()}",
             mounts=[

@@ -20,6 +20,7 @@ from typing import Any, NoReturn
 from common.errors import ConfigError, OffloadError
 from loadgen.quota import Quota
 from loadgen.relay.client import ask
+from loadgen.testbed import PART
 
 LAUNCH_S = 10.0
 POLL_S = 0.05
@@ -116,7 +117,12 @@ def launch(part: Part, log: Path, *, again: bool) -> Child:
         ]
         output: Any = {} if part.shown else {"stdout": file, "stderr": subprocess.STDOUT}
         process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, start_new_session=True, pass_fds=[launching], **output
+            command,
+            stdin=subprocess.DEVNULL,
+            env={**os.environ, PART: part.name},
+            start_new_session=True,
+            pass_fds=[launching],
+            **output,
         )
         os.close(launching)
         return Child(part, process, log, log_start=file.tell(), launched=launched)

@@ -170,6 +170,9 @@ class _Replaying:
     def cancel(self, task: Task) -> None:
         pass
 
+    def hurry(self) -> None:
+        pass
+
     def condition(self) -> Condition:
         return UNMEASURED
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol, Self
 
 CLOUD, WAN, ROBOT = "cloud", "wan", "robot"
+PART = "OFFBOARD_PART"  # in the environment of each part: its name
 
 
 @dataclass(frozen=True, slots=True)

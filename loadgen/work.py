@@ -4,11 +4,14 @@ A server runs them with `--tasks loadgen.work`, a robot with `--task loadgen.wor
 """
 
 import hashlib
+import os
+import zlib
 
 from common.tasks import task
+from loadgen.testbed import PART
 
 ROUNDS_MAX = 10_000_000
-RARE = 25  # one in so many sizes ...
+RARE = 25  # on a computer one in so many sizes ...
 MUCH = 20  # ... takes so many times the work
 
 
@@ -26,8 +29,15 @@ def hash_pairs(count: int) -> bytes:
 
 @task("hash_rarely_long", size=float)
 def hash_rarely_long(rounds: int) -> bytes:
-    """As `hash_rounds`, but sizes that RARE divides take MUCH times as long: a tail out of nowhere."""
-    return _hashed(rounds * MUCH if rounds % RARE == 0 else rounds)
+    """As `hash_rounds`, but takes MUCH times as long for one in RARE sizes, others on each computer."""
+    _hashed(rounds_on(os.environ.get(PART, ""), rounds) - rounds)
+    return _hashed(rounds)
+
+
+def rounds_on(part: str, rounds: int) -> int:
+    """What `hash_rarely_long` takes on a part of a testbed: a tail that nothing foretells."""
+    rare = zlib.crc32(f"{part}/{rounds}".encode()) % RARE == 0
+    return rounds * MUCH if rare else rounds
 
 
 def _hashed(rounds: int) -> bytes:

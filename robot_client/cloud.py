@@ -87,6 +87,7 @@ class CloudRunner:
         self._pending: dict[int, _Pending] = {}
         self._inbox: deque[_Pending] = deque()
         self._unwanted: deque[int] = deque()
+        self._asked = False  # to find out whether the server is there
         self._waker, self._wake = _wake_pair()
         self._closing = False
         self._hello_due = float("inf")
@@ -138,6 +139,10 @@ class CloudRunner:
 
     def cancel(self, task: Task) -> None:
         self._unwanted.append(task.id)
+        self._wake_up()
+
+    def hurry(self) -> None:
+        self._asked = True
         self._wake_up()
 
     def condition(self) -> Condition:
@@ -216,6 +221,9 @@ class CloudRunner:
 
     def _beat(self) -> None:
         now_s = time.perf_counter()
+        if self._asked:
+            self._asked = False
+            self._heartbeat.hurry(now_s)
         if self._heartbeat.due_s <= now_s:
             self._send(wire.Ping(self._heartbeat.beat(now_s)))
 

@@ -68,11 +68,13 @@ class Conformal:
 
         None while too few errors are known.
         """
+        if not self._tail:
+            return None
         unit = self._unit(predicted_s)
-        for score, rest in self._tail:
-            if unit * rest > worth_s:
-                return max(0.0, predicted_s + unit * score)
-        return None
+        late = [one for one in self._tail if unit * one[1] > worth_s]
+        last = late.pop()
+        score = max(late, key=lambda one: one[1])[0] if late else last[0]
+        return max(0.0, predicted_s + unit * score)
 
     def share_above(self, predicted_s: float, limit_s: float) -> float | None:
         """The share of errors with which a task so predicted would exceed `limit_s`; None: too few known."""

@@ -11,6 +11,7 @@ from robot_client.runner import Condition
 EVERY_S = 0.5
 JITTER = 0.2  # each comes up to this share earlier or later: robots of a fleet do not beat together
 SILENT_S = 0.25  # unanswered for longer than this, and longer than round trips vary: the site is silent
+SLACK_S = 0.02  # beyond the usual round trip, if they vary no more: so much later an answer is late
 UNANSWERED_MAX = 16  # remembered; while so many are out they come SLOWER times as rarely
 SLOWER = 5
 LEAST_OF = 2  # round trips: one stalled segment is no slow link, and one that is quick again is believed
@@ -85,11 +86,21 @@ class Heartbeat:
         self._heard_s, self._queue = now_s, queue
 
     def condition(self, now_s: float) -> Condition:
-        return Condition(self._round_trip_s, self._silent(now_s), self._queue)
+        """A site whose answer is late is expected to be held up for as long again."""
+        out_s = self._out_s(now_s)
+        late = self._smooth_s > 0 and out_s > max(self._smooth_s + SLACK_S, self._limit_s)
+        return Condition(self._round_trip_s, self._silent(now_s), self._queue, wait_s=out_s if late else 0.0)
+
+    def _out_s(self, now_s: float) -> float:
+        """For how long an answer has been waited for and nothing was heard; negative: none is."""
+        return now_s - max(self._oldest_s, self._heard_s)
+
+    @property
+    def _limit_s(self) -> float:
+        return self._smooth_s + 4 * self._varies_s
 
     def _silent(self, now_s: float) -> bool:
-        limit_s = max(SILENT_S, self._smooth_s + 4 * self._varies_s)
-        return now_s - self._oldest_s > limit_s and now_s - self._heard_s > limit_s
+        return self._out_s(now_s) > max(SILENT_S, self._limit_s)
 
     def _vary(self, round_trip_s: float) -> None:
         """What is usual, whatever held it up: a link that is always slow is not silent."""

@@ -199,7 +199,8 @@ class SiteMemory:
             self._use(moved, cpu_s)
             return
         waited_s = (execution.queue_s or 0.0) if self.conditional and self._site == ONBOARD else 0.0
-        interval = execution.ok and not condition.silent
+        held_up = condition.silent or (self._site != ONBOARD and condition.wait_s > 0)
+        interval = execution.ok and not held_up
         self._take(
             Observation(
                 size,

@@ -370,6 +370,11 @@ class Offloader:
                 condition = self._behind_own(site, condition)
         return here.outlook(amount, condition, in_flight=len(flights), timeout_s=timeout_s)
 
+    def _held_up(self, site: str) -> bool:
+        """Whether a server does not answer, or may not."""
+        condition = self._runners[site].condition()
+        return condition.silent or condition.wait_s > 0
+
     def _behind_own(self, site: str, condition: Condition) -> Condition:
         """Onboard runs one task at a time; a server's queue may not know yet of what was sent to it."""
         flights = self._flights[site].values()
@@ -504,7 +509,7 @@ class Offloader:
         self._allowance.spend(
             execution.bytes_out + execution.bytes_in if site != ONBOARD else 0, memory.joules(execution)
         )
-        silent = not execution.ok and memory.conditional and self._runners[site].condition().silent
+        silent = not execution.ok and memory.conditional and self._held_up(site)
         amount = asked.amount if work is None else work
         memory.learn(
             amount, execution, asked.forecast.sites.get(site), silent=silent, size=asked.task.size, work=work

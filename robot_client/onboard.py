@@ -1,49 +1,127 @@
 """The runner of the robot's own computer."""
 
+import contextlib
+import os
+import threading
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from queue import SimpleQueue
 
 from common import cpu
 from common.cpu import SELF
-from common.errors import OffloadError, TaskFailed, describe
+from common.errors import OffloadError, Overtaken, TaskFailed, describe
 from common.tasks import Kind, Task
 from robot_client.load import Load
 from robot_client.runner import ONBOARD, Condition, Execution
 
+ASIDE_MAX = 4  # runs that nobody waits for any more and that still go on
+ASIDE_NICE = 10  # theirs: beside a task of nice 0 a tenth of its CPU time (sched(7))
+
+
+@dataclass(eq=False, slots=True)
+class _Run:
+    """A task in line, or running in the thread of this native id; `aside`: nobody waits for it any more."""
+
+    task: Task
+    published: float
+    future: "Future[Execution]" = field(default_factory=Future)
+    thread: int | None = None
+    aside: bool = False
+
 
 class OnboardRunner:
-    """Runs tasks in this process, `workers` at a time; a waiting task's seconds include its wait."""
+    """Runs tasks in this process, `workers` at a time; a waiting task's seconds include its wait.
+
+    A thread cannot be stopped: a run that is cancelled goes on aside, at a low priority, and another thread
+    takes its worker's place at once.
+    """
 
     site = ONBOARD
 
     def __init__(self, workers: int = 1) -> None:
-        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="onboard")
-        self._futures: dict[int, Future[Execution]] = {}  # of tasks that have not ended
+        self._workers = workers
+        self._line: SimpleQueue[_Run | None] = SimpleQueue()
+        self._runs: dict[int, _Run] = {}  # that have not ended
+        self._threads = 0  # without those aside
+        self._aside = 0
+        self._closed = False
+        self._lock = threading.Lock()
         self._load = Load(SELF)
 
     def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - onboard always exists
         return None
 
     def submit(self, task: Task, budget_s: float) -> "Future[Execution]":  # noqa: ARG002 - a thread cannot be stopped
-        try:
-            future = self._pool.submit(_run, task, time.perf_counter())
-        except RuntimeError as error:
-            raise OffloadError("the onboard runner is closed") from error
-        self._futures[task.id] = future
-        future.add_done_callback(lambda _: self._futures.pop(task.id, None))
-        return future
+        run = _Run(task, time.perf_counter())
+        with self._lock:
+            if self._closed:
+                raise OffloadError("the onboard runner is closed")
+            self._runs[task.id] = run
+            if self._threads < min(self._workers, len(self._runs) - self._aside):
+                self._start_thread()
+            self._line.put(run)
+        return run.future
 
     def cancel(self, task: Task) -> None:
-        """Only a task that still waits for a worker: a thread cannot be stopped."""
-        future = self._futures.get(task.id)
-        if future is not None:
-            future.cancel()
+        """One that waits is not begun; one that runs goes on aside, ASIDE_MAX of them at most."""
+        with self._lock:
+            run = self._runs.get(task.id)
+            if run is None or run.aside or (run.thread is not None and self._aside == ASIDE_MAX):
+                return
+            if run.thread is None:
+                del self._runs[task.id]
+            else:
+                self._put_aside(run, run.thread)
+        failure = Overtaken("another site answered first")
+        seconds, started = time.perf_counter() - run.published, run.thread is not None
+        run.future.set_result(Execution(ONBOARD, seconds, failure=failure, censored=True, started=started))
+
+    def hurry(self) -> None:
+        pass
 
     def condition(self) -> Condition:
         return Condition(load=self._load.share())
 
     def close(self) -> None:
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            waiting = [run for run in self._runs.values() if run.thread is None]
+            for run in waiting:
+                del self._runs[run.task.id]
+            for _ in range(self._threads):
+                self._line.put(None)
+        for run in waiting:
+            run.future.cancel()
+
+    def _start_thread(self) -> None:
+        self._threads += 1
+        threading.Thread(target=self._work, name=ONBOARD, daemon=True).start()
+
+    def _put_aside(self, run: _Run, thread: int) -> None:
+        run.aside = True
+        self._aside += 1
+        with contextlib.suppress(OSError, AttributeError):  # where threads have no priority of their own
+            os.setpriority(os.PRIO_PROCESS, thread, ASIDE_NICE)
+        self._threads -= 1
+        self._start_thread()
+
+    def _work(self) -> None:
+        """What a thread does until it is put aside or the runner is closed."""
+        while (run := self._line.get()) is not None:
+            with self._lock:
+                if self._runs.get(run.task.id) is not run:  # cancelled, or closed
+                    continue
+                run.thread = threading.get_native_id()
+            execution = _run(run.task, run.published)
+            with self._lock:
+                del self._runs[run.task.id]
+                if run.aside:
+                    self._aside -= 1
+                    return
+            run.future.set_result(execution)
 
 
 def _run(task: Task, published: float) -> Execution:

@@ -88,6 +88,8 @@ class Race:
                 self._clock.wait(runs, after_s)
             if any(run.done() for run in runs):
                 return
+            for first in self._runs:
+                self._runners[first].hurry()
         if self._allowed():
             self._start(site)
 

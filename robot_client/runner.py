@@ -54,7 +54,7 @@ class Condition:
 
     `round_trip_s` is that of its heartbeats (None: it has none); `silent`: they go unanswered; `queue`: tasks
     that wait there, as it last said; `load`: the share of the robot's own CPU that others take, 0 to 1;
-    `wait_s`: how long the robot's own tasks will still keep the site from beginning.
+    `wait_s`: how long the robot's own tasks, or a link that is held up, will still keep it from beginning.
     """
 
     round_trip_s: float | None = None
@@ -82,6 +82,9 @@ class Runner(Protocol):
 
     def cancel(self, task: Task) -> None:
         """The answer is no longer wanted: where it can still be stopped, its future ends now, censored."""
+
+    def hurry(self) -> None:
+        """An answer is later than expected: find out soon whether the site is there. Must not block."""
 
     def condition(self) -> Condition:
         """What is measured now. Must not block; it is asked once a task."""

@@ -20,6 +20,7 @@ class ScriptedRunner:
         self.closed = False
         self.cancelled: list[Task] = []
         self.measured = UNMEASURED
+        self.hurried = 0
 
     def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - the same for every kind
         return self.absent
@@ -32,6 +33,9 @@ class ScriptedRunner:
 
     def cancel(self, task: Task) -> None:
         self.cancelled.append(task)
+
+    def hurry(self) -> None:
+        self.hurried += 1
 
     def condition(self) -> Condition:
         return self.measured

@@ -66,6 +66,7 @@ class VirtualRunner:
         )  # of the next tasks, before these
         self.tasks: list[Task] = []
         self.cancelled: list[Task] = []
+        self.hurried_s: list[float] = []
         self.closed = False
         self._clock = clock
         self._runs: dict[int, tuple[Future[Execution], float]] = {}
@@ -90,6 +91,9 @@ class VirtualRunner:
         self.cancelled.append(task)
         if self.site != ONBOARD:
             self._end(task, Overtaken("another site answered first"), censored=True)
+
+    def hurry(self) -> None:
+        self.hurried_s.append(self._clock.now_s())
 
     def condition(self) -> Condition:
         return self.measured

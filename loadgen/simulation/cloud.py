@@ -84,6 +84,9 @@ class SimulatedCloud:
         if pending is not None:
             self._give_up(pending, Overtaken("another site answered first"))
 
+    def hurry(self) -> None:
+        self._hurry()
+
     def condition(self) -> Condition:
         return self._heartbeat.condition(self._clock.now_s())
 
@@ -159,6 +162,11 @@ class SimulatedCloud:
         cancel = partial(self._server.cancel, self._key(pending))
         self.connection.say(CANCEL_BYTES, CANCEL, pending.number, cancel)
         self._end(pending, failure, censored=True)
+        self._hurry()
+
+    def _hurry(self) -> None:
+        self._heartbeat.hurry(self._clock.now_s())
+        self._clock.at(self._heartbeat.due_s, partial(self._beat, self._heartbeat.due_s))
 
     def _end(
         self, pending: _Pending, failure: OffloadError, *, censored: bool = False, started: bool = True

@@ -13,7 +13,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from random import Random
 
-from loadgen.work import MUCH, RARE
+from loadgen.testbed import CLOUD as CLOUD_PART
+from loadgen.testbed import ROBOT
+from loadgen.work import rounds_on
+from robot_client.runner import CLOUD, ONBOARD
 
 DECIDING_CPU_S = 0.3e-3  # of the robot: predict, decide, learn and record one task
 TASK_NOISE = 0.1  # standard deviation of the logarithm: what the work does not tell, the same on every site
@@ -48,10 +51,11 @@ COSTS: Mapping[str, Cost] = {
     "hash_pairs": HASH,
     "hash_rarely_long": HASH,
 }
-ROUNDS: Mapping[str, Callable[[int], int]] = {
-    "hash_rounds": lambda rounds: rounds,
-    "hash_pairs": lambda count: count * count // 1000,
-    "hash_rarely_long": lambda rounds: rounds * MUCH if rounds % RARE == 0 else rounds,
+PARTS = {ONBOARD: ROBOT, CLOUD: CLOUD_PART}  # the part of a testbed that a site is
+ROUNDS: Mapping[str, Callable[[str, int], int]] = {
+    "hash_rounds": lambda _, rounds: rounds,
+    "hash_pairs": lambda _, count: count * count // 1000,
+    "hash_rarely_long": lambda site, rounds: rounds_on(PARTS[site], rounds),
 }
 
 

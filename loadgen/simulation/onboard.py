@@ -1,14 +1,17 @@
 """The runner of the robot's own computer in a simulation, and what it measures of its load."""
 
+import math
 from concurrent.futures import Future
 from functools import partial
 
+from common.errors import Overtaken
 from common.tasks import Kind, Task
 from loadgen.simulation.clock import VirtualClock
 from loadgen.simulation.processor import Processor, Run
 from loadgen.simulation.truth import Truth
 from loadgen.testbed import ROBOT
 from robot_client.load import EVERY_S, FREE_MIN, MEMORY_S
+from robot_client.onboard import ASIDE_MAX
 from robot_client.runner import ONBOARD, Condition, Execution
 
 
@@ -35,11 +38,19 @@ class SimulatedOnboard:
         return future
 
     def cancel(self, task: Task) -> None:
-        """Only a task that still waits: a thread cannot be stopped."""
+        """One that waits is not begun; one that runs goes on aside."""
         run, future = self._runs.get(task.id, (None, None))
-        if run is not None and future is not None and self._processor.drop(run):
-            del self._runs[task.id]
-            future.cancel()
+        if run is None or future is None or (run.begun_s < math.inf and self._processor.aside == ASIDE_MAX):
+            return
+        del self._runs[task.id]
+        started = not self._processor.drop(run)
+        if started:
+            self._processor.put_aside(run)
+        failure, seconds = Overtaken("another site answered first"), self._clock.now_s() - run.added_s
+        future.set_result(Execution(ONBOARD, seconds, failure=failure, censored=True, started=started))
+
+    def hurry(self) -> None:
+        pass
 
     def condition(self) -> Condition:
         return Condition(load=self._load.share())
@@ -48,7 +59,9 @@ class SimulatedOnboard:
         pass
 
     def _ended(self, task: Task, cpu_s: float, run: Run) -> None:
-        _, future = self._runs.pop(task.id)
+        _, future = self._runs.pop(task.id, (None, None))
+        if future is None:  # it was put aside
+            return
         now_s = self._clock.now_s()
         future.set_result(
             Execution(

@@ -3,7 +3,7 @@
 They are those of a real run with this seed: made by the robot's own workload, planned once by the planner.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +11,7 @@ from common import wire
 from common.errors import ConfigError
 from common.tasks import Kind, kind_of
 from loadgen.scenario import Workload
-from loadgen.simulation.costs import COSTS, ROUNDS, Cost
+from loadgen.simulation.costs import COSTS, PARTS, ROUNDS, Cost
 from robot_client.work import make_work
 
 HASH_BYTES = bytes(32)  # a value as long as the answers of loadgen.work
@@ -20,10 +20,10 @@ OTHERS_TASKS_MAX = 50  # tasks of each other robot, which asks for them again an
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """One task: input size, work, and the bytes of its request and reply."""
+    """One task: input size, work on each site, and the bytes of its request and reply."""
 
     size: float
-    work: float
+    work: Mapping[str, float]
     bytes_out: int
     bytes_in: int
 
@@ -55,17 +55,17 @@ def find_tasks(workload: Workload, seed: int, count: int) -> Tasks:
     for _ in range(count):
         request = work.request()
         if kind.name in ROUNDS:
-            answer, units = None, float(ROUNDS[kind.name](request[0]))
+            answer, units = None, {site: float(ROUNDS[kind.name](site, request[0])) for site in PARTS}
         else:
             answer = work.function(*request)
-            units = kind.work_of(answer) or 0.0
+            units = dict.fromkeys(PARTS, kind.work_of(answer) or 0.0)
         asked.append(_asked(kind, request, HASH_BYTES if answer is None else answer, units))
         work.advance(answer)
     blob_bytes = sum(raw.nbytes for raw in blobs.values())
     return Tasks(asked, COSTS[kind.name], kind.work is not None, blob_bytes)
 
 
-def _asked(kind: Kind, request: tuple[Any, ...], answer: Any, units: float) -> Asked:
+def _asked(kind: Kind, request: tuple[Any, ...], answer: Any, units: Mapping[str, float]) -> Asked:
     """The bytes are those of the messages that would be sent."""
     body = wire.encode(list(request), kind.types, blobs=True)
     frames = wire.pack(wire.Request(1, kind.name, 1.0, 1, tuple(body.blobs), body.frames))

@@ -9,6 +9,7 @@ from typing import Any
 from common.tasks import Task, task
 from loadgen.simulation.costs import Noise
 from loadgen.simulation.tasks import Asked, Tasks
+from robot_client.runner import ONBOARD
 
 
 class Truth:
@@ -25,14 +26,14 @@ class Truth:
 
     def seconds(self, site: str, number: int) -> float:
         """CPU seconds of a task at a whole CPU of this site."""
-        return self.cost.cpu_s(self.asked(number).work) * self._noise.factor(site, number)
+        return self.cost.cpu_s(self.asked(number).work[site]) * self._noise.factor(site, number)
 
     def cpu_s(self, site: str, call: Task) -> float:
         return self.seconds(site, number_of(call))
 
     def value(self, call: Task) -> float:
-        """The answer that the call gets: the work that it was."""
-        return self.asked(number_of(call)).work
+        """The answer that the call gets: the work that it was, where that is told the same on every site."""
+        return self.asked(number_of(call)).work[ONBOARD]
 
 
 def number_of(call: Task) -> int:

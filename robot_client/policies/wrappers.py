@@ -8,6 +8,7 @@ from robot_client.policies.base import Decision, Forecast, Policy, cheapest
 from robot_client.runner import ONBOARD
 
 PROBE_EVERY = 20  # tasks without news of a site
+RESERVED = 1  # second runs that are left for hedges
 HEDGE_MIN_S = 1e-3  # a wait of 0 is a probe
 BREAK_AFTER = 3  # failures in a row
 BROKEN_FOR, BROKEN_MAX = 10, 160  # tasks: after the first break, doubling, at most
@@ -25,7 +26,7 @@ class Probe:
 
     def decide(self, forecast: Forecast) -> Decision:
         decision = self._inner.decide(forecast)
-        if decision.both or decision.second or forecast.duplicates < 1:
+        if decision.both or decision.second or forecast.duplicates < 1 + RESERVED:
             return decision
         ages = {
             site: one.age

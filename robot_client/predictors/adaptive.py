@@ -11,33 +11,35 @@ from robot_client.window import checked_length
 
 CLIP = 3.0  # standard deviations of the running error that one observation may pull by
 CLIP_FROM = 8  # observations: before them nothing is known to be an outlier
-SCALE_RATE = 0.05  # of the running error's variance, once so many observations made it
+SCALE_RATE = 0.05  # of the running error, once so many observations made it
+NORMAL = math.sqrt(math.pi / 2)  # standard deviation over mean absolute error, of normal errors
 GROWTH = 2.0  # clips: a larger error counts as this large in the running error, so that it can grow
 
 
 class Scale:
-    """Running standard deviation of errors: the mean of their squares, an early one an equal part of it.
+    """Running standard deviation of errors, as that of normal ones with their mean absolute value.
 
     An error is taken as at most GROWTH clips, so that one outlier does not make the next one look usual,
-    while a lasting change doubles the scale within a few tasks. `clip` is the largest error that is believed:
-    infinite while too few are known, or all were 0.
+    while a lasting change doubles the scale within a few tasks; squares would let one outlier in 30 tasks
+    grow it for ever. `clip` is the largest error that is believed: infinite while too few are known, or all
+    were 0.
     """
 
-    __slots__ = ("_square", "clip", "count", "deviation")
+    __slots__ = ("_mean", "clip", "count", "deviation")
 
     def __init__(self) -> None:
         self.count = 0
         self.deviation = 0.0
         self.clip = math.inf
-        self._square = 0.0
+        self._mean = 0.0
 
     def add(self, error: float) -> None:
         error = min(abs(error), GROWTH * self.clip)
         self.count += 1
         rate = 1 / self.count if self.count * SCALE_RATE < 1 else SCALE_RATE
-        self._square += rate * (error * error - self._square)
-        self.deviation = math.sqrt(self._square)
-        if self.count >= CLIP_FROM and self._square:
+        self._mean += rate * (error - self._mean)
+        self.deviation = NORMAL * self._mean
+        if self.count >= CLIP_FROM and self._mean:
             self.clip = CLIP * self.deviation
 
 
@@ -136,9 +138,9 @@ class Kalman:
 
     West and Harrison, Bayesian Forecasting and Dynamic Models; noise of the walks as shares of the
     measured one, so that no unit matters. Innovations are clipped at CLIP running errors. After RUN
-    innovations of one sign beyond SIGNAL running errors the level is as uncertain as the last of them is
-    large: what has changed for good is believed at once. Alone it can lock on to what it last saw of a
-    site that is no longer tried: it needs probes.
+    innovations of one sign beyond SIGNAL running errors the last of them is not clipped, and the level as
+    uncertain as it is large: what has changed for good is believed at once. Alone it can lock on to what it
+    last saw of a site that is no longer tried: it needs probes.
     """
 
     LEVEL_NOISE = 0.1  # variance a task over that of the measurement
@@ -180,8 +182,11 @@ class Kalman:
         error = seconds - expected
         clip, deviation = self._scale.clip, self._scale.deviation
         self._scale.add(error)
-        self._watch(error, deviation)
-        self._step(x, max(-clip, min(clip, error)))
+        if self._watch(error, deviation):
+            self._p00 += error * error
+        else:
+            error = max(-clip, min(clip, error))
+        self._step(x, error)
 
     def expect(self, size: float) -> float:
         """The expected seconds alone."""
@@ -200,15 +205,14 @@ class Kalman:
         if first and self._reach > 0:
             self._p11 = self._noise / self._reach
 
-    def _watch(self, error: float, deviation: float) -> None:
-        """Innovations beyond SIGNAL on one side, again and again, are a change."""
+    def _watch(self, error: float, deviation: float) -> bool:
+        """Whether innovations were beyond SIGNAL on one side again and again: a change."""
         if self._scale.count <= CLIP_FROM or abs(error) <= self.SIGNAL * deviation:
             self._run = 0
-            return
+            return False
         sign = 1 if error > 0 else -1
         self._run = self._run + sign if self._run * sign > 0 else sign
-        if abs(self._run) >= self.RUN:
-            self._p00 += error * error
+        return abs(self._run) >= self.RUN
 
     def _step(self, x: float, error: float) -> None:
         """Predict and update (Kalman 1960), in the symmetric form."""

@@ -1,15 +1,21 @@
 """Dynamic model averaging: several predictors of one site, each believed as far as it was right of late."""
 
 import math
+from collections.abc import Sequence
 
-from robot_client.predictors.adaptive import ClippedLeastSquares, Kalman, Scale
+from robot_client.predictors.adaptive import CLIP, ClippedLeastSquares, Kalman, Scale
 from robot_client.predictors.base import Prediction, check_observation
 from robot_client.predictors.features import Conditional, Gains
+from robot_client.predictors.robust import TheilSen
 from robot_client.runner import UNMEASURED, Condition
 
 SHARPNESS = 4.0  # weight of a model: exp(-SHARPNESS x its mean error in units of the average's own)
 MEMORY = 0.9  # of the mean error: so much of it is left after one more task
 ERROR_MAX = 4.0  # one task's error counts as at most so many of the average's own
+START = 10  # observations, of which none may lie further than CLIP deviations from a line that bears outliers
+START_CLIP_FROM = 5  # fewer have no outliers
+EXCESS_RATE = 0.05  # of the mean of what was clipped
+EXCESS_MAX = 8.0  # clips that count of it, at most: hedges bound what is waited for
 
 
 class Average(Conditional):
@@ -22,13 +28,21 @@ class Average(Conditional):
     """
 
     def __init__(self, window: int, seed: int = 0, *, blind: bool = False) -> None:
+        self._window, self._seed, self._blind = window, seed, blind
+        self._first: list[tuple[float, float, Condition]] = []
+        self._forget()
+
+    def _forget(self) -> None:
+        """Begin anew, with what `_first` holds not yet learnt."""
+        window, seed = self._window, self._seed
         self._plain = _models(window, seed)
-        self._measured = () if blind else _models(window, seed)
+        self._measured = () if self._blind else _models(window, seed)
         count = len(self._plain) + len(self._measured)
         self._errors = [0.0] * count
         self._weights = [1 / count] * count
         self._gains = Gains()
         self._scale = Scale()
+        self._excess = 0.0
 
     @property
     def full(self) -> bool:
@@ -39,6 +53,17 @@ class Average(Conditional):
 
     def learn(self, size: float, seconds: float, condition: Condition = UNMEASURED) -> None:
         check_observation(size, seconds)
+        if len(self._first) == START:
+            self._learn(size, seconds, condition)
+            return
+        self._first.append((size, seconds, condition))
+        self._forget()
+        reach = _reach(self._first)
+        for (size, seconds, condition), (low, high) in zip(self._first, reach, strict=True):
+            self._learn(size, min(max(seconds, low), high), condition)
+            self._exceed(seconds - high, high - low)
+
+    def _learn(self, size: float, seconds: float, condition: Condition) -> None:
         if len(self):
             self._judge(self._each(size, condition), seconds)
         for plain in self._plain:
@@ -59,7 +84,8 @@ class Average(Conditional):
         if not len(self):
             return None
         return Prediction(
-            self._mean(self._each(size, condition)), self._scale.deviation if self._scale.count > 1 else None
+            self._mean(self._each(size, condition)) + self._excess,
+            self._scale.deviation if self._scale.count > 1 else None,
         )
 
     def _each(self, size: float, condition: Condition) -> list[float]:
@@ -79,7 +105,9 @@ class Average(Conditional):
     def _judge(self, predicted: list[float], seconds: float) -> None:
         """How far each was off; the weights that follow."""
         unit = self._scale.deviation
-        self._scale.add(seconds - self._mean(predicted))
+        error, clip = seconds - self._mean(predicted), self._scale.clip
+        self._exceed(error - clip, clip)
+        self._scale.add(error)
         unit = unit or self._scale.deviation
         if not unit:
             return
@@ -93,6 +121,11 @@ class Average(Conditional):
         total = sum(weights)
         self._weights = [weight / total for weight in weights]
 
+    def _exceed(self, beyond_s: float, clip: float) -> None:
+        """What was clipped at `clip` was so much more."""
+        excess = min(max(0.0, beyond_s), EXCESS_MAX * clip)
+        self._excess += EXCESS_RATE * (excess - self._excess)
+
     def _learn_gains(self, size: float, rest: float, condition: Condition) -> None:
         """From the error of the models that use them."""
         if not (condition.queue or condition.load) or not len(self._measured[0]):
@@ -101,6 +134,22 @@ class Average(Conditional):
         expected *= self._gains.crowding(condition)
         if expected > 0:
             self._gains.learn(rest / expected, condition)
+
+
+def _reach(first: Sequence[tuple[float, float, Condition]]) -> list[tuple[float, float]]:
+    """Between what seconds each is no outlier; from START_CLIP_FROM observations on there may be some."""
+    line = TheilSen(START)
+    for size, seconds, _ in first:
+        line.learn(size, seconds)
+    found = []
+    for size, _, _ in first:
+        expected = line.predict(size)
+        if expected is None or not expected.spread_s or len(first) < START_CLIP_FROM:
+            found.append((0.0, math.inf))
+        else:
+            reach = CLIP * expected.spread_s
+            found.append((max(0.0, expected.seconds - reach), max(0.0, expected.seconds + reach)))
+    return found
 
 
 def _models(window: int, seed: int) -> tuple[ClippedLeastSquares | Kalman, ...]:

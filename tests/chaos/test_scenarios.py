@@ -50,7 +50,7 @@ def test_a_scenario_is_played_and_judged(
 @pytest.mark.integration
 def test_one_seed_is_one_run(tmp_path: Path) -> None:
     """Twice the same scenario and seed: the same tasks, sizes, events and draws of the link."""
-    scenario = read_scenario(find_scenario("lossy")).changed(tasks=40, policy="cloud")
+    scenario = read_scenario(find_scenario("lossy")).changed(tasks=24, policy="cloud")
     runs = []
     for name in ("a", "b"):
         out = tmp_path / name

@@ -6,7 +6,15 @@ import pytest
 
 from robot_client import predictors
 from robot_client.predictors import Predictor
-from robot_client.predictors.adaptive import CLIP, CLIP_FROM, GROWTH, ClippedLeastSquares, Scale
+from robot_client.predictors.adaptive import (
+    CLIP,
+    CLIP_FROM,
+    GROWTH,
+    NORMAL,
+    SCALE_RATE,
+    ClippedLeastSquares,
+    Scale,
+)
 from robot_client.predictors.linear import RecursiveLeastSquares
 
 FOLLOWING = ("clipped-least-squares", "kalman", "blind-average", "average")
@@ -64,7 +72,7 @@ def test_before_eight_errors_nothing_is_an_outlier() -> None:
     for n in range(CLIP_FROM):
         assert scale.clip == float("inf"), n
         scale.add(1.0)
-    assert scale.clip == pytest.approx(CLIP)
+    assert scale.clip == pytest.approx(CLIP * NORMAL)
 
 
 def test_the_scale_grows_by_so_much_an_error() -> None:
@@ -73,10 +81,20 @@ def test_the_scale_grows_by_so_much_an_error() -> None:
     for _ in range(100):
         scale.add(1.0)
     scale.add(1e9)
-    assert scale.deviation < 1 + GROWTH * CLIP * 0.25
+    assert scale.deviation < NORMAL * (1 + GROWTH * CLIP * NORMAL * SCALE_RATE)
     for _ in range(60):
         scale.add(50.0)
-    assert scale.deviation == pytest.approx(50.0, rel=0.1)
+    assert scale.deviation == pytest.approx(50.0 * NORMAL, rel=0.1)
+
+
+def test_one_outlier_in_twenty_five_stays_one() -> None:
+    """However many of them come: the scale settles, and never takes the next one for usual."""
+    scale, random = Scale(), Random(1)
+    for _ in range(100):
+        scale.add(random.gauss(0, 1))
+    for n in range(2_000):
+        scale.add(100.0 if n % 25 == 0 else random.gauss(0, 1))
+        assert scale.clip < 10, n
 
 
 @pytest.mark.parametrize(

@@ -127,6 +127,20 @@ def test_the_share_above_a_limit_is_that_of_the_errors() -> None:
     assert 0 < (conformal.share_above(0.5, 50.0) or 0) < 0.01, "nothing is certain"
 
 
+def test_a_late_task_is_overdue_where_waiting_on_is_worth_least() -> None:
+    """Times around 1 s and some around 20 s: beyond the first ones, and not while it may still be one."""
+    conformal, random = Conformal(), Random(1)
+    for n in range(100):
+        conformal.learn(1.0, 20.0 if n % 25 == 24 else random.uniform(0.8, 1.2))
+    after_s = conformal.overdue(1.0, worth_s=2.0)
+    assert after_s is not None
+    assert 1.15 < after_s < 1.5
+    alone = conformal.overdue(1.0, worth_s=60.0)
+    assert alone is not None
+    assert alone > 20.0, "nothing else is worth so much"
+    assert Conformal().overdue(1.0, 2.0) is None
+
+
 def test_units_do_not_matter() -> None:
     """Milliseconds for seconds scale the interval alike."""
     small, large = Conformal(), Conformal()

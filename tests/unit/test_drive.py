@@ -3,6 +3,7 @@
 import itertools
 import signal
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
@@ -300,7 +301,7 @@ def answers_number(line: str) -> int:
 
 def test_a_stopped_run_answers_nothing_that_it_gave_up(tmp_path: Path) -> None:
     """Ctrl-C with tasks in flight and waiting: only what was answered before is in the file."""
-    closed = threading.Event()
+    closed, path = threading.Event(), tmp_path / "answers.jsonl"
 
     class Onboard(OnboardRunner):
         def close(self) -> None:
@@ -309,6 +310,9 @@ def test_a_stopped_run_answers_nothing_that_it_gave_up(tmp_path: Path) -> None:
 
     def act(number: int) -> None:
         if number == 2:
+            until = time.monotonic() + WAIT_S
+            while len(path.read_text().splitlines()) < 2 and time.monotonic() < until:
+                time.sleep(0.001)
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
         if number >= 2:
             assert closed.wait(WAIT_S)
@@ -317,15 +321,15 @@ def test_a_stopped_run_answers_nothing_that_it_gave_up(tmp_path: Path) -> None:
     config = RobotConfig(
         task="m:f", sizes=("constant:0",), tasks=100, in_flight=4, arrivals="constant", rate=1000.0
     )
-    answers, own = Answers(tmp_path / "answers.jsonl"), OwnRecord()
+    answers, own = Answers(path), OwnRecord()
     with offloader(Onboard(), observers=[own]) as offload:
         work = Calls(scripted, map(float, itertools.count()))
         run = Drive(config, work, offload, own, lambda _: None, answers=answers)
         with pytest.raises(KeyboardInterrupt):
             run.run()
     answers.close()
-    lines = list(answers_file.read(tmp_path / "answers.jsonl"))
-    assert [(line["i"], line["error"]) for line in lines] == [(0, None), (1, None)]
+    lines = list(answers_file.read(path))
+    assert sorted((line["i"], line["error"]) for line in lines) == [(0, None), (1, None)]
 
 
 def test_tasks_are_made_ahead_in_order_and_bounded() -> None:

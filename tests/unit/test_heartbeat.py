@@ -2,7 +2,7 @@
 
 import pytest
 
-from robot_client.heartbeat import EVERY_S, JITTER, SILENT_S, SLOWER, UNANSWERED_MAX, Heartbeat
+from robot_client.heartbeat import EVERY_S, JITTER, SILENT_S, SLACK_S, SLOWER, UNANSWERED_MAX, Heartbeat
 
 TRIP_S = 0.03
 
@@ -85,6 +85,22 @@ def test_any_answer_of_the_server_breaks_the_silence() -> None:
     condition = heartbeat.condition(at_s + 0.5)
     assert (condition.silent, condition.queue) == (False, 7)
     assert heartbeat.condition(at_s + 0.4 + 1.01 * SILENT_S).silent
+
+
+def test_an_answer_that_is_late_holds_the_site_up_for_as_long_again() -> None:
+    """Longer out than usual: as long as it is out; nothing before, and nothing once something was heard."""
+    heartbeat = beating(20.0)
+    at_s = heartbeat.due_s
+    unanswered = heartbeat.beat(at_s)
+    late_s = TRIP_S + SLACK_S
+    assert heartbeat.condition(at_s + 0.99 * late_s).wait_s == 0
+    assert heartbeat.condition(at_s + 1.01 * late_s).wait_s == pytest.approx(1.01 * late_s)
+    heartbeat.answer(unanswered, at_s + 0.2, 0)
+    assert heartbeat.condition(at_s + 0.2).wait_s == 0
+    first = Heartbeat(EVERY_S)
+    first.start(0.0)
+    first.beat(0.0)
+    assert first.condition(0.2).wait_s == 0, "nothing is usual before the first answer"
 
 
 def test_on_a_slow_link_silence_begins_later() -> None:

@@ -149,6 +149,15 @@ def test_a_site_without_news_is_probed_at_once(age: int, probed: bool) -> None:
     assert ("cloud is probed" in decision.reason) == probed
 
 
+def test_a_probe_leaves_a_second_run_to_hedges() -> None:
+    """With one second run left a stale site is not probed, and the task may still be hedged."""
+    sites = {ONBOARD: known(0.1), CLOUD: known(0.2, age=500)}
+    forecast = Forecast(1.0, sites, duplicates=1.0)
+    assert policies.make("probe:greedy").decide(forecast).second is None
+    assert policies.make("hedge:probe:greedy").decide(forecast).second_after_s > 0
+    assert policies.make("probe:greedy").decide(replace(forecast, duplicates=2.0)).second == CLOUD
+
+
 @pytest.mark.parametrize("fields", [{"in_flight": 1}, {"condition": SILENT}], ids=["under way", "silent"])
 def test_some_sites_are_not_probed(fields: dict[str, Any]) -> None:
     """Not one that runs a task just now, nor a silent one, however stale."""

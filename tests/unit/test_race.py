@@ -107,6 +107,16 @@ def test_of_a_hedge_the_first_answer_counts_and_the_other_is_given_up(
     assert not course.sites[used].cancelled
 
 
+def test_whoever_is_late_is_asked_whether_it_is_there(course: Course) -> None:
+    """When its hedge is due, whether or not that may start; not where it was in time."""
+    course.take(cloud=0.5, onboard=0.1)
+    course.allowed = False
+    course.run(Plan((CLOUD,), ONBOARD, 0.2))
+    assert (course.sites[CLOUD].hurried_s, course.sites[ONBOARD].hurried_s) == ([0.2], [])
+    course.run(Plan((ONBOARD,), CLOUD, 0.2))
+    assert course.sites[ONBOARD].hurried_s == []
+
+
 def test_what_comes_of_an_overtaken_run_is_told_once(course: Course) -> None:
     """A server's run ends at once, censored; one onboard, which cannot be stopped, when it is done."""
     course.take(onboard=0.2, cloud=1.0)

@@ -17,6 +17,7 @@ from loadgen.simulation.tasks import Tasks, find_tasks
 from loadgen.simulation.world import check_simulated
 from loadgen.testbed import ROBOT
 from robot_client.cloud import RECONNECT_MAX_MS
+from robot_client.runner import CLOUD, ONBOARD
 
 HEAD = """name = "small"
 [workload]
@@ -93,8 +94,8 @@ def test_constant_policies_take_what_can_be_added_up(read: Callable[..., Scenari
     scenario = read()
     asked = tasks_of(scenario)[ROBOT].asked
     for policy, expected in (
-        ("onboard", [onboard_s(one.work) for one in asked]),
-        ("cloud", [cloud_s(one.work, one.bytes_out + one.bytes_in) for one in asked]),
+        ("onboard", [onboard_s(one.work[ONBOARD]) for one in asked]),
+        ("cloud", [cloud_s(one.work[CLOUD], one.bytes_out + one.bytes_in) for one in asked]),
     ):
         run = played(scenario, policy, noise=0.0)
         assert [one.response_s for one in run.answered] == pytest.approx(expected, abs=1e-9), policy
@@ -125,13 +126,13 @@ def test_an_outage_times_out_and_ends(read: Callable[..., Scenario]) -> None:
     asked = tasks_of(scenario)[ROBOT].asked
     run = played(scenario, "cloud", noise=0.0)
     for number, one in enumerate(run.answered):
-        expected = cloud_s(asked[number].work, asked[number].bytes_out + asked[number].bytes_in)
+        expected = cloud_s(asked[number].work[CLOUD], asked[number].bytes_out + asked[number].bytes_in)
         if 20 <= number < 24:
             assert one.sites == ("cloud", "onboard")
-            expected = 0.5 + onboard_s(asked[number].work)
+            expected = 0.5 + onboard_s(asked[number].work[ONBOARD])
             assert run.references[number].given_up_s["cloud"] > 0.5
         # The server may still be at what it was sent in the outage.
-        behind = HASH.cpu_s(asked[20].work) if number == 24 else 0.0
+        behind = HASH.cpu_s(asked[20].work[CLOUD]) if number == 24 else 0.0
         assert expected - 1e-9 <= one.response_s <= expected + behind + 1e-9
 
 

@@ -10,6 +10,8 @@ import pytest
 from common import planner
 from common.errors import ConfigError, DataError
 from common.planner import Plan, plan_path, size_of_plan
+from loadgen.testbed import PART
+from loadgen.work import MUCH, RARE, hash_rarely_long, hash_rounds, rounds_on
 from robot_client.answers import cells_of
 from robot_client.config import RobotConfig
 from robot_client.work import Work, make_work
@@ -145,3 +147,18 @@ def test_bad_sizes_are_said_before_the_robot_is_made() -> None:
     """A CSV that is not there is named."""
     with pytest.raises(DataError, match=r"--sizes: 'none\.csv' is not"):
         on_map("none.csv")
+
+
+def test_a_rare_task_is_long_on_one_part_and_its_answer_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One size in RARE takes MUCH times the rounds, another one on each part; the answer is the same."""
+    for part in ("cloud", "robot"):
+        rare = sum(rounds_on(part, rounds) == MUCH * rounds for rounds in range(1, 25_001))
+        assert rare == pytest.approx(25_000 / RARE, rel=0.1)
+    both = sum(rounds_on("cloud", n) == rounds_on("robot", n) == MUCH * n for n in range(1, 25_001))
+    assert both < 100
+    long_here = next(n for n in range(1, 1_000) if rounds_on("robot", n) > n and rounds_on("cloud", n) == n)
+    answers = set()
+    for part in ("cloud", "robot"):
+        monkeypatch.setenv(PART, part)
+        answers.add(hash_rarely_long(long_here))
+    assert answers == {hash_rounds(long_here)}

@@ -1,0 +1,138 @@
+"""The runner of the robot's own computer: threads of this process."""
+
+import os
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from common.errors import OffloadError, Overtaken
+from common.tasks import Task, kind_of, task
+from robot_client.onboard import ASIDE_MAX, ASIDE_NICE, OnboardRunner
+
+WAIT_S = 5.0
+
+
+class Gate:
+    """Holds `held_back` until it is opened."""
+
+    def __init__(self) -> None:
+        self.open = threading.Event()
+        self.begun: list[int] = []
+        self.threads: list[int] = []
+
+
+gate = Gate()
+
+
+@task("held_back", size=float)
+def held_back(number: int) -> int:
+    gate.begun.append(number)
+    gate.threads.append(threading.get_native_id())
+    assert gate.open.wait(WAIT_S)
+    return number
+
+
+@task("at_once", size=float)
+def at_once(number: int) -> int:
+    return number
+
+
+def call(number: int, function: object = held_back) -> Task:
+    return Task(kind_of(function), (number,), float(number))  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def runner() -> Iterator[OnboardRunner]:
+    gate.__init__()  # type: ignore[misc]
+    one = OnboardRunner()
+    yield one
+    gate.open.set()
+    one.close()
+
+
+def until_begun(count: int) -> None:
+    for _ in range(500):
+        if len(gate.begun) == count:
+            return
+        threading.Event().wait(0.01)
+    raise AssertionError(f"{gate.begun} has begun")
+
+
+def test_a_run_that_is_cancelled_makes_room_at_once(runner: OnboardRunner) -> None:
+    """Its future ends as overtaken, it goes on at a low priority, and the next task does not wait for it."""
+    first = call(1)
+    future = runner.submit(first, 1.0)
+    until_begun(1)
+    runner.cancel(first)
+    given_up = future.result(0)
+    assert isinstance(given_up.failure, Overtaken)
+    assert given_up.censored
+    assert given_up.started
+    assert runner.submit(call(2, at_once), 1.0).result(WAIT_S).value == 2
+    assert os.getpriority(os.PRIO_PROCESS, gate.threads[0]) == ASIDE_NICE
+    assert os.getpriority(os.PRIO_PROCESS, 0) == 0
+
+
+def test_so_many_go_on_aside_and_no_more(runner: OnboardRunner) -> None:
+    """One more than ASIDE_MAX cannot be cancelled: it keeps its place until it ends."""
+    for number in range(ASIDE_MAX):
+        one = call(number)
+        future = runner.submit(one, 1.0)
+        until_begun(number + 1)
+        runner.cancel(one)
+        assert future.done()
+    last = call(ASIDE_MAX)
+    future = runner.submit(last, 1.0)
+    until_begun(ASIDE_MAX + 1)
+    runner.cancel(last)
+    behind = runner.submit(call(9, at_once), 1.0)
+    assert not future.done()
+    assert not behind.done()
+    gate.open.set()
+    assert (future.result(WAIT_S).value, behind.result(WAIT_S).value) == (ASIDE_MAX, 9)
+
+
+def test_a_task_that_waits_is_not_begun_once_it_is_cancelled(runner: OnboardRunner) -> None:
+    """It ends as never started; those behind it take its place."""
+    runner.submit(call(1), 1.0)
+    until_begun(1)
+    second, third = call(2), call(3)
+    waits, follows = runner.submit(second, 1.0), runner.submit(third, 1.0)
+    runner.cancel(second)
+    assert not waits.result(0).started
+    gate.open.set()
+    assert follows.result(WAIT_S).value == 3
+    assert gate.begun == [1, 3]
+
+
+def test_what_is_unknown_or_over_can_be_cancelled(runner: OnboardRunner) -> None:
+    one = call(1, at_once)
+    assert runner.submit(one, 1.0).result(WAIT_S).value == 1
+    runner.cancel(one)
+    runner.cancel(call(2))
+
+
+def test_closing_ends_what_waits(runner: OnboardRunner) -> None:
+    """What runs comes to its end, what waits is cancelled, and nothing more is taken."""
+    runs, waits = runner.submit(call(1), 1.0), runner.submit(call(2), 1.0)
+    until_begun(1)
+    runner.close()
+    runner.close()
+    assert waits.cancelled()
+    with pytest.raises(OffloadError, match="the onboard runner is closed"):
+        runner.submit(call(3), 1.0)
+    gate.open.set()
+    assert runs.result(WAIT_S).value == 1
+
+
+@pytest.mark.usefixtures("runner")
+def test_so_many_workers_run_at_a_time() -> None:
+    """And each task once."""
+    many = OnboardRunner(3)
+    futures = [many.submit(call(number), 1.0) for number in range(6)]
+    until_begun(3)
+    gate.open.set()
+    assert [future.result(WAIT_S).value for future in futures] == list(range(6))
+    assert sorted(gate.begun) == list(range(6))
+    many.close()
