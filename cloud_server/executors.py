@@ -20,6 +20,7 @@ from common import cpu, tasks
 from common.blobs import BlobStore, Buffer, StoredBlob
 from common.errors import CloudBroken, ProtocolError, describe
 from common.values import decode, encode
+from common.wanted import always, call_while
 
 START_S_MAX = 300.0  # the slowest worker's start, compilation included
 PR_SET_PDEATHSIG = 1
@@ -55,8 +56,13 @@ class Executor(Protocol):
     def warm(self) -> "Future[None]":
         """Start all workers and run each kind's warm in each. Does not block."""
 
-    def submit(self, kind: str, frames: Sequence[Buffer], blobs: Blobs) -> "Future[Outcome]":
-        """Run a task now; called only while fewer than `workers` run. The future never holds an exception."""
+    def submit(
+        self, kind: str, frames: Sequence[Buffer], blobs: Blobs, wanted: Callable[[], bool] = always
+    ) -> "Future[Outcome]":
+        """Run a task now; called only while fewer than `workers` run. The future never holds an exception.
+
+        A task that looks may end early once it is not `wanted`, where it runs in this process.
+        """
 
     def close(self) -> None:
         """Stop; tasks still running are abandoned. Safe to call twice."""
@@ -74,8 +80,10 @@ class Threads:
     def warm(self) -> "Future[None]":
         return self._pool.submit(_warm_kinds)
 
-    def submit(self, kind: str, frames: Sequence[Buffer], blobs: Blobs) -> "Future[Outcome]":
-        return self._pool.submit(run_task, kind, frames, blobs)
+    def submit(
+        self, kind: str, frames: Sequence[Buffer], blobs: Blobs, wanted: Callable[[], bool] = always
+    ) -> "Future[Outcome]":
+        return self._pool.submit(run_task, kind, frames, blobs, wanted)
 
     def close(self) -> None:
         self._pool.shutdown(wait=False, cancel_futures=True)
@@ -112,7 +120,13 @@ class Processes:
             return _failed(error)
         return _all_started(met, self._pids)
 
-    def submit(self, kind: str, frames: Sequence[Buffer], blobs: Blobs) -> "Future[Outcome]":
+    def submit(
+        self,
+        kind: str,
+        frames: Sequence[Buffer],
+        blobs: Blobs,
+        wanted: Callable[[], bool] = always,  # noqa: ARG002 - a worker is not told
+    ) -> "Future[Outcome]":
         answer: Future[Outcome] = Future()
         assert self._pool is not None, "submit before warm"
         try:
@@ -163,7 +177,9 @@ EXECUTORS: dict[str, Callable[[int, Sequence[str], int], Executor]] = {
 }
 
 
-def run_task(kind_name: str, frames: Sequence[Buffer], blobs: Blobs) -> Outcome:
+def run_task(
+    kind_name: str, frames: Sequence[Buffer], blobs: Blobs, wanted: Callable[[], bool] = always
+) -> Outcome:
     """Decode the arguments, call the task, encode its result; whatever it raises becomes the outcome."""
     cpu_before_s, started = cpu.used_s(), time.perf_counter()
     status, failure = "ok", ""
@@ -173,7 +189,7 @@ def run_task(kind_name: str, frames: Sequence[Buffer], blobs: Blobs) -> Outcome:
         args = decode(frames, kind.types, blobs)
         if not isinstance(args, list):
             raise ProtocolError("the body is not a list of arguments")
-        result = encode(kind.function(*args), kind.types).frames
+        result = encode(call_while(wanted, kind.function, args), kind.types).frames
     except BaseException as error:  # noqa: BLE001 - a task may raise anything
         status, failure = "failed", describe(error)
     run_s = time.perf_counter() - started

@@ -237,9 +237,13 @@ class Server:
             if work.expired(now):
                 self._refuse(work.peer, work.request, "expired", queue_s=work.queue_s)
                 continue
-            self._running.add(work)
-            future = self._executor.submit(work.request.kind, work.request.body, work.blobs)
-            future.add_done_callback(lambda done, work=work: self._finished(work, done))  # type: ignore[misc]
+            self._start(work)
+
+    def _start(self, work: Work) -> None:
+        self._running.add(work)
+        request = work.request
+        future = self._executor.submit(request.kind, request.body, work.blobs, lambda: work.wanted)
+        future.add_done_callback(lambda done: self._finished(work, done))
 
     def _finished(self, work: Work, future: "Future[Outcome]") -> None:
         """Called in a worker's thread."""
@@ -256,7 +260,7 @@ class Server:
             outcome = replace(outcome, status="failed", error=error, frames=[], server_fault=True)
         self.metrics.queue_s.labels(request.kind).observe(work.queue_s)
         self.metrics.run_s.labels(request.kind).observe(outcome.run_s)
-        self._count(request, outcome.status)
+        self._count(request, outcome.status if work.wanted else "cancelled")
         if work.wanted:
             self._send(
                 work.peer,

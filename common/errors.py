@@ -64,5 +64,9 @@ class CloudBroken(CloudError):
     """The connection was lost, or the server cannot run this task."""
 
 
+class Unwanted(OffloadError):
+    """Raised within a task whose answer was given up meanwhile."""
+
+
 class ProtocolError(OffloadError):
     """Bytes that are not ours; logged, counted, dropped."""

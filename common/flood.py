@@ -17,7 +17,8 @@ DISTANCE_MAX = 2**32 - 1 - 4 * STRAIGHT  # beyond it a move could overflow
 WHEEL = 16  # circular buckets of the weighted flood; the dearest move spans 8 (sqrt 2 * 251.6 / 50)
 BLOCKED_COST = 253
 
-FOUND, EMPTY, GROW, TOO_FAR = 0, 1, 2, 3
+FOUND, EMPTY, GROW, TOO_FAR, PAUSE = 0, 1, 2, 3, 4
+PAUSE_CELLS = 1 << 17  # expanded between two pauses: about 2 ms
 
 
 @kernel
@@ -33,13 +34,13 @@ def flood(
 
     A bucket is one straight move wide, so its cells are final when it opens: only the two after it are
     live. `state` is low bound, row, the three counts, expanded cells, lowest and highest cell expanded;
-    after GROW the call is repeated with larger buckets and goes on where it was.
+    after GROW the call is repeated with larger buckets and goes on where it was, and so it is after PAUSE.
     """
     straight, diagonal, one = np.uint64(STRAIGHT), np.uint64(DIAGONAL), np.uint64(1)
     low, row = np.uint64(state[0]), np.uint64(state[1])
     here, after, later = np.uint64(state[2]), np.uint64(state[3]), np.uint64(state[4])
     expanded, lowest, highest = np.uint64(state[5]), np.uint64(state[6]), np.uint64(state[7])
-    capacity = np.uint64(buckets.shape[1])
+    capacity, pause = np.uint64(buckets.shape[1]), expanded + np.uint64(PAUSE_CELLS)
     outcome = EMPTY
     while True:
         if distance[goal] < low + straight:
@@ -52,6 +53,9 @@ def flood(
             break
         if max(after, later) + np.uint64(8) * here > capacity:
             outcome = GROW
+            break
+        if expanded >= pause:
+            outcome = PAUSE
             break
         row_after, row_later = (row + one) % np.uint64(3), (row + np.uint64(2)) % np.uint64(3)
         end_after, end_later = low + straight + straight, low + straight + straight + straight
@@ -122,6 +126,7 @@ def flood_weighted(
     """
     one, mask = np.uint64(1), np.uint64(WHEEL - 1)
     bucket, expanded = np.uint64(state[0]), np.uint64(state[1])
+    pause = expanded + np.uint64(PAUSE_CELLS)
     outcome = EMPTY
     while True:
         low = float(bucket)
@@ -134,6 +139,9 @@ def flood_weighted(
         here = np.uint64(counts[row])
         if np.uint64(counts.max()) + np.uint64(8) * here > np.uint64(buckets.shape[1]):
             outcome = GROW
+            break
+        if expanded >= pause:
+            outcome = PAUSE
             break
         for k in range(here):
             i = np.uint64(buckets[row, k])

@@ -18,6 +18,7 @@ from common.flood import (
     DISTANCE_MAX,
     FOUND,
     GROW,
+    PAUSE,
     STRAIGHT,
     TOO_FAR,
     WHEEL,
@@ -28,6 +29,7 @@ from common.flood import (
     load,
     stamp,
 )
+from common.wanted import check_wanted
 
 FREE = np.uint32(2**32 - 1)
 IDLE_MAX = 8  # workspaces kept for the next request; more may be in use for as long as they are
@@ -135,9 +137,12 @@ class _PlainWorkspace:
         self._buckets[0, 0] = source
         while True:
             outcome = flood(self._distance, self._buckets, self._state, self._width, target, DISTANCE_MAX)
-            if outcome != GROW:
+            if outcome == PAUSE:
+                check_wanted()
+            elif outcome == GROW:
+                self._buckets = _grown(self._buckets)
+            else:
                 return outcome
-            self._buckets = _grown(self._buckets)
 
     def _answer(self, outcome: int, source: np.uint64, target: np.uint64) -> Route:
         expanded = int(self._state[5])
@@ -205,9 +210,12 @@ class _WeightedWorkspace:
                 self._distance, self._costs, MOVES, self._buckets, self._counts, self._state,
                 self._offsets, target,
             )  # fmt: skip
-            if outcome != GROW:
+            if outcome == PAUSE:
+                check_wanted()
+            elif outcome == GROW:
+                self._buckets = _grown(self._buckets)
+            else:
                 return outcome
-            self._buckets = _grown(self._buckets)
 
 
 def _index(cell: Cell, width: np.uint64) -> np.uint64:

@@ -8,6 +8,7 @@ import os
 import zlib
 
 from common.tasks import task
+from common.wanted import check_wanted
 from loadgen.testbed import PART
 
 ROUNDS_MAX = 10_000_000
@@ -30,7 +31,9 @@ def hash_pairs(count: int) -> bytes:
 @task("hash_rarely_long", size=float)
 def hash_rarely_long(rounds: int) -> bytes:
     """As `hash_rounds`, but takes MUCH times as long for one in RARE sizes, others on each computer."""
-    _hashed(rounds_on(os.environ.get(PART, ""), rounds) - rounds)
+    for _ in range(rounds_on(os.environ.get(PART, ""), rounds) // max(rounds, 1) - 1):
+        check_wanted()
+        _hashed(rounds)
     return _hashed(rounds)
 
 

@@ -12,6 +12,7 @@ from common import cpu
 from common.cpu import SELF
 from common.errors import OffloadError, Overtaken, TaskFailed, describe
 from common.tasks import Kind, Task
+from common.wanted import call_while
 from robot_client.load import Load
 from robot_client.runner import ONBOARD, Condition, Execution
 
@@ -33,8 +34,8 @@ class _Run:
 class OnboardRunner:
     """Runs tasks in this process, `workers` at a time; a waiting task's seconds include its wait.
 
-    A thread cannot be stopped: a run that is cancelled goes on aside, at a low priority, and another thread
-    takes its worker's place at once.
+    A thread cannot be stopped: another one takes the place of a run that is cancelled, which goes on aside,
+    at a low priority, until it ends or looks whether it is wanted.
     """
 
     site = ONBOARD
@@ -115,7 +116,7 @@ class OnboardRunner:
                 if self._runs.get(run.task.id) is not run:  # cancelled, or closed
                     continue
                 run.thread = threading.get_native_id()
-            execution = _run(run.task, run.published)
+            execution = _run(run)
             with self._lock:
                 del self._runs[run.task.id]
                 if run.aside:
@@ -124,11 +125,11 @@ class OnboardRunner:
             run.future.set_result(execution)
 
 
-def _run(task: Task, published: float) -> Execution:
+def _run(run: _Run) -> Execution:
     cpu_before_s, started = cpu.used_s(), time.perf_counter()
     value, failure = None, None
     try:
-        value = task.kind.function(*task.args)
+        value = call_while(lambda: not run.aside, run.task.kind.function, run.task.args)
     except BaseException as error:  # noqa: BLE001 - whatever a user's function raises is the task's failure
         failure = TaskFailed(describe(error))
         failure.__cause__ = error
@@ -138,10 +139,10 @@ def _run(task: Task, published: float) -> Execution:
     now = time.perf_counter()
     return Execution(
         ONBOARD,
-        now - published,
+        now - run.published,
         value,
         failure,
-        queue_s=started - published,
+        queue_s=started - run.published,
         run_s=now - started,
         network_s=0.0,
         cpu_s=cpu_s,

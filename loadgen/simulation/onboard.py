@@ -11,7 +11,6 @@ from loadgen.simulation.processor import Processor, Run
 from loadgen.simulation.truth import Truth
 from loadgen.testbed import ROBOT
 from robot_client.load import EVERY_S, FREE_MIN, MEMORY_S
-from robot_client.onboard import ASIDE_MAX
 from robot_client.runner import ONBOARD, Condition, Execution
 
 
@@ -38,16 +37,13 @@ class SimulatedOnboard:
         return future
 
     def cancel(self, task: Task) -> None:
-        """One that waits is not begun; one that runs goes on aside."""
-        run, future = self._runs.get(task.id, (None, None))
-        if run is None or future is None or (run.begun_s < math.inf and self._processor.aside == ASIDE_MAX):
-            return
-        del self._runs[task.id]
-        started = not self._processor.drop(run)
-        if started:
-            self._processor.put_aside(run)
-        failure, seconds = Overtaken("another site answered first"), self._clock.now_s() - run.added_s
-        future.set_result(Execution(ONBOARD, seconds, failure=failure, censored=True, started=started))
+        """The tasks of scenarios look often whether they are wanted: one that runs ends now too."""
+        run, future = self._runs.pop(task.id, (None, None))
+        if run is not None and future is not None:
+            self._processor.stop(run)
+            failure, seconds = Overtaken("another site answered first"), self._clock.now_s() - run.added_s
+            started = run.begun_s < math.inf
+            future.set_result(Execution(ONBOARD, seconds, failure=failure, censored=True, started=started))
 
     def hurry(self) -> None:
         pass
@@ -59,9 +55,7 @@ class SimulatedOnboard:
         pass
 
     def _ended(self, task: Task, cpu_s: float, run: Run) -> None:
-        _, future = self._runs.pop(task.id, (None, None))
-        if future is None:  # it was put aside
-            return
+        _, future = self._runs.pop(task.id)
         now_s = self._clock.now_s()
         future.set_result(
             Execution(

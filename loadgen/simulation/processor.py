@@ -10,7 +10,6 @@ from functools import partial
 from loadgen.simulation.clock import VirtualClock
 
 LINE_MAX = 100_000  # in line; a simulation that has more has gone wrong
-ASIDE = 0.1  # of the CPU time of a program beside it gets a run that was put aside: nice 10
 
 
 @dataclass(eq=False, slots=True)
@@ -31,8 +30,7 @@ class Run:
 class Processor:
     """Runs work first come, first served, `workers` at a time, on `cpus` CPUs that busy programs share.
 
-    Each of those and each of `hogs` gets the same part of the quota, a whole CPU at most; what was put aside
-    gets what is left, and ASIDE of such a part at least.
+    Each of those and each of `hogs` gets the same part of the quota, a whole CPU at most.
     """
 
     def __init__(self, clock: VirtualClock, cpus: float, workers: int = 1) -> None:
@@ -43,7 +41,6 @@ class Processor:
         self._hogs = 0
         self._paused = False
         self._running: list[Run] = []
-        self._aside: list[Run] = []
         self._line: deque[Run] = deque()
         self._settled_s = clock.now_s()
         self._turn = 0  # what was planned in an earlier one does not happen
@@ -69,22 +66,17 @@ class Processor:
         self._line.remove(run)
         return True
 
-    def put_aside(self, run: Run) -> None:
-        """It goes on at a low priority, in nobody's place."""
-        self.settle()
-        self._running.remove(run)
-        self._aside.append(run)
-        self._plan()
-
-    @property
-    def aside(self) -> int:
-        return len(self._aside)
+    def stop(self, run: Run) -> None:
+        """Give it up, whether or not it has begun."""
+        if not self.drop(run):
+            self.settle()
+            self._running.remove(run)
+            self._plan()
 
     def clear(self) -> None:
         """All of it is lost, hogs too."""
         self.settle()
         self._running.clear()
-        self._aside.clear()
         self._line.clear()
         self._hogs, self._paused = 0, False
         self._plan()
@@ -100,8 +92,7 @@ class Processor:
 
     def share(self, busy: int) -> float:
         """CPUs that each of so many busy programs gets beside the hogs."""
-        weight = busy + self._hogs + ASIDE * len(self._aside)
-        return 0.0 if self._paused else min(1.0, self.cpus / weight)
+        return 0.0 if self._paused else min(1.0, self.cpus / (busy + self._hogs))
 
     @property
     def share_of_one_more(self) -> float:
@@ -130,23 +121,12 @@ class Processor:
         since_s, self._settled_s = now_s - self._settled_s, now_s
         if since_s <= 0:
             return
-        used = 0.0
-        for run, speed in self._speeds():
+        speed = self.share(len(self._running)) if self._running else 0.0
+        for run in self._running:
             run.left_s -= since_s * speed
-            used += speed
+        used = speed * len(self._running)
         self.own_s += since_s * used
         self.others_s += since_s * min(self._hogs, self.cpus - used)
-
-    def _speeds(self) -> list[tuple[Run, float]]:
-        """CPUs that each run gets now."""
-        if self._paused or not (self._running or self._aside):
-            return []
-        part, first = self.share(len(self._running)), len(self._running) + self._hogs
-        found = [(run, part) for run in self._running]
-        if self._aside:
-            left = max(0.0, self.cpus - first * part) / len(self._aside)
-            found += [(run, min(1.0, max(ASIDE * part, left))) for run in self._aside]
-        return found
 
     def _plan(self) -> None:
         """Begin what can, and end next what ends first."""
@@ -157,14 +137,14 @@ class Processor:
             if now_s < run.until_s:
                 run.begun_s = now_s
                 self._running.append(run)
-        ends_s = [(max(0.0, run.left_s) / speed, n, run) for n, (run, speed) in enumerate(self._speeds())]
-        if ends_s:
-            seconds, _, first = min(ends_s)
+        if self._running and not self._paused:
+            first = min(self._running, key=lambda run: run.left_s)
+            seconds = max(0.0, first.left_s) / self.share(len(self._running))
             self._clock.after(seconds, partial(self._end, first, self._turn))
 
     def _end(self, run: Run, turn: int) -> None:
         if turn == self._turn:
             self.settle()
-            (self._aside if run in self._aside else self._running).remove(run)
+            self._running.remove(run)
             self._plan()
             run.ended(run)

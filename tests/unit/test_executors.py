@@ -6,6 +6,7 @@ import os
 import select
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import wait
 from pathlib import Path
@@ -22,8 +23,9 @@ BURNT_S = 0.2
 TOLERANCE_S = 0.05  # the CPU time of whatever else the process does meanwhile
 ROOT = Path(__file__).parents[2]
 MODULE = '''
-import asyncio, os, signal, threading, time
+import asyncio, os, pathlib, signal, threading, time
 from common.tasks import task
+from common.wanted import check_wanted
 
 warmed = []
 
@@ -76,6 +78,13 @@ def exec_burn(seconds):
     while (used := time.thread_time() - start) < seconds:
         pass
     return used
+
+@task("exec_look", size=lambda path: 0)
+def exec_look(path):
+    pathlib.Path(path).touch()
+    while True:
+        check_wanted()
+        time.sleep(0.001)
 
 @task("exec_die", size=lambda: 0)
 def exec_die():
@@ -214,6 +223,20 @@ def test_processes_are_others_and_threads_are_not(make: Callable[..., Executor])
     """`threads` runs in the server's process, `processes` does not."""
     assert value(run(make("threads"), "exec_where", 0))[0] == os.getpid()
     assert value(run(make("processes"), "exec_where", 0))[0] != os.getpid()
+
+
+def test_a_task_in_a_thread_stops_once_it_is_not_wanted(
+    make: Callable[..., Executor], tmp_path: Path
+) -> None:
+    """Its worker is free for the next one."""
+    executor, begun, wanted = make("threads"), tmp_path / "begun", [True]
+    body = encode([str(begun)])
+    future = executor.submit("exec_look", body.frames, {}, lambda: wanted[0])
+    while not begun.exists():
+        time.sleep(0.001)
+    wanted[0] = False
+    assert future.result(WAIT_S).error.startswith("Unwanted: nobody waits")
+    assert value(run(executor, "exec_echo", 3)) == 3
 
 
 def test_a_dead_worker_fails_what_ran_and_a_new_pool_works(

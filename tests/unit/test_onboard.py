@@ -6,8 +6,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from common.errors import OffloadError, Overtaken
+from common.errors import OffloadError, Overtaken, Unwanted
 from common.tasks import Task, kind_of, task
+from common.wanted import check_wanted
 from robot_client.onboard import ASIDE_MAX, ASIDE_NICE, OnboardRunner
 
 WAIT_S = 5.0
@@ -17,7 +18,7 @@ class Gate:
     """Holds `held_back` until it is opened."""
 
     def __init__(self) -> None:
-        self.open = threading.Event()
+        self.open, self.stopped = threading.Event(), threading.Event()
         self.begun: list[int] = []
         self.threads: list[int] = []
 
@@ -30,6 +31,18 @@ def held_back(number: int) -> int:
     gate.begun.append(number)
     gate.threads.append(threading.get_native_id())
     assert gate.open.wait(WAIT_S)
+    return number
+
+
+@task("looking", size=float)
+def looking(number: int) -> int:
+    gate.begun.append(number)
+    try:
+        while not gate.open.wait(0.001):
+            check_wanted()
+    except Unwanted:
+        gate.stopped.set()
+        raise
     return number
 
 
@@ -72,6 +85,18 @@ def test_a_run_that_is_cancelled_makes_room_at_once(runner: OnboardRunner) -> No
     assert runner.submit(call(2, at_once), 1.0).result(WAIT_S).value == 2
     assert os.getpriority(os.PRIO_PROCESS, gate.threads[0]) == ASIDE_NICE
     assert os.getpriority(os.PRIO_PROCESS, 0) == 0
+
+
+def test_a_run_that_looks_whether_it_is_wanted_stops(runner: OnboardRunner) -> None:
+    """And one that comes after it is wanted."""
+    first = call(1, looking)
+    future = runner.submit(first, 1.0)
+    until_begun(1)
+    runner.cancel(first)
+    assert isinstance(future.result(0).failure, Overtaken)
+    assert gate.stopped.wait(WAIT_S)
+    gate.open.set()
+    assert runner.submit(call(2, looking), 1.0).result(WAIT_S).value == 2
 
 
 def test_so_many_go_on_aside_and_no_more(runner: OnboardRunner) -> None:

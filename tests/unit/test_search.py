@@ -1,6 +1,7 @@
 """The compiled search against a plain heap planner, and against the published optima of MovingAI."""
 
 import heapq
+import itertools
 import math
 import threading
 import tracemalloc
@@ -12,8 +13,10 @@ import pytest
 from numpy.typing import NDArray
 
 from common import maps, planner, search
-from common.flood import DISTANCE_MAX, STRAIGHT
+from common.errors import Unwanted
+from common.flood import DISTANCE_MAX, PAUSE_CELLS, STRAIGHT
 from common.search import Field, Hits
+from common.wanted import call_while
 
 ROOT = Path(__file__).parents[2]
 SAMPLES = ROOT / "tests/samples"
@@ -298,3 +301,21 @@ def test_idle_workspaces_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(KeyError), pool.borrow():
         raise KeyError
     assert len(pool._idle) == 1
+
+
+def test_a_search_stops_where_nobody_waits_for_it() -> None:
+    """Within PAUSE_CELLS cells, and the next search on the same map finds what it should."""
+    field = Field(np.ones((1000, 1000), np.bool_))
+    looks = itertools.count()
+
+    def route() -> search.Route:
+        return field.route((0, 0), (999, 999), search.NO_HITS, None)
+
+    whole = call_while(lambda: next(looks) >= 0, route, ())
+    assert 1 <= next(looks) <= whole.expanded / PAUSE_CELLS + 1
+    with pytest.raises(Unwanted):
+        call_while(lambda: False, route, ())
+    assert route().cost == whole.cost == pytest.approx(999 * math.sqrt(2))
+    costs = np.full((1000, 1000), 100, np.uint8)
+    with pytest.raises(Unwanted):
+        call_while(lambda: False, lambda: field.route((0, 0), (999, 999), search.NO_HITS, costs), ())

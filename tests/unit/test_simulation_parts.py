@@ -113,16 +113,18 @@ def test_workers_share_it_among_them_too() -> None:
     assert ended == [pytest.approx(3.0), pytest.approx(3.0), pytest.approx(4.0)]
 
 
-def test_what_is_put_aside_gets_a_tenth_and_what_is_left() -> None:
-    """Of 2 s of work 1 s is done; a task of 1 s then takes 1.1 s beside it, and it has 0.9 s left."""
-    clock, ended = VirtualClock(), dict[str, float]()
+def test_what_is_stopped_makes_room() -> None:
+    """Half-way through the first of three tasks of 2 s, and the second one before its turn."""
+    clock, ended = VirtualClock(), dict[int, float]()
     processor = Processor(clock, cpus=1.0)
-    first = processor.add(2.0, lambda _: ended.update(first=clock.now_s()))
-    clock.at(1.0, lambda: processor.put_aside(first))
-    clock.at(1.0, lambda: processor.add(1.0, lambda _: ended.update(second=clock.now_s())))
+    runs = [
+        processor.add(2.0, lambda _, number=number: ended.update({number: clock.now_s()}))
+        for number in range(3)
+    ]
+    clock.at(1.0, lambda: processor.stop(runs[1]))
+    clock.at(1.0, lambda: processor.stop(runs[0]))
     clock.pass_by(10.0)
-    assert ended == {"second": pytest.approx(2.1), "first": pytest.approx(3.0)}
-    assert processor.aside == 0
+    assert ended == {2: pytest.approx(3.0)}
 
 
 def test_what_is_new_begins_after_what_is_here_and_comes_before_it() -> None:
