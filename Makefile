@@ -9,8 +9,9 @@ export NUMBA_CACHE_DIR ?= $(CACHE)/numba
 PACKAGES := common robot_client cloud_server loadgen
 BENCH_READY := $(VENV)/.bench-ready
 DEV_READY := $(VENV)/.dev-ready
+PEERS_READY := $(VENV)/.peers-ready
 
-.PHONY: help demo install format lint type test unit integration compose chaos browser torch up down table lock wheel clean
+.PHONY: help demo install format lint type test unit integration compose chaos bench browser torch up down table lock wheel clean
 
 help: ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -47,6 +48,9 @@ compose: $(DEV_READY) ## tests with real containers; needs a Docker engine
 chaos: $(DEV_READY) ## every fault 20 times and 3 times in containers, every scenario, then half an hour of faults
 	CHAOS=1 $(BIN)/pytest tests/chaos
 	$(BIN)/loadgen run soak --out out/soak
+
+bench: $(PEERS_READY) ## speed beside peers and limits; wants a machine with nothing else to do
+	$(BIN)/python -m benchmarks
 
 browser: $(DEV_READY) ## tests in a real browser; needs Chromium
 	$(BIN)/pytest tests/browser
@@ -88,3 +92,9 @@ $(DEV_READY): requirements/dev.txt pyproject.toml
 	$(BIN)/python -m pip install --quiet --require-hashes -r requirements/dev.txt
 	$(BIN)/python -m pip install --quiet --no-deps --editable .
 	touch $@ $(BENCH_READY)
+
+$(PEERS_READY): requirements/peers.txt pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --require-hashes -r requirements/peers.txt
+	$(BIN)/python -m pip install --quiet --no-deps --editable .
+	touch $@ $(DEV_READY) $(BENCH_READY)

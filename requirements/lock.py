@@ -4,7 +4,13 @@ import subprocess
 from pathlib import Path
 
 HERE = Path(__file__).parent
-EXTRAS = {"robot": ["planning"], "cloud": ["planning", "cloud"], "bench": ["bench"], "dev": ["dev"]}
+EXTRAS = {
+    "robot": ["planning"],
+    "cloud": ["planning", "cloud"],
+    "bench": ["bench"],
+    "dev": ["dev"],
+    "peers": ["peers"],
+}
 
 OPTIONS = (
     *("--quiet", "--universal", "--python-version", "3.11", "--generate-hashes", "--upgrade"),

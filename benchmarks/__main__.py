@@ -1,0 +1,41 @@
+"""`python -m benchmarks [TABLE ...]`: speed beside peers and limits, each table in one run."""
+
+import argparse
+import importlib
+import os
+import platform
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+TABLES = ("planner", "decision", "wire")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("table", nargs="*", metavar="TABLE", help=f"of {', '.join(TABLES)} (default: all)")
+    chosen = parser.parse_args().table or TABLES
+    for name in chosen:
+        if name not in TABLES:
+            parser.error(f"table {name!r} is not one of {', '.join(TABLES)}")
+    print(f"{_processor()}, {os.cpu_count()} cores, Python {platform.python_version()}, ", end="")
+    print(", ".join(f"{package} {version(package)}" for package in ("numpy", "numba", "pyzmq")), end="\n\n")
+    failed = 0
+    for name in chosen:
+        for table in importlib.import_module(f"benchmarks.{name}").tables():
+            print(table, flush=True)
+            failed += sum(not bar.holds for bar in table.bars)
+    print(f"{failed} bars fail" if failed else "all bars hold")
+    return 0
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.machine()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,171 @@
+"""What deciding costs: predict both sites, decide, learn and record, with runners that answer at once."""
+
+import random
+from collections.abc import Callable
+from concurrent.futures import Future
+
+import numpy as np
+
+from benchmarks.measure import Bar, Table, each_of
+from common.tasks import Kind, Task, task
+from robot_client import policies, predictors
+from robot_client.offloader import Offloader
+from robot_client.policies import Policy
+from robot_client.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
+
+CALLS = 2_000
+WINDOW = 50
+SIZES = [random.Random(1).uniform(1, 5) for _ in range(CALLS)]
+MEASURED = Condition(round_trip_s=0.03)
+SECONDS = {ONBOARD: 0.02, CLOUD: 0.04}  # for size 1
+
+
+@task("counted", size=lambda size: size)
+def counted(size: float) -> float:
+    return size
+
+
+class AtOnce:
+    """A site whose answers are there when they are asked for, and take what a line says."""
+
+    def __init__(self, site: str) -> None:
+        self.site = site
+
+    def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002
+        return None
+
+    def submit(self, task: Task, budget_s: float) -> "Future[Execution]":  # noqa: ARG002
+        future: Future[Execution] = Future()
+        future.set_result(Execution(self.site, SECONDS[self.site] * task.size, task.size))
+        return future
+
+    def cancel(self, task: Task) -> None:
+        pass
+
+    def hurry(self) -> None:
+        pass
+
+    def condition(self) -> Condition:
+        return MEASURED if self.site == CLOUD else UNMEASURED
+
+    def close(self) -> None:
+        pass
+
+
+class Kept:
+    """A policy that remembers the last forecast it was asked about."""
+
+    def __init__(self, inner: Policy) -> None:
+        self.inner = inner
+
+    def decide(self, forecast: policies.Forecast) -> policies.Decision:
+        self.forecast = forecast
+        return self.inner.decide(forecast)
+
+
+def tables() -> list[Table]:
+    return [_decisions(), _predictors()]
+
+
+def _offloader(policy: str, window: int) -> tuple[Offloader, Kept]:
+    """One that knows both sites well."""
+    name = policies.predictor_of(policy)
+    plain = name.removeprefix(predictors.WORK)
+    kept = Kept(policies.make(policy))
+    offload = Offloader(
+        [AtOnce(ONBOARD), AtOnce(CLOUD)],
+        policy=kept,
+        predictor=lambda: predictors.make(plain, window),
+        shared_work=name != plain,
+    )
+    for size in SIZES:
+        offload(counted, size, where="both")
+    for size in SIZES:
+        offload(counted, size)
+    return offload, kept
+
+
+def _decisions() -> Table:
+    cases: dict[str, Callable[[int], object]] = {"an empty call": _empty_calls}
+    for policy in ("paper", policies.DEFAULT):
+        for window in (10, WINDOW, 1_000):
+            offload, kept = _offloader(policy, window)
+            cases[f"{policy}, N = {window}"] = lambda count, offload=offload: _ask(offload, count)
+            if window == WINDOW:
+                cases[f"{policy}: the rule alone"] = lambda count, kept=kept: _decide(kept, count)
+    seconds = each_of(cases, CALLS)
+    empty = seconds["an empty call"]
+    rows = [[name, f"{each * 1e6:.2f}", f"{each / empty:.0f}"] for name, each in seconds.items()]
+    bars = []
+    for policy, limit in (("paper", 25.0), (policies.DEFAULT, 80.0)):
+        few, usual, many = (seconds[f"{policy}, N = {window}"] for window in (10, WINDOW, 1_000))
+        bars.append(Bar(f"{policy}, a task without its run", usual * 1e6, limit, " us"))
+        bars.append(Bar(f"{policy}, N = 10 and N = 1,000 apart", abs(many / few - 1), 0.2))
+    return Table("Deciding", ("what", "us", "empty calls"), rows, bars)
+
+
+def _empty_calls(count: int) -> None:
+    def empty() -> None:
+        pass
+
+    for _ in range(count):
+        empty()
+
+
+def _ask(offload: Offloader, count: int) -> None:
+    for size in SIZES[:count]:
+        offload(counted, size)
+
+
+def _decide(kept: Kept, count: int) -> None:
+    forecast = kept.forecast
+    for _ in range(count):
+        kept.inner.decide(forecast)
+
+
+def _predictors() -> Table:
+    from river import linear_model
+    from sklearn.linear_model import LinearRegression
+
+    least = predictors.make(predictors.LEAST_SQUARES, WINDOW)
+    average = predictors.make("average", WINDOW)
+    streaming = linear_model.LinearRegression()
+    sizes, seconds = np.array(SIZES[:WINDOW]), np.array(SIZES[:WINDOW]) * 0.04
+    for size in SIZES[:WINDOW]:
+        least.learn(size, 0.04 * size)
+        average.learn(size, 0.04 * size)
+
+    def ours(one: predictors.Predictor) -> Callable[[int], None]:
+        def run(count: int) -> None:
+            for size in SIZES[:count]:
+                one.learn(size, 0.04 * size)
+                one.predict(size)
+
+        return run
+
+    def river(count: int) -> None:
+        for size in SIZES[:count]:
+            streaming.learn_one({"d": size}, 0.04 * size)
+            streaming.predict_one({"d": size})
+
+    def polyfit(count: int) -> None:
+        for n, size in enumerate(SIZES[:count]):
+            sizes[n % WINDOW], seconds[n % WINDOW] = size, 0.04 * size
+            slope, intercept = np.polyfit(sizes, seconds, 1)
+            slope * size + intercept
+
+    def sklearn(count: int) -> None:
+        for n, size in enumerate(SIZES[:count]):
+            sizes[n % WINDOW], seconds[n % WINDOW] = size, 0.04 * size
+            LinearRegression().fit(sizes[:, np.newaxis], seconds).predict([[size]])
+
+    found = each_of({"least squares": ours(least), "average of four": ours(average), "river": river}, CALLS)
+    found |= each_of({"numpy.polyfit": polyfit, "scikit-learn": sklearn}, CALLS // 10)
+    base = found["least squares"]
+    rows = [[name, f"{each * 1e6:.2f}", f"{each / base:.1f}"] for name, each in found.items()]
+    bars = [
+        Bar("numpy.polyfit over ours", found["numpy.polyfit"] / base, 8.0, at_least=True),
+        Bar("river over ours", found["river"] / base, 2.0, at_least=True),
+        Bar("scikit-learn over ours", found["scikit-learn"] / base, 50.0, at_least=True),
+    ]
+    return Table(f"Learn and predict one site, N = {WINDOW}", ("what", "us", "over ours"), rows, bars)

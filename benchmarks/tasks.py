@@ -1,0 +1,15 @@
+"""Tasks that take no time, so that what is measured is the way to them and back."""
+
+from typing import Any
+
+from common.tasks import task
+
+
+@task("nothing", size=lambda: 0.0)
+def nothing() -> None:
+    pass
+
+
+@task("length", size=lambda array: array.nbytes)
+def length(array: Any) -> int:
+    return int(array.nbytes)

@@ -1,0 +1,209 @@
+"""An empty task and one of 1 MB through the real client and server, beside raw ZMQ and other ways to call."""
+
+import contextlib
+import http.client
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import zmq
+
+from benchmarks.measure import Bar, Table, each_of
+from benchmarks.servers import free_port
+from benchmarks.tasks import length, nothing
+from common import wire
+from common.tasks import kind_of
+from robot_client.offloader import Offloader
+from robot_client.runner import CLOUD
+
+CALLS, MEGABYTE_CALLS = 200, 20
+MEGABYTE = 1_000_000
+READY_S = 30.0
+LISTENS_S = 0.5
+
+
+def tables() -> list[Table]:
+    with contextlib.ExitStack() as stack:
+        return [_empty(stack), _megabyte(stack)]
+
+
+def _empty(stack: contextlib.ExitStack) -> Table:
+    missing: list[str] = []
+    cases: dict[str, Callable[[int], object]] = {
+        "raw ZMQ echo of the same bytes": _echo(stack, _frames(nothing)),
+        "offboard": _ours(stack, nothing),
+        "FastAPI, keep-alive": _http(stack),
+    }
+    peers = {"grpc": ("gRPC, bytes", _grpc), "ray": ("Ray actor", _ray), "distributed": ("Dask actor", _dask)}
+    for module, (name, start) in peers.items():
+        if find_spec(module) is None:
+            missing.append(f"{name}: {module} is not installed")
+        else:
+            cases[name] = start(stack)
+    seconds = each_of(cases, CALLS, rounds=9)
+    ours, raw = seconds["offboard"], seconds["raw ZMQ echo of the same bytes"]
+    bars = [Bar("offboard over raw echo", ours / raw, 4.0)]
+    least = {"FastAPI, keep-alive": 1.0, "gRPC, bytes": 1.0, "Ray actor": 4.0, "Dask actor": 10.0}
+    bars += [
+        Bar(f"{name} over offboard", seconds[name] / ours, limit, at_least=True)
+        for name, limit in least.items()
+        if name in seconds
+    ]
+    return Table("An empty task", ("way", "us", "over raw echo"), _rows(seconds, raw), bars, missing)
+
+
+def _megabyte(stack: contextlib.ExitStack) -> Table:
+    array = np.random.default_rng(1).integers(0, 255, MEGABYTE, np.uint8)
+    arrays = [
+        array + np.uint8(n) for n in range(MEGABYTE_CALLS)
+    ]  # as blobs they would be known the next time
+    raw_name = "raw ZMQ echo of the same bytes"
+    seconds = each_of(
+        {raw_name: _echo(stack, _frames(length, array)), "offboard": _ours(stack, length, arrays)},
+        MEGABYTE_CALLS,
+        rounds=9,
+    )
+    raw = seconds[raw_name]
+    bar = Bar("offboard over raw echo", seconds["offboard"] / raw, 1.6)
+    return Table("A task with an array of 1 MB", ("way", "us", "over raw echo"), _rows(seconds, raw), [bar])
+
+
+def _rows(seconds: dict[str, float], raw: float) -> list[list[str]]:
+    return [[name, f"{each * 1e6:.0f}", f"{each / raw:.2f}"] for name, each in seconds.items()]
+
+
+def _frames(function: Callable[..., Any], *args: Any) -> list[Any]:
+    """What the client sends for this call."""
+    kind = kind_of(function)
+    body = wire.encode(list(args), kind.types)
+    return list(wire.pack(wire.Request(1, kind.name, 1.0, 1, (), body.frames)))
+
+
+def _echo(stack: contextlib.ExitStack, frames: list[Any]) -> Callable[[int], None]:
+    socket = stack.enter_context(zmq.Context.instance().socket(zmq.DEALER))
+    socket.linger = 0
+    socket.connect(f"tcp://127.0.0.1:{_serve(stack, 'echo')}")
+
+    def call(count: int) -> None:
+        for _ in range(count):
+            socket.send_multipart(frames, copy=False)
+            socket.recv_multipart(copy=False)
+
+    return call
+
+
+def _ours(
+    stack: contextlib.ExitStack, function: Callable[..., Any], given: Any = None
+) -> Callable[[int], None]:
+    endpoint = stack.enter_context(_cloud_server())
+    offload = stack.enter_context(Offloader.connect(endpoint, policy=CLOUD))
+    absent = offload.wait_for_sites(function, READY_S)
+    if absent:
+        raise RuntimeError(f"the server is not ready: {absent}")
+
+    def call(count: int) -> None:
+        for n in range(count):
+            if given is None:
+                offload(function)
+            else:
+                given[n][:8] += 1  # another array each time
+                offload(function, given[n])
+        record = offload.last
+        assert record is not None
+        assert record.used == CLOUD, record.executions
+
+    return call
+
+
+@contextlib.contextmanager
+def _cloud_server() -> Iterator[str]:
+    port, http_port = free_port(), free_port()
+    endpoint = f"tcp://127.0.0.1:{port}"
+    command = [sys.executable, "-m", "cloud_server", "--listen", endpoint, "--tasks", "benchmarks.tasks"]
+    command += ["--http", f"127.0.0.1:{http_port}", "--log", "error"]
+    with _running(command):
+        yield endpoint
+
+
+def _http(stack: contextlib.ExitStack) -> Callable[[int], None]:
+    connection = http.client.HTTPConnection("127.0.0.1", _serve(stack, "http"))
+    time.sleep(LISTENS_S)  # it says its port just before it listens
+    stack.callback(connection.close)
+
+    def call(count: int) -> None:
+        for _ in range(count):
+            connection.request("POST", "/nothing")
+            connection.getresponse().read()
+
+    return call
+
+
+def _grpc(stack: contextlib.ExitStack) -> Callable[[int], None]:
+    import grpc
+
+    channel = stack.enter_context(grpc.insecure_channel(f"127.0.0.1:{_serve(stack, 'grpc')}"))
+    method = channel.unary_unary("/bench/nothing")
+
+    def call(count: int) -> None:
+        for _ in range(count):
+            method(b"")
+
+    return call
+
+
+def _ray(stack: contextlib.ExitStack) -> Callable[[int], None]:
+    import ray
+
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="error")
+    stack.callback(ray.shutdown)
+
+    @ray.remote
+    class Actor:
+        def nothing(self) -> None:
+            pass
+
+    actor = Actor.remote()  # type: ignore[attr-defined]
+
+    def call(count: int) -> None:
+        for _ in range(count):
+            ray.get(actor.nothing.remote())
+
+    return call
+
+
+class _Actor:
+    def nothing(self) -> None:
+        pass
+
+
+def _dask(stack: contextlib.ExitStack) -> Callable[[int], None]:
+    from distributed import Client
+
+    client = stack.enter_context(Client(n_workers=1, threads_per_worker=1, dashboard_address=None))
+    actor = client.submit(_Actor, actor=True).result()
+
+    def call(count: int) -> None:
+        for _ in range(count):
+            actor.nothing().result()
+
+    return call
+
+
+def _serve(stack: contextlib.ExitStack, name: str) -> int:
+    process = stack.enter_context(_running([sys.executable, "-m", "benchmarks.servers", name]))
+    assert process.stdout is not None
+    return int(process.stdout.readline())
+
+
+@contextlib.contextmanager
+def _running(command: list[str]) -> Iterator["subprocess.Popen[str]"]:
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        yield process
+    finally:
+        process.terminate()
+        process.wait(READY_S)
