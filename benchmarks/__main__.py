@@ -8,7 +8,7 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
-TABLES = ("planner", "decision", "wire")
+TABLES = ("planner", "decision", "wire", "start")
 
 
 def main() -> int:

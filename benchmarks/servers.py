@@ -1,11 +1,53 @@
-"""`python -m benchmarks.servers NAME`: peers that answer an empty call; the first line says at which port."""
+"""Our server, and peers that answer an empty call: `python -m benchmarks.servers NAME` says at which port."""
 
 import contextlib
+import os
 import socket
+import subprocess
 import sys
-from collections.abc import AsyncIterator
+import time
+import urllib.request
+from collections.abc import AsyncIterator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
+
+READY_S = 30.0
+POLL_S = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Server:
+    """A `cloud-server` that is ready, after `took_s`."""
+
+    endpoint: str
+    pid: int
+    took_s: float
+
+
+@contextlib.contextmanager
+def running(command: Sequence[str], **environ: str) -> Iterator["subprocess.Popen[str]"]:
+    pipe = subprocess.PIPE  # an input too, of which there is no end before we let go
+    process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=os.environ | environ)
+    try:
+        yield process
+    finally:
+        process.terminate()
+        process.wait(READY_S)
+
+
+@contextlib.contextmanager
+def cloud_server(tasks: str = "benchmarks.tasks", **environ: str) -> Iterator[Server]:
+    """The real one, on loopback."""
+    endpoint, http = f"tcp://127.0.0.1:{free_port()}", f"127.0.0.1:{free_port()}"
+    command = [sys.executable, "-m", "cloud_server", "--listen", endpoint, "--tasks", tasks]
+    began = time.perf_counter()
+    with running([*command, "--http", http, "--log", "error"], **environ) as process:
+        while time.perf_counter() - began < READY_S:
+            with contextlib.suppress(OSError), urllib.request.urlopen(f"http://{http}/ready", timeout=1):
+                break
+            time.sleep(POLL_S)
+        yield Server(endpoint, process.pid, time.perf_counter() - began)
 
 
 def free_port() -> int:

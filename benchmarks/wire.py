@@ -2,10 +2,9 @@
 
 import contextlib
 import http.client
-import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from importlib.util import find_spec
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 import zmq
 
 from benchmarks.measure import Bar, Table, each_of
-from benchmarks.servers import free_port
+from benchmarks.servers import READY_S, cloud_server, running
 from benchmarks.tasks import length, nothing
 from common import wire
 from common.tasks import kind_of
@@ -22,7 +21,6 @@ from robot_client.runner import CLOUD
 
 CALLS, MEGABYTE_CALLS = 200, 20
 MEGABYTE = 1_000_000
-READY_S = 30.0
 LISTENS_S = 0.5
 
 
@@ -99,7 +97,7 @@ def _echo(stack: contextlib.ExitStack, frames: list[Any]) -> Callable[[int], Non
 def _ours(
     stack: contextlib.ExitStack, function: Callable[..., Any], given: Any = None
 ) -> Callable[[int], None]:
-    endpoint = stack.enter_context(_cloud_server())
+    endpoint = stack.enter_context(cloud_server()).endpoint
     offload = stack.enter_context(Offloader.connect(endpoint, policy=CLOUD))
     absent = offload.wait_for_sites(function, READY_S)
     if absent:
@@ -117,16 +115,6 @@ def _ours(
         assert record.used == CLOUD, record.executions
 
     return call
-
-
-@contextlib.contextmanager
-def _cloud_server() -> Iterator[str]:
-    port, http_port = free_port(), free_port()
-    endpoint = f"tcp://127.0.0.1:{port}"
-    command = [sys.executable, "-m", "cloud_server", "--listen", endpoint, "--tasks", "benchmarks.tasks"]
-    command += ["--http", f"127.0.0.1:{http_port}", "--log", "error"]
-    with _running(command):
-        yield endpoint
 
 
 def _http(stack: contextlib.ExitStack) -> Callable[[int], None]:
@@ -194,16 +182,6 @@ def _dask(stack: contextlib.ExitStack) -> Callable[[int], None]:
 
 
 def _serve(stack: contextlib.ExitStack, name: str) -> int:
-    process = stack.enter_context(_running([sys.executable, "-m", "benchmarks.servers", name]))
+    process = stack.enter_context(running([sys.executable, "-m", "benchmarks.servers", name]))
     assert process.stdout is not None
     return int(process.stdout.readline())
-
-
-@contextlib.contextmanager
-def _running(command: list[str]) -> Iterator["subprocess.Popen[str]"]:
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    try:
-        yield process
-    finally:
-        process.terminate()
-        process.wait(READY_S)
