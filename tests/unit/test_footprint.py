@@ -1,0 +1,72 @@
+"""What an offloader holds does not grow with the tasks that it has run."""
+
+import gc
+import tracemalloc
+from concurrent.futures import Future
+from random import Random
+
+import pytest
+
+from common.tasks import Kind, Task, task
+from robot_client import policies, predictors
+from robot_client.offloader import Offloader
+from robot_client.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
+
+GROWTH_BYTES = 20_000  # of a few megabytes: dictionaries that are made anew, caches of small numbers
+
+
+@task("footed", size=lambda size: size, work=lambda size: size)
+def footed(size: float) -> float:
+    return size
+
+
+class Forgetful:
+    """Answers at once, late now and then, and remembers nothing."""
+
+    def __init__(self, site: str) -> None:
+        self.site = site
+        self._random = Random(site)
+
+    def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002
+        return None
+
+    def submit(self, task: Task, budget_s: float) -> "Future[Execution]":  # noqa: ARG002
+        future: Future[Execution] = Future()
+        seconds = task.size * self._random.lognormvariate(-4.0, 0.3)
+        future.set_result(Execution(self.site, seconds, task.size, run_s=seconds, queue_s=0.0))
+        return future
+
+    def cancel(self, task: Task) -> None:
+        pass
+
+    def hurry(self) -> None:
+        pass
+
+    def condition(self) -> Condition:
+        return Condition(round_trip_s=0.03) if self.site == CLOUD else UNMEASURED
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.timeout(30)  # traced, it takes some seconds
+@pytest.mark.parametrize("policy", ["paper", policies.DEFAULT])
+def test_memory_does_not_grow_with_the_tasks(policy: str) -> None:
+    """After 4,000 tasks as much is held as after 1,500."""
+    name = policies.predictor_of(policy)
+    random, held = Random(1), []
+    with Offloader(
+        [Forgetful(ONBOARD), Forgetful(CLOUD)],
+        policy=policies.make(policy),
+        predictor=lambda: predictors.make(name.removeprefix(predictors.WORK), 50),
+        shared_work=name.startswith(predictors.WORK),
+    ) as offload:
+        tracemalloc.start()
+        for count in (1_500, 2_500):
+            for _ in range(count):
+                offload(footed, random.uniform(1, 5))
+            gc.collect()
+            held.append(tracemalloc.get_traced_memory()[0])
+        tracemalloc.stop()
+    print(held)
+    assert held[1] - held[0] < GROWTH_BYTES, held
