@@ -25,6 +25,9 @@ class Average(Conditional):
     Ettler, Online Prediction Under Model Uncertainty Via Dynamic Model Averaging (2010), with clipped
     absolute errors in place of densities: an outlier is no model's fault. The models with features share
     one set of gains. The spread is the running error of the average itself.
+
+    The first START observations are held to a line that bears outliers; what was clipped off any counts in
+    the mean, as times do that nobody can foretell.
     """
 
     def __init__(self, window: int, seed: int = 0, *, blind: bool = False) -> None:

@@ -7,10 +7,11 @@ from random import Random
 
 import pytest
 
-from common.tasks import Kind, Task, task
+from benchmarks.decision import AtOnce
+from common.tasks import Task, task
 from robot_client import policies, predictors
 from robot_client.offloader import Offloader
-from robot_client.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
+from robot_client.runner import CLOUD, ONBOARD, Execution
 
 GROWTH_BYTES = 20_000  # of a few megabytes: dictionaries that are made anew, caches of small numbers
 
@@ -20,33 +21,18 @@ def footed(size: float) -> float:
     return size
 
 
-class Forgetful:
-    """Answers at once, late now and then, and remembers nothing."""
+class Forgetful(AtOnce):
+    """Late now and then, and remembers nothing."""
 
     def __init__(self, site: str) -> None:
-        self.site = site
+        super().__init__(site)
         self._random = Random(site)
-
-    def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002
-        return None
 
     def submit(self, task: Task, budget_s: float) -> "Future[Execution]":  # noqa: ARG002
         future: Future[Execution] = Future()
         seconds = task.size * self._random.lognormvariate(-4.0, 0.3)
         future.set_result(Execution(self.site, seconds, task.size, run_s=seconds, queue_s=0.0))
         return future
-
-    def cancel(self, task: Task) -> None:
-        pass
-
-    def hurry(self) -> None:
-        pass
-
-    def condition(self) -> Condition:
-        return Condition(round_trip_s=0.03) if self.site == CLOUD else UNMEASURED
-
-    def close(self) -> None:
-        pass
 
 
 @pytest.mark.timeout(30)  # traced, it takes some seconds
