@@ -7,8 +7,10 @@ times are skewed.
 """
 
 import math
+import operator
 from bisect import bisect_left, insort
 from collections import deque
+from typing import NamedTuple
 
 COVERAGE = 0.9
 OUTSIDE = 1 - COVERAGE
@@ -20,9 +22,6 @@ TAIL = 0.2  # of the errors: the largest, from which one tells how long a late t
 BEYOND = 0.25  # of the distance from the median to the largest error: so much later nothing was ever
 NORMAL_90 = 1.645  # standard deviations on each side that hold 90 %, on one side 95 %
 USUAL_RATE = 0.05
-
-
-Tail = tuple[tuple[float, float], ...]
 
 
 class Conformal:
@@ -38,15 +37,16 @@ class Conformal:
         self._usual_s = 0.0
         self._count = 0
         self._outside = OUTSIDE
-        self._low = self._high = 0.0  # scores between which the next one should be
-        self._tail: Tail = ()
+        self._ends: tuple[float, float] | None = None  # scores between which the next one should be
+        self._tail: _Tail | None = None
 
     def learn(self, predicted_s: float, seconds: float) -> None:
         """Take what came of a prediction."""
         if self._count:
             score = (seconds - predicted_s) / self._unit(predicted_s)
             if len(self._sorted) >= SCORES_MIN:
-                missed = not self._low <= score <= self._high
+                low, high = self._interval()
+                missed = not low <= score <= high
                 outside = self._outside + RATE * (OUTSIDE - missed)
                 self._outside = min(OUTSIDE_MAX, max(OUTSIDE_MIN, outside))
             self._add(score)
@@ -59,8 +59,8 @@ class Conformal:
             if spread_s is None:
                 return None
             return max(0.0, predicted_s - NORMAL_90 * spread_s), predicted_s + NORMAL_90 * spread_s
-        unit = self._unit(predicted_s)
-        low_s, high_s = predicted_s + unit * self._low, predicted_s + unit * self._high
+        unit, (low, high) = self._unit(predicted_s), self._interval()
+        low_s, high_s = predicted_s + unit * low, predicted_s + unit * high
         return max(0.0, min(low_s, predicted_s)), max(high_s, predicted_s, 0.0)
 
     def overdue(self, predicted_s: float, worth_s: float) -> float | None:
@@ -68,12 +68,12 @@ class Conformal:
 
         None while too few errors are known.
         """
-        if not self._tail:
+        if len(self._sorted) < SCORES_MIN:
             return None
-        unit = self._unit(predicted_s)
-        late = [one for one in self._tail if unit * one[1] > worth_s]
-        last = late.pop()
-        score = max(late, key=lambda one: one[1])[0] if late else last[0]
+        if self._tail is None:
+            self._tail = _tail(self._sorted)
+        unit, tail = self._unit(predicted_s), self._tail
+        score = tail.slowest if unit * tail.beyond > worth_s else tail.never
         return max(0.0, predicted_s + unit * score)
 
     def share_above(self, predicted_s: float, limit_s: float) -> float | None:
@@ -102,27 +102,34 @@ class Conformal:
             del ordered[bisect_left(ordered, self._order.popleft())]
         self._order.append(score)
         insort(ordered, score)
-        self._low, self._high = _shortest(ordered, 1 - self._outside)
-        if len(ordered) >= SCORES_MIN:
-            self._tail = _tail(ordered)
+        self._ends = self._tail = None
+
+    def _interval(self) -> tuple[float, float]:
+        if self._ends is None:
+            self._ends = _shortest(self._sorted, 1 - self._outside)
+        return self._ends
 
 
-def _tail(ordered: list[float]) -> Tail:
-    """Of the largest errors each, and how much longer those beyond it were in the mean.
+class _Tail(NamedTuple):
+    """The largest errors: the `slowest` one, beyond which the others were so much longer in the mean as
+    beyond no other; who is later than `never` may never come."""
 
-    Who is later than all that were seen may never come.
-    """
+    slowest: float
+    beyond: float
+    never: float
+
+
+def _tail(ordered: list[float]) -> _Tail:
     count = len(ordered)
-    first = count - max(2, round(TAIL * count))
-    found: list[tuple[float, float]] = []
-    total = 0.0
-    for n, place in enumerate(range(count - 1, first - 1, -1)):
-        if n:
-            found.append((ordered[place], total / n - ordered[place]))
-        total += ordered[place]
-    found.reverse()
-    last = ordered[-1] + BEYOND * (ordered[-1] - ordered[count // 2])
-    return (*found, (last, math.inf))
+    largest = ordered[count - max(2, round(TAIL * count)) :]
+    slowest = total = last = largest.pop()
+    beyond = -math.inf
+    for n, score in enumerate(reversed(largest), 1):
+        longer = total / n - score
+        if longer >= beyond:
+            slowest, beyond = score, longer
+        total += score
+    return _Tail(slowest, beyond, last + BEYOND * (last - ordered[count // 2]))
 
 
 def _shortest(ordered: list[float], share: float) -> tuple[float, float]:
@@ -135,6 +142,6 @@ def _shortest(ordered: list[float], share: float) -> tuple[float, float]:
     if held >= count:
         beyond = (share * (count + 1) / count - 1) * (ordered[-1] - ordered[0])
         return ordered[0] - max(0.0, beyond), ordered[-1] + max(0.0, beyond)
-    widths = [high - low for low, high in zip(ordered, ordered[held - 1 :], strict=False)]
+    widths = list(map(operator.sub, ordered[held - 1 :], ordered))
     first = widths.index(min(widths))
     return ordered[first], ordered[first + held - 1]

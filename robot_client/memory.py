@@ -26,7 +26,7 @@ OBSERVATIONS_MAX = 200  # of a site, kept for `store`
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Observation:
     """What one execution taught its site, and all that is needed to teach it again.
 
@@ -119,7 +119,7 @@ class SiteMemory:
         self.predictor = predictor
         self.age = 0
         self.observations: deque[Observation] = deque(maxlen=OBSERVATIONS_MAX)
-        self.conditional = isinstance(predictor, Conditional)
+        self._conditional = predictor if isinstance(predictor, Conditional) else None
         self._site = site
         self._failures = 0
         self._conformal = Conformal()
@@ -128,14 +128,19 @@ class SiteMemory:
         self._bytes = _Usual()
         self._cpu_s = _Usual()
 
+    @property
+    def conditional(self) -> bool:
+        """Whether the predictor looks at what was measured."""
+        return self._conditional is not None
+
     def outlook(
         self, amount: float | None, condition: Condition, *, in_flight: int, timeout_s: float
     ) -> Outlook:
         """Before a task of so much work, or of this size."""
         predictor, found = self.predictor, None
         if amount is not None:
-            if isinstance(predictor, Conditional):
-                found = predictor.predict(amount, self.age + 1, condition)
+            if self._conditional is not None:
+                found = self._conditional.predict(amount, self.age + 1, condition)
             else:
                 found = predictor.predict(amount, self.age + 1)
         if found is None:
@@ -228,8 +233,8 @@ class SiteMemory:
         self._use(one.bytes, one.cpu_s)
         if one.predicted_s is not None:
             self._conformal.learn(one.predicted_s, one.seconds + one.waited_s)
-        if isinstance(self.predictor, Conditional):
-            self.predictor.learn(one.amount, one.seconds, one.condition)
+        if self._conditional is not None:
+            self._conditional.learn(one.amount, one.seconds, one.condition)
         else:
             self.predictor.learn(one.amount, one.seconds)
 

@@ -57,7 +57,7 @@ class _Asked:
     seconds: dict[str, float] = field(default_factory=dict)  # of the sites that answered
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Flight:
     """A run under way on a site."""
 
@@ -302,7 +302,7 @@ class Offloader:
             size=task.size,
             sites=asked.forecast.sites,
             decision=asked.decision,
-            executions=tuple(replace(execution, value=None) for execution in executions),
+            executions=tuple(execution.without_value() for execution in executions),
             used=answer.site if answer.ok else None,
             waited_s=self._clock.now_s() - started,
             amount=asked.amount,

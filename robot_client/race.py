@@ -14,7 +14,7 @@ from robot_client.clock import Clock
 from robot_client.runner import ONBOARD, Execution, Runner
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Plan:
     """`first` start at once, `second` when no answer has come after `after_s`; `all`: wait for every one.
 

@@ -28,15 +28,19 @@ class RegretEstimate:
 
     def __init__(self) -> None:
         self._regrets: deque[float] = deque(maxlen=PROBES_MAX)
+        self._estimate: Regret | None = None
 
     def learn(self, chosen_s: float, other_s: float) -> None:
         self._regrets.append(max(0.0, chosen_s - other_s))
+        if len(self._regrets) >= PROBES_MIN:
+            self._estimate = self._fresh()
 
     def estimate(self) -> Regret | None:
         """None before PROBES_MIN probes."""
+        return self._estimate
+
+    def _fresh(self) -> Regret:
         count = len(self._regrets)
-        if count < PROBES_MIN:
-            return None
         mean = math.fsum(self._regrets) / count
         variance = math.fsum((one - mean) ** 2 for one in self._regrets) / (count - 1)
         half = student_95(count - 1) * math.sqrt(variance / count)

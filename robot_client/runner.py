@@ -15,7 +15,7 @@ PORT_MAX = 65_535
 _ENDPOINT = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5})")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Execution:
     """One run of a task on one site, measured on the robot's own clock.
 
@@ -38,6 +38,23 @@ class Execution:
     bytes_out: int = 0
     bytes_in: int = 0
     started: bool = True
+
+    def without_value(self) -> "Execution":
+        """The same for the record: what a task returned may be large."""
+        return Execution(
+            self.site,
+            self.seconds,
+            None,
+            self.failure,
+            self.censored,
+            self.queue_s,
+            self.run_s,
+            self.network_s,
+            self.cpu_s,
+            self.bytes_out,
+            self.bytes_in,
+            self.started,
+        )
 
     @property
     def ok(self) -> bool:

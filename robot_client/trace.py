@@ -53,7 +53,7 @@ class Late:
     censored: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Record:
     """Everything about one task, written once it is answered; `used` is the site whose answer was used.
 

@@ -13,7 +13,7 @@ WINDOW_MAX = 1_000_000
 CANCELLATION_MAX = 1e-3  # sums are made anew when less than this share of their largest value is left
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Moments:
     """Means and centred sums over a window: sdd = sum((d - mean d)^2), sdt, stt alike.
 

@@ -12,7 +12,7 @@ OVERDUE_SD = 2.0  # standard deviations beyond its prediction, while too few err
 PINNED = "pinned"  # what stands for a policy where the caller said where to run
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Outlook:
     """What is known of one site before a task.
 
@@ -50,7 +50,7 @@ class Outlook:
         return None if self.spread_s is None else self.predicted_s + OVERDUE_SD * self.spread_s
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Forecast:
     """The size of a task and the outlook of every site that can take it now.
 
@@ -72,7 +72,7 @@ class Forecast:
         return replace(self, sites={name: one for name, one in self.sites.items() if name in sites})
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Decision:
     """Run on `site`, or on all sites but those `spared` in parallel where `both`; the reason is for people.
 

@@ -13,9 +13,9 @@ class Paper:
     """Algorithm 1 of Penmetcha, Kannan and Min, exactly."""
 
     def decide(self, forecast: Forecast) -> Decision:
-        if not all(outlook.full for outlook in forecast.sites.values()):
+        cold = [site for site, outlook in forecast.sites.items() if not outlook.full]
+        if cold:
             # Algorithm 1, warm-up branch: both sites, until both queues are full.
-            cold = [site for site, outlook in forecast.sites.items() if not outlook.full]
             reason = f"warm-up: the window of {' and '.join(sorted(cold))} is not full"
             return Decision(home(forecast), len(forecast.sites) > 1, reason, "paper")
         predicted = {site: outlook.predicted_s or 0.0 for site, outlook in forecast.sites.items()}
@@ -112,12 +112,10 @@ class Thompson(Greedy):
 
 def warm_up(forecast: Forecast, policy: str) -> Decision | None:
     """All sites but silent ones, while one of them has too few observations."""
-    heard = forecast.only([site for site, one in forecast.sites.items() if not one.condition.silent])
-    cold = [
-        site for site, one in heard.sites.items() if one.count < WARM_UP and not (one.full or one.in_flight)
-    ]
-    if not cold or len(heard.sites) == 1:
+    heard = {site: one for site, one in forecast.sites.items() if not one.condition.silent}
+    cold = [site for site, one in heard.items() if one.count < WARM_UP and not (one.full or one.in_flight)]
+    if not cold or len(heard) == 1:
         return None
     reason = f"warm-up: too little is known of {' and '.join(sorted(cold))}"
-    silent = tuple(site for site in forecast.sites if site not in heard.sites)
-    return Decision(home(heard), True, reason, policy, spared=silent)
+    silent = tuple(site for site in forecast.sites if site not in heard)
+    return Decision(home(forecast.only(heard)), True, reason, policy, spared=silent)

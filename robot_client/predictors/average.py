@@ -93,11 +93,13 @@ class Average(Conditional):
 
     def _each(self, size: float, condition: Condition) -> list[float]:
         """Of every model: those without features first."""
-        found = [max(0.0, plain.expect(size)) for plain in self._plain]
+        found = [plain.expect(size) for plain in self._plain]
         if self._measured:
             trip_s, crowding = condition.round_trip_s or 0.0, self._gains.crowding(condition)
-            found += [trip_s + crowding * max(0.0, one.expect(size)) for one in self._measured]
-        return found
+            for one in self._measured:
+                rest = one.expect(size)
+                found.append(trip_s + crowding * rest if rest > 0 else trip_s)
+        return [seconds if seconds > 0 else 0.0 for seconds in found]
 
     def _mean(self, predicted: list[float]) -> float:
         first = predicted[0]  # exact where all agree

@@ -2,8 +2,7 @@
 
 import math
 from collections import deque
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -15,8 +14,7 @@ Column = npt.NDArray[np.float64]
 SIZE_MIN = 1e-100  # sizes that differ by less are equal: a steeper line would leave the range of a float
 
 
-@dataclass(frozen=True, slots=True)
-class Prediction:
+class Prediction(NamedTuple):
     """Expected `seconds` of a task, and the standard deviation of what was seen around it (None: unknown).
 
     `error_s` is the standard error of the expectation itself, where the predictor knows it.
