@@ -21,10 +21,10 @@ from loadgen.render import Heading, Table, render
 from loadgen.rows import Column, Rows, read_lived
 from loadgen.score import Scored, Sides
 from robot_client import policies, predictors
-from robot_client.offloader import WINDOW, Offloader
+from robot_client.offloader import Offloader
 from robot_client.policies import Decision, Forecast, Policy
 from robot_client.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
-from robot_client.window import WINDOW_MAX
+from robot_client.window import WINDOW, WINDOW_MAX
 
 ORACLE = "oracle"
 RECORDED = "as recorded"

@@ -20,9 +20,8 @@ from loadgen.replay import ORACLE, RECORDED, ReplayConfig
 from loadgen.rows import write_whole
 from loadgen.series import POINTS_MAX, Times
 from robot_client import policies, predictors
-from robot_client.offloader import WINDOW
 from robot_client.runner import CLOUD, ONBOARD
-from robot_client.window import WINDOW_MAX
+from robot_client.window import WINDOW, WINDOW_MAX
 
 PAGE = "report.html"
 NO_WINDOW = "Not drawn: there is no row that a window of any N leaves to predict."

@@ -8,15 +8,16 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from common.config import as_dict, load, run_command
 from common.errors import ConfigError, OffloadError
-from robot_client.answers import Answers
 from robot_client.config import RobotConfig
-from robot_client.lines import Lines
 from robot_client.runner import CLOUD, ONBOARD, PORT_MAX
-from robot_client.trace import Record
+
+if TYPE_CHECKING:
+    from robot_client.lines import Lines
+    from robot_client.trace import Record
 
 log = logging.getLogger("robot_client")
 
@@ -43,6 +44,7 @@ def _run(argv: Sequence[str]) -> int:
 
 def _drive(config: RobotConfig) -> int:
     # Loaded after the flags are read: --help answers without compiling anything.
+    from robot_client.answers import Answers
     from robot_client.drive import Drive, OwnRecord
     from robot_client.offloader import Offloader
     from robot_client.references import References
@@ -118,7 +120,7 @@ def _say_absent(doing: str, absent: Mapping[str, str]) -> None:
         log.warning("%s without %s: %s; tasks run %s", doing, site, why, ONBOARD)
 
 
-def _metrics(config: RobotConfig) -> list[Callable[[Record], None]]:
+def _metrics(config: RobotConfig) -> "list[Callable[[Record], None]]":
     if config.metrics is None:
         return []
     from prometheus_client import CollectorRegistry

@@ -9,8 +9,8 @@ from robot_client import objectives, policies, predictors
 from robot_client.allowance import DUPLICATES, Allowance
 from robot_client.energy import Energy
 from robot_client.objectives import OBJECTIVES, Objective
-from robot_client.offloader import TIMEOUT_S, WINDOW
-from robot_client.runner import CLOUD, ONBOARD, check_endpoint
+from robot_client.runner import CLOUD, ONBOARD, TIMEOUT_S, check_endpoint
+from robot_client.window import WINDOW
 from robot_client.workload import ARRIVALS, CLOSED, parse_sizes
 
 MEAN = OBJECTIVES[0]

@@ -30,14 +30,13 @@ from robot_client.policies import PINNED, Decision, Forecast, Outlook, Policy
 from robot_client.predictors import Predictor
 from robot_client.race import Plan, Race, answer_of
 from robot_client.regret import RegretEstimate
-from robot_client.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution, Runner
+from robot_client.runner import CLOUD, ONBOARD, TIMEOUT_S, UNMEASURED, Condition, Execution, Runner
 from robot_client.store import Store
 from robot_client.trace import Late, Record
+from robot_client.window import WINDOW
 
 BOTH = "both"
-TIMEOUT_S = 2.0
 TIMEOUT_MAX_S = 24 * 3600.0
-WINDOW = 50
 POLL_S = 0.01
 LATE_MAX = 64  # executions that ended after their task, kept for the next record
 OVERDUE = 0.5  # of the time it took so far: what a task that should be done is taken to need still

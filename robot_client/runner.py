@@ -10,6 +10,7 @@ from common.tasks import Kind, Task
 
 ONBOARD = "onboard"
 CLOUD = "cloud"
+TIMEOUT_S = 2.0  # that a remote site has for a task, unless told
 PORT_MAX = 65_535
 
 _ENDPOINT = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5})")

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from common.errors import ConfigError
 
+WINDOW = 50  # N, unless told
 WINDOW_MAX = 1_000_000
 CANCELLATION_MAX = 1e-3  # sums are made anew when less than this share of their largest value is left
 

@@ -7,10 +7,12 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from common.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    import numpy as np
 
 CLOSED, CONSTANT, POISSON, BURSTS = "closed", "constant", "poisson", "bursts"
 ARRIVALS = (CLOSED, CONSTANT, POISSON, BURSTS)
@@ -48,7 +50,7 @@ def due_instants(arrivals: str, rate: float, burst: int, seed: int) -> Iterator[
         yield from (n // burst * burst / rate for n in itertools.count())
     else:
         assert arrivals == POISSON, arrivals
-        random, due_s = np.random.default_rng([seed, _DUE_STREAM]), 0.0
+        random, due_s = _stream(seed, _DUE_STREAM), 0.0
         while True:
             yield due_s
             due_s += float(random.exponential(1 / rate))
@@ -71,10 +73,16 @@ def sizes(phases: Sequence[Phase], seed: int) -> Iterator[float]:
 
     Each phase has a random stream of its own, so that changing one leaves the others as they are.
     """
-    draws = [_draws(phase, np.random.default_rng([seed, _SIZE_STREAM, n])) for n, phase in enumerate(phases)]
+    draws = [_draws(phase, _stream(seed, _SIZE_STREAM, n)) for n, phase in enumerate(phases)]
     lengths = [after.first - phase.first for phase, after in itertools.pairwise(phases)]
     parts = [itertools.islice(part, length) for part, length in zip(draws, lengths, strict=False)]
     return itertools.chain(*parts, draws[-1])
+
+
+def _stream(*key: int) -> "np.random.Generator":
+    import numpy as np  # where something is drawn: not for --help
+
+    return np.random.default_rng(key)
 
 
 def _phase(spec: str) -> Phase:
@@ -96,7 +104,7 @@ def _phase(spec: str) -> Phase:
     return Phase(first, shape, numbers)
 
 
-def _draws(phase: Phase, random: np.random.Generator) -> Iterator[float]:
+def _draws(phase: Phase, random: "np.random.Generator") -> Iterator[float]:
     if phase.file is not None:
         return itertools.cycle(_read_column(phase.file))
     if phase.shape == "constant":

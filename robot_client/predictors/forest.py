@@ -5,7 +5,8 @@ import math
 import numpy as np
 
 from common.errors import MissingExtra
-from robot_client.predictors.base import Column, Prediction, Refitted
+from robot_client.predictors.base import Prediction
+from robot_client.predictors.refitted import Column, Refitted
 
 try:
     from sklearn.ensemble import RandomForestRegressor

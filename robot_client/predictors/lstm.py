@@ -9,7 +9,8 @@ from itertools import islice
 import numpy as np
 
 from common.errors import MissingExtra
-from robot_client.predictors.base import SIZE_MIN, Column, Prediction, Refitted
+from robot_client.predictors.base import SIZE_MIN, Prediction
+from robot_client.predictors.refitted import Column, Refitted
 
 try:
     import torch

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.linalg import LinAlgError
 
 from common.errors import MissingExtra
-from robot_client.predictors.base import SIZE_MIN, Column, Prediction, Refitted
+from robot_client.predictors.base import SIZE_MIN, Prediction
+from robot_client.predictors.refitted import Column, Refitted
 
 try:
     from statsmodels.tsa.arima.model import ARIMA

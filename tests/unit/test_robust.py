@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from common.errors import ConfigError
 from robot_client.predictors import Predictor, make
-from robot_client.predictors.base import Column, Prediction
+from robot_client.predictors.base import Prediction
+from robot_client.predictors.refitted import Column
 from robot_client.predictors.robust import EPSILON, SAMPLE, Huber, TheilSen, huber_line, median
 from tests.checks import Row, teach
 

@@ -1,0 +1,62 @@
+"""The base of the predictors that fit a model to the whole window."""
+
+from collections import deque
+
+import numpy as np
+import numpy.typing as npt
+
+from robot_client.predictors.base import Prediction, check_observation
+from robot_client.window import checked_length
+
+Column = npt.NDArray[np.float64]
+
+
+class Refitted:
+    """Learns a window and fits it when asked.
+
+    A prediction fits anew where observations came since the last fit; with `refit_share` k, where at least
+    1/k as many came as that one was made on. A leaf has `_fit` and `_estimate`; `_follow` is for those that
+    keep step with each observation between two fits.
+    """
+
+    def __init__(self, window: int, refit_share: int | None = None) -> None:
+        self.window = checked_length(window)
+        self.refit_share = refit_share
+        self._observations: deque[tuple[float, float]] = deque(maxlen=window)
+        self._unfitted = 0  # observations since the last fit
+        self._refit_at = 0  # so many of them; 0: never fitted
+
+    @property
+    def full(self) -> bool:
+        return len(self._observations) == self.window
+
+    def __len__(self) -> int:
+        return len(self._observations)
+
+    def learn(self, size: float, seconds: float) -> None:
+        check_observation(size, seconds)
+        self._observations.append((size, seconds))
+        self._unfitted += 1
+        if self._refit_at:
+            self._follow(size, seconds)
+
+    def predict(self, size: float, ahead: int = 1) -> Prediction | None:
+        if not self._observations:
+            return None
+        if self._unfitted >= self._refit_at:
+            sizes, seconds = np.array(self._observations, dtype=np.float64).T.copy()
+            self._fit(sizes, seconds)
+            self._unfitted = 0
+            self._refit_at = max(1, len(sizes) // self.refit_share) if self.refit_share else 1
+        return self._estimate(size, ahead)
+
+    def _fit(self, sizes: Column, seconds: Column) -> None:
+        """Fit to the window, oldest first; it holds at least one observation."""
+        raise NotImplementedError
+
+    def _follow(self, size: float, seconds: float) -> None:
+        """Take in one observation without fitting."""
+
+    def _estimate(self, size: float, ahead: int) -> Prediction:
+        """The prediction of the model as fitted."""
+        raise NotImplementedError
