@@ -8,7 +8,7 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
-TABLES = ("planner", "decision", "wire", "start")
+TABLES = ("planner", "decision", "wire", "load", "start")
 
 
 def main() -> int:

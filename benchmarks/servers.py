@@ -50,6 +50,13 @@ def cloud_server(tasks: str = "benchmarks.tasks", **environ: str) -> Iterator[Se
         yield Server(endpoint, process.pid, time.perf_counter() - began)
 
 
+def serve(stack: contextlib.ExitStack, name: str) -> int:
+    """One of those below in a process of its own; its port."""
+    process = stack.enter_context(running([sys.executable, "-m", "benchmarks.servers", name]))
+    assert process.stdout is not None
+    return int(process.stdout.readline())
+
+
 def free_port() -> int:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         return int(taken.getsockname()[1])

@@ -2,7 +2,6 @@
 
 import contextlib
 import http.client
-import sys
 import time
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -12,10 +11,9 @@ import numpy as np
 import zmq
 
 from benchmarks.measure import Bar, Table, each_of
-from benchmarks.servers import READY_S, cloud_server, running
+from benchmarks.robots import request_frames
+from benchmarks.servers import READY_S, cloud_server, serve
 from benchmarks.tasks import length, nothing
-from common import wire
-from common.tasks import kind_of
 from robot_client.offloader import Offloader
 from robot_client.runner import CLOUD
 
@@ -32,7 +30,7 @@ def tables() -> list[Table]:
 def _empty(stack: contextlib.ExitStack) -> Table:
     missing: list[str] = []
     cases: dict[str, Callable[[int], object]] = {
-        "raw ZMQ echo of the same bytes": _echo(stack, _frames(nothing)),
+        "raw ZMQ echo of the same bytes": _echo(stack, request_frames(nothing)),
         "offboard": _ours(stack, nothing),
         "FastAPI, keep-alive": _http(stack),
     }
@@ -61,7 +59,7 @@ def _megabyte(stack: contextlib.ExitStack) -> Table:
     ]  # as blobs they would be known the next time
     raw_name = "raw ZMQ echo of the same bytes"
     seconds = each_of(
-        {raw_name: _echo(stack, _frames(length, array)), "offboard": _ours(stack, length, arrays)},
+        {raw_name: _echo(stack, request_frames(length, array)), "offboard": _ours(stack, length, arrays)},
         MEGABYTE_CALLS,
         rounds=9,
     )
@@ -74,17 +72,10 @@ def _rows(seconds: dict[str, float], raw: float) -> list[list[str]]:
     return [[name, f"{each * 1e6:.0f}", f"{each / raw:.2f}"] for name, each in seconds.items()]
 
 
-def _frames(function: Callable[..., Any], *args: Any) -> list[Any]:
-    """What the client sends for this call."""
-    kind = kind_of(function)
-    body = wire.encode(list(args), kind.types)
-    return list(wire.pack(wire.Request(1, kind.name, 1.0, 1, (), body.frames)))
-
-
 def _echo(stack: contextlib.ExitStack, frames: list[Any]) -> Callable[[int], None]:
     socket = stack.enter_context(zmq.Context.instance().socket(zmq.DEALER))
     socket.linger = 0
-    socket.connect(f"tcp://127.0.0.1:{_serve(stack, 'echo')}")
+    socket.connect(f"tcp://127.0.0.1:{serve(stack, 'echo')}")
 
     def call(count: int) -> None:
         for _ in range(count):
@@ -118,7 +109,7 @@ def _ours(
 
 
 def _http(stack: contextlib.ExitStack) -> Callable[[int], None]:
-    connection = http.client.HTTPConnection("127.0.0.1", _serve(stack, "http"))
+    connection = http.client.HTTPConnection("127.0.0.1", serve(stack, "http"))
     time.sleep(LISTENS_S)  # it says its port just before it listens
     stack.callback(connection.close)
 
@@ -133,7 +124,7 @@ def _http(stack: contextlib.ExitStack) -> Callable[[int], None]:
 def _grpc(stack: contextlib.ExitStack) -> Callable[[int], None]:
     import grpc
 
-    channel = stack.enter_context(grpc.insecure_channel(f"127.0.0.1:{_serve(stack, 'grpc')}"))
+    channel = stack.enter_context(grpc.insecure_channel(f"127.0.0.1:{serve(stack, 'grpc')}"))
     method = channel.unary_unary("/bench/nothing")
 
     def call(count: int) -> None:
@@ -179,9 +170,3 @@ def _dask(stack: contextlib.ExitStack) -> Callable[[int], None]:
             actor.nothing().result()
 
     return call
-
-
-def _serve(stack: contextlib.ExitStack, name: str) -> int:
-    process = stack.enter_context(running([sys.executable, "-m", "benchmarks.servers", name]))
-    assert process.stdout is not None
-    return int(process.stdout.readline())

@@ -1,14 +1,11 @@
-"""The ROUTER loop: takes requests from robots, hands them to the executor, sends the replies.
+"""The ROUTER loop: takes requests from robots and hands them to the executor, whose threads send the replies.
 
 It never computes and never waits for work; what runs the tasks is `executors`.
 """
 
-import contextlib
 import logging
 import os
-import socket
 import time
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
@@ -20,6 +17,7 @@ from cloud_server.metrics import Metrics, Status
 from cloud_server.waiting import Waiting, Work, held_bytes
 from common import VERSION, tasks
 from common.blobs import BlobStore, Buffer
+from common.channel import Channel
 from common.errors import ConfigError, OffloadError, ProtocolError
 from common.wire import (
     Blob,
@@ -48,7 +46,7 @@ log = logging.getLogger("cloud_server")
 
 
 class Server:
-    """One socket, one thread. `drain` and `status` may be called from others."""
+    """One socket, read by one thread. `drain` and `status` may be called from others."""
 
     def __init__(
         self,
@@ -71,7 +69,6 @@ class Server:
         self._drain_s = drain_s
         self._drain_until: float | None = None
         self._on_ready = on_ready
-        self._done: deque[tuple[Work, Future[Outcome]]] = deque()
         self._warming: Future[None] | None = None
         self._ready = self._was_ready = False
         self._started = self._last_turn = time.monotonic()
@@ -80,21 +77,21 @@ class Server:
         self._context = zmq.Context()
         self._socket = _bind(self._context, listen, message_bytes_max)
         self.endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
-        self._wake_in, self._wake_out = socket.socketpair()
-        self._wake_in.setblocking(False)
-        self._wake_out.setblocking(False)
+        self._channel = Channel(self._socket)
+        self._closed = False
+        metrics.queue_depth.set_function(lambda: len(self._waiting))
+        metrics.running.set_function(lambda: len(self._running))
+        metrics.blob_bytes.set_function(lambda: self._blobs.byte_count)
 
     def run(self) -> bool:
         """Serve until drained; True when everything that was accepted has been answered."""
-        poller = zmq.Poller()
-        poller.register(self._socket, zmq.POLLIN)
-        poller.register(self._wake_out.fileno(), zmq.POLLIN)
         try:
             self._turn()
             while not self._over():
-                poller.poll(int(POLL_S * 1000))
+                self._channel.wait(POLL_S)
                 self._turn()
-            return self._give_up_rest() == 0
+            with self._channel.lock:
+                return self._give_up_rest() == 0
         finally:
             self._close()
 
@@ -102,7 +99,7 @@ class Server:
         """Take no new requests, answer the accepted ones, then let `run` return."""
         if self._drain_until is None:
             self._drain_until = time.monotonic() + self._drain_s
-        self._wake()
+        self._channel.wake()
 
     def status(self) -> Status:
         now = time.monotonic()
@@ -117,21 +114,15 @@ class Server:
         )
 
     def _turn(self) -> None:
-        now = self._last_turn = time.monotonic()
-        with contextlib.suppress(BlockingIOError):
-            self._wake_out.recv(4096)
-        self._tend_executor(now)
-        while self._done:
-            self._answer(*self._done.popleft())
-        for _ in range(RECEIVE_MAX):
-            if not self._receive():
-                break
-        for work in self._waiting.take(lambda work: work.expired(self._last_turn)):
-            self._refuse(work.peer, work.request, "expired", queue_s=now - work.arrived)
-        self._dispatch()
-        self.metrics.queue_depth.set(len(self._waiting))
-        self.metrics.running.set(len(self._running))
-        self.metrics.blob_bytes.set(self._blobs.byte_count)
+        with self._channel.lock:
+            now = self._last_turn = time.monotonic()
+            self._tend_executor(now)
+            for _ in range(RECEIVE_MAX):
+                if not self._receive():
+                    break
+            for work in self._waiting.take(lambda work: work.expired(self._last_turn)):
+                self._refuse(work.peer, work.request, "expired", queue_s=now - work.arrived)
+            self._dispatch()
 
     def _tend_executor(self, now: float) -> None:
         """Start the executor, or start it again when its workers died; notice when it is warm."""
@@ -145,7 +136,7 @@ class Server:
         elif not self._ready and now - self._last_start >= RESTART_PAUSE_S:
             self._last_start = now
             self._warming = self._executor.warm()
-            self._warming.add_done_callback(lambda _: self._wake())
+            self._warming.add_done_callback(lambda _: self._channel.wake())
 
     def _warmed(self, warming: "Future[None]") -> None:
         self._warming = None
@@ -160,10 +151,10 @@ class Server:
 
     def _receive(self) -> bool:
         """Take one message, if there is one."""
-        try:
-            peer, *raw = self._socket.recv_multipart(zmq.DONTWAIT, copy=False)
-        except zmq.Again:
+        message = self._channel.receive()
+        if message is None:
             return False
+        peer, *raw = message
         frames: list[Buffer] = [f.buffer if len(f) > COPIED_BYTES_MAX else f.bytes for f in raw]
         size = byte_count(frames)
         self.metrics.bytes_in.inc(size)
@@ -246,21 +237,23 @@ class Server:
         future.add_done_callback(lambda done: self._finished(work, done))
 
     def _finished(self, work: Work, future: "Future[Outcome]") -> None:
-        """Called in a worker's thread."""
-        self._done.append((work, future))
-        self._wake()
+        """Called in a worker's thread: the reply need not wait for the loop."""
+        with self._channel.lock:
+            if self._closed or future.cancelled():
+                return
+            self._answer(work, future.result())
+            loop_has_work = self._waiting or self._drain_until is not None
+        if loop_has_work:
+            self._channel.wake()
 
-    def _answer(self, work: Work, future: "Future[Outcome]") -> None:
+    def _answer(self, work: Work, outcome: Outcome) -> None:
         self._running.discard(work)
         self._last_task = time.monotonic()
-        outcome, request = future.result(), work.request
+        request = work.request
         size = byte_count(outcome.frames)
         if size > self._message_bytes_max:
             error = f"BadValue: the result takes {size} bytes, at most {self._message_bytes_max} are allowed"
             outcome = replace(outcome, status="failed", error=error, frames=[], server_fault=True)
-        self.metrics.queue_s.labels(request.kind).observe(work.queue_s)
-        self.metrics.run_s.labels(request.kind).observe(outcome.run_s)
-        self._count(request, outcome.status if work.wanted else "cancelled")
         if work.wanted:
             self._send(
                 work.peer,
@@ -276,6 +269,9 @@ class Server:
                     cpu_s=outcome.cpu_s,
                 ),
             )
+        self._count(request, outcome.status if work.wanted else "cancelled")
+        self.metrics.queue_s.labels(request.kind).observe(work.queue_s)
+        self.metrics.run_s.labels(request.kind).observe(outcome.run_s)
 
     def _cancel(self, peer: bytes, id: int) -> None:
         for work in self._waiting.take(lambda work: work.peer == peer and work.request.id == id):
@@ -313,7 +309,7 @@ class Server:
         """Send or drop, never wait: the robot may be gone, or not reading."""
         frames = pack(message)
         try:
-            self._socket.send_multipart([peer, *frames], zmq.DONTWAIT, copy=False)
+            self._channel.send([peer, *frames])
             self.metrics.bytes_out.inc(byte_count(frames))
         except zmq.Again:
             self.metrics.dropped.labels("not reading").inc()
@@ -328,14 +324,10 @@ class Server:
             self._last_warning = self._last_turn
             log.warning("dropped a message: %s (more within %g s are only counted)", error, LOG_PAUSE_S)
 
-    def _wake(self) -> None:
-        with contextlib.suppress(OSError):  # full: a wake is due already; closed: nobody waits
-            self._wake_in.send(b"\0")
-
     def _over(self) -> bool:
         if self._drain_until is None:
             return False
-        idle = not self._waiting and not self._running and not self._done
+        idle = not self._waiting and not self._running
         return idle or time.monotonic() >= self._drain_until
 
     def _give_up_rest(self) -> int:
@@ -348,10 +340,11 @@ class Server:
 
     def _close(self) -> None:
         self._executor.close()
-        self._socket.close(linger=int(SEND_LAST_S * 1000))
+        with self._channel.lock:
+            self._closed = True
+            self._socket.close(linger=int(SEND_LAST_S * 1000))
         self._context.term()
-        self._wake_in.close()
-        self._wake_out.close()
+        self._channel.close()
 
 
 def _bind(

@@ -1,12 +1,9 @@
-"""The runner of a remote site: one DEALER socket, owned by one I/O thread.
+"""The runner of a remote site: one DEALER socket, read by one I/O thread; whoever asks sends himself.
 
 Answers are matched by id; whatever arrives late is dropped. What a message looks like is `common.wire`.
 """
 
-import contextlib
 import logging
-import math
-import socket
 import threading
 import time
 from collections import deque
@@ -20,6 +17,7 @@ import zmq.utils.monitor
 
 from common import VERSION as SOFTWARE
 from common import wire
+from common.channel import Channel
 from common.errors import (
     BadValue,
     CloudBroken,
@@ -85,11 +83,10 @@ class CloudRunner:
         self._message_bytes_max = MESSAGE_BYTES_MAX  # what the server takes, once it said so
         self._told: set[str] = set()
         self._pending: dict[int, _Pending] = {}
-        self._inbox: deque[_Pending] = deque()
         self._unwanted: deque[int] = deque()
         self._asked = False  # to find out whether the server is there
-        self._waker, self._wake = _wake_pair()
         self._closing = False
+        self._wakes_s = 0.0  # when the I/O thread looks again, whatever happens
         self._hello_due = float("inf")
         self._messages = 0
         self._uploads: dict[bytes, int] = {}  # number of the message that last carried the blob
@@ -99,6 +96,7 @@ class CloudRunner:
         except zmq.ZMQError as error:
             self._context.destroy(linger=0)
             raise ConfigError(f"{site}: endpoint {endpoint!r}: {error}") from error
+        self._channel = Channel(self._socket, self._monitor.FD)
         self._thread = threading.Thread(target=self._run, name=f"site-{site}", daemon=True)
         self._thread.start()
 
@@ -127,30 +125,34 @@ class CloudRunner:
         if largest > self._message_bytes_max - wire.HEADER_BYTES_MAX:
             failure = f"{largest} bytes of arguments; the server takes messages of {self._message_bytes_max}"
             return self._refused(CloudBroken(failure))
-        if len(self._pending) + len(self._inbox) >= PENDING_MAX:
+        if len(self._pending) >= PENDING_MAX:
             return self._refused(CloudBusy(f"{PENDING_MAX} tasks are in flight"))
         request = wire.Request(task.id, task.kind.name, budget_s, 1, tuple(body.blobs), body.frames)
         pending = _Pending(task, request, body.blobs, published, published + budget_s)
-        self._inbox.append(pending)
-        self._wake_up()
-        if self._closing:
-            pending.future.cancel()
+        with self._channel.lock:
+            if self._closing:
+                pending.future.cancel()
+                return pending.future
+            self._pending[task.id] = pending
+            self._send_request(pending, request)
+            if pending.deadline < self._wakes_s:
+                self._channel.wake()
         return pending.future
 
     def cancel(self, task: Task) -> None:
         self._unwanted.append(task.id)
-        self._wake_up()
+        self._channel.wake()
 
     def hurry(self) -> None:
         self._asked = True
-        self._wake_up()
+        self._channel.wake()
 
     def condition(self) -> Condition:
         return self._heartbeat.condition(time.perf_counter())
 
     def close(self) -> None:
         self._closing = True
-        self._wake_up()
+        self._channel.wake()
         self._thread.join(CLOSE_WAIT_S)
 
     def _refused(self, failure: OffloadError) -> "Future[Execution]":
@@ -158,11 +160,7 @@ class CloudRunner:
         future.set_result(Execution(self.site, 0.0, failure=failure, started=False))
         return future
 
-    def _wake_up(self) -> None:
-        with contextlib.suppress(OSError):  # full: it is awake already; closed: there is nobody to wake
-            self._waker.send(b"\0")
-
-    # What follows runs in the I/O thread only.
+    # What follows runs in the I/O thread only, but for sending a request.
 
     def _run(self) -> None:
         try:
@@ -171,33 +169,22 @@ class CloudRunner:
             self._shut_down()
 
     def _loop(self) -> None:
-        poller = zmq.Poller()
-        for readable in (self._socket, self._monitor, self._wake):
-            poller.register(readable, zmq.POLLIN)
         while not self._closing:
-            ready = dict(poller.poll(math.ceil(self._wait_s() * 1e3)))
-            if self._wake.fileno() in ready:
-                self._wake.recv(4096)
-            if self._monitor in ready:
-                self._watch_connection()
-            if self._socket in ready:
+            self._channel.wait(self._wait_s())
+            with self._channel.lock:
                 self._receive_all()
-            while self._inbox:
-                self._send_first(self._inbox.popleft())
-            while self._unwanted:
-                self._give_up(self._unwanted.popleft())
-            self._expire()
-            self._beat()
+                self._watch_connection()
+                while self._unwanted:
+                    self._give_up(self._unwanted.popleft())
+                self._expire()
+                self._beat()
 
     def _wait_s(self) -> float:
-        due = min(
-            [
-                self._hello_due,
-                self._heartbeat.due_s,
-                *(pending.deadline for pending in self._pending.values()),
-            ]
-        )
-        return min(max(0.0, due - time.perf_counter()), IDLE_WAIT_S)
+        now_s = time.perf_counter()
+        with self._channel.lock:
+            due = [pending.deadline for pending in self._pending.values()]
+            self._wakes_s = min([now_s + IDLE_WAIT_S, self._hello_due, self._heartbeat.due_s, *due])
+            return self._wakes_s - now_s
 
     def _watch_connection(self) -> None:
         while self._monitor.poll(0):
@@ -234,12 +221,6 @@ class CloudRunner:
             self._finish(request_id, Overtaken("another site answered first"), censored=True)
             self._heartbeat.hurry(time.perf_counter())
 
-    def _send_first(self, pending: _Pending) -> None:
-        if not pending.future.set_running_or_notify_cancel():
-            return
-        self._pending[pending.task.id] = pending
-        self._send_request(pending, pending.request)
-
     def _send_request(self, pending: _Pending, request: wire.Request) -> None:
         left_s = pending.deadline - time.perf_counter()
         if left_s > 0:
@@ -253,18 +234,14 @@ class CloudRunner:
         """Bytes handed over; 0 where there is no connection or its queue is full."""
         frames = wire.pack(message)
         try:
-            self._socket.send_multipart(frames, zmq.DONTWAIT, copy=False)
+            self._channel.send(frames)
         except zmq.Again:
             return 0
         self._messages += 1
         return wire.byte_count(frames)
 
     def _receive_all(self) -> None:
-        while True:
-            try:
-                frames = self._socket.recv_multipart(zmq.DONTWAIT, copy=False)
-            except zmq.Again:
-                return
+        while frames := self._channel.receive():
             received = time.perf_counter()
             buffers = [frame.buffer for frame in frames]
             try:
@@ -362,14 +339,13 @@ class CloudRunner:
 
     def _shut_down(self) -> None:
         self._absent = "closed"
-        while self._inbox:
-            self._inbox.popleft().future.cancel()
-        for request_id in list(self._pending):
-            self._finish(request_id, CloudBroken("closed while the task was in flight"))
-        self._socket.disable_monitor()
-        self._context.destroy(linger=0)
-        self._wake.close()
-        self._waker.close()
+        with self._channel.lock:
+            self._closing = True
+            for request_id in list(self._pending):
+                self._finish(request_id, CloudBroken("closed while the task was in flight"))
+            self._socket.disable_monitor()
+            self._context.destroy(linger=0)
+            self._channel.close()
 
 
 _FAILURES: dict[str, Callable[[str], OffloadError]] = {
@@ -403,10 +379,3 @@ def _connect(context: "zmq.Context[Any]", endpoint: str) -> tuple["zmq.Socket[by
     monitor = dealer.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED)
     dealer.connect(endpoint)
     return dealer, monitor
-
-
-def _wake_pair() -> tuple[socket.socket, socket.socket]:
-    waker, wake = socket.socketpair()
-    waker.setblocking(False)
-    wake.setblocking(False)
-    return waker, wake

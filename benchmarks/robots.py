@@ -1,0 +1,83 @@
+"""Robots that ask for empty tasks as fast as they are answered.
+
+`python -m benchmarks.robots raw|client ENDPOINT ROBOTS TASKS IN_FLIGHT` says when all are connected, begins
+when it gets a line, and says how many seconds all tasks took and how many answers were wrong.
+"""
+
+import sys
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import zmq
+
+from benchmarks.servers import READY_S
+from benchmarks.tasks import nothing
+from common import wire
+from common.tasks import Task, kind_of
+from robot_client.cloud import CloudRunner
+
+BUDGET_S = 60.0
+
+
+def main() -> None:
+    way, endpoint, *numbers = sys.argv[1:]
+    robots, tasks, in_flight = (int(number) for number in numbers)
+    start = {"raw": raw, "client": client}[way]
+    ask = [start(endpoint) for _ in range(robots)]
+    wrong = sum(not one()() for one in ask)
+    print("ready", flush=True)
+    sys.stdin.readline()
+    began, asked = time.perf_counter(), deque[Callable[[], bool]]()
+    for n in range(tasks):
+        if len(asked) == in_flight:
+            wrong += not asked.popleft()()
+        asked.append(ask[n % robots]())
+    wrong += sum(not answered() for answered in asked)
+    print(time.perf_counter() - began, wrong, flush=True)
+
+
+def raw(endpoint: str) -> Callable[[], Callable[[], bool]]:
+    """A DEALER that sends the bytes of a request; an echo of them is an answer too."""
+    socket = zmq.Context.instance().socket(zmq.DEALER)
+    socket.linger = 0
+    socket.connect(endpoint)
+    frames = request_frames(nothing, budget_s=BUDGET_S)
+
+    def answered() -> bool:
+        if not socket.poll(BUDGET_S * 1e3):
+            return False
+        message = wire.unpack([frame.buffer for frame in socket.recv_multipart(copy=False)])
+        return not isinstance(message, wire.Reply) or message.status == "ok"
+
+    def ask() -> Callable[[], bool]:
+        socket.send_multipart(frames, copy=False)
+        return answered
+
+    return ask
+
+
+def client(endpoint: str) -> Callable[[], Callable[[], bool]]:
+    """Ours."""
+    runner, kind = CloudRunner(endpoint), kind_of(nothing)
+    until = time.monotonic() + READY_S
+    while runner.unavailable(kind) and time.monotonic() < until:
+        time.sleep(0.01)
+
+    def ask() -> Callable[[], bool]:
+        answer = runner.submit(Task(kind, (), 0.0), BUDGET_S)
+        return lambda: answer.result().ok
+
+    return ask
+
+
+def request_frames(function: Callable[..., Any], *args: Any, budget_s: float = 1.0) -> list[Any]:
+    """What the client sends for this call."""
+    kind = kind_of(function)
+    body = wire.encode(list(args), kind.types)
+    return list(wire.pack(wire.Request(1, kind.name, budget_s, 1, (), body.frames)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""A ZMQ socket that one thread reads and any thread sends on.
+
+A socket may be used by several threads, one after the other, where a lock is between them. The reader must
+then not wait inside the socket: it waits for the descriptor by which libzmq signals.
+"""
+
+import contextlib
+import select
+import socket
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+import zmq
+
+WAKE_BYTES = 4096  # taken at once of the pair by which the reader is woken
+
+
+class Channel:
+    """`lock` is held while the socket is used; whoever needs more to be of one piece may hold it longer.
+
+    `watched`: further descriptors for which `wait` returns. The owner closes the socket.
+    """
+
+    def __init__(self, of: "zmq.Socket[bytes]", *watched: int) -> None:
+        self.lock = threading.RLock()
+        self._socket = of
+        self._waker, self._woken = socket.socketpair()
+        self._waker.setblocking(False)
+        self._woken.setblocking(False)
+        self._poll = select.poll()
+        for readable in (of.FD, self._woken.fileno(), *watched):
+            self._poll.register(readable, select.POLLIN)
+
+    def send(self, frames: Sequence[Any]) -> None:
+        """Never waits: zmq.Again where the queue is full."""
+        with self.lock:
+            self._socket.send_multipart(frames, zmq.DONTWAIT, copy=False)
+            # The signal is given once, for all that happened before: sending may have taken it.
+            if self._readable:
+                self.wake()
+
+    def receive(self) -> "list[zmq.Frame] | None":
+        """The next message; None where there is none. For the reader."""
+        with self.lock:
+            if self._readable:
+                with contextlib.suppress(zmq.Again):
+                    return self._socket.recv_multipart(zmq.DONTWAIT, copy=False)
+        return None
+
+    def wait(self, timeout_s: float) -> None:
+        """Until there is something to read, or `wake` was called. For the reader."""
+        with self.lock:
+            if self._readable:
+                return
+        ready = self._poll.poll(max(0.0, timeout_s) * 1e3)
+        if any(descriptor == self._woken.fileno() for descriptor, _ in ready):
+            self._woken.recv(WAKE_BYTES)
+
+    def wake(self) -> None:
+        """Make `wait` return, the next one if none is under way. Any thread, any time."""
+        with contextlib.suppress(OSError):  # full: it is awake already; closed: there is nobody to wake
+            self._waker.send(b"\0")
+
+    def close(self) -> None:
+        """What `wake` needs; not the socket."""
+        self._waker.close()
+        self._woken.close()
+
+    @property
+    def _readable(self) -> bool:
+        return bool(int(self._socket.EVENTS) & zmq.POLLIN)
