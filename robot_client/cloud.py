@@ -6,7 +6,7 @@ Answers are matched by id; whatever arrives late is dropped. What a message look
 import logging
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
@@ -45,6 +45,7 @@ RECONNECT_MS, RECONNECT_MAX_MS = 100, 1000
 UNACKNOWLEDGED_MS = 15_000
 KEEPALIVE_IDLE_S, KEEPALIVE_EVERY_S, KEEPALIVE_PROBES = 10, 5, 2
 UPLOADS_KEPT = 1024  # digests remembered of one connection
+PUSH_AFTER = 2  # tasks of a kind in a row, each with a blob that is new to the server: then they go unasked
 CLOSE_WAIT_S = 2.0
 IDLE_WAIT_S = 1.0
 
@@ -63,6 +64,7 @@ class _Pending:
     future: "Future[Execution]" = field(default_factory=Future)
     bytes_out: int = 0
     sent_as: int = 0  # number of the last message it was sent in
+    asks: bool = False  # whether the server has a blob of it is not known
 
 
 class CloudRunner:
@@ -90,6 +92,7 @@ class CloudRunner:
         self._hello_due = float("inf")
         self._messages = 0
         self._uploads: dict[bytes, int] = {}  # number of the message that last carried the blob
+        self._in_vain: Counter[str] = Counter()  # tasks of a kind in a row with new blobs
         self._context = zmq.Context()
         try:
             self._socket, self._monitor = _connect(self._context, endpoint)
@@ -134,7 +137,7 @@ class CloudRunner:
                 pending.future.cancel()
                 return pending.future
             self._pending[task.id] = pending
-            self._send_request(pending, request)
+            self._send_first(pending)
             if pending.deadline < self._wakes_s:
                 self._channel.wake()
         return pending.future
@@ -221,6 +224,17 @@ class CloudRunner:
             self._finish(request_id, Overtaken("another site answered first"), censored=True)
             self._heartbeat.hurry(time.perf_counter())
 
+    def _send_first(self, pending: _Pending) -> None:
+        """Blobs that the server may have are only named, unless those of this kind are always new."""
+        unknown = [digest for digest in pending.blobs if digest not in self._uploads]
+        if unknown and self._in_vain[pending.request.kind] >= PUSH_AFTER:
+            self._upload(pending, unknown)
+        elif unknown:
+            pending.asks = True
+        elif pending.blobs:
+            self._in_vain[pending.request.kind] = 0
+        self._send_request(pending, pending.request)
+
     def _send_request(self, pending: _Pending, request: wire.Request) -> None:
         left_s = pending.deadline - time.perf_counter()
         if left_s > 0:
@@ -278,17 +292,24 @@ class CloudRunner:
             self._finish(pending.task.id, CloudBroken("the server keeps losing the blobs"), started=False)
             return
         pending.request = request
-        for digest in missing:
-            # Another task may have brought it since this one was sent; messages keep their order.
-            if self._uploads.get(digest, 0) <= pending.sent_as:
-                pending.bytes_out += self._send(wire.Blob(pending.blobs[digest]))
-                self._uploads[digest] = self._messages
-                if len(self._uploads) > UPLOADS_KEPT:
-                    del self._uploads[next(iter(self._uploads))]
+        if pending.asks:
+            self._in_vain[request.kind] += 1
+            pending.asks = False
+        # Another task may have brought one since this one was sent; messages keep their order.
+        self._upload(pending, [one for one in missing if self._uploads.get(one, 0) <= pending.sent_as])
         self._send_request(pending, request)
+
+    def _upload(self, pending: _Pending, digests: Iterable[bytes]) -> None:
+        for digest in digests:
+            pending.bytes_out += self._send(wire.Blob(pending.blobs[digest]))
+            self._uploads[digest] = self._messages
+            if len(self._uploads) > UPLOADS_KEPT:
+                del self._uploads[next(iter(self._uploads))]
 
     def _finish_reply(self, pending: _Pending, reply: wire.Reply, received: float, bytes_in: int) -> None:
         value, failure = None, _failure(reply)
+        if pending.asks and reply.status in ("ok", "failed"):
+            self._in_vain[pending.request.kind] = 0
         if failure is None:
             try:
                 value = wire.decode(reply.body, pending.task.kind.types, {})
