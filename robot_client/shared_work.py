@@ -3,12 +3,12 @@
 What the unit of work is, a kind says itself (`@task(work=...)`); the times of a site are learnt per work.
 """
 
-import math
 from bisect import bisect_left, insort
 from collections import deque
 
 PAIRS_MAX = 200  # (size, work) remembered
 ODD = 3.0  # times the median of those near: more work than this counts as so much
+ROUNDING = 1e-12  # of the squares of what sizes differ by: less is all of one size
 NEAR = 20  # of them, those nearest in size: the line through them tells
 
 
@@ -37,12 +37,15 @@ class SharedWork:
             return None
         first = max(0, min(bisect_left(self._sorted, (size,)) - NEAR // 2, count - NEAR))
         near = self._sorted[first : first + NEAR]
-        sizes = [one for one, _ in near]
         most = ODD * sorted([work for _, work in near])[len(near) // 2]
-        works = [min(work, most) for _, work in near]
-        mean_size, mean_work = math.fsum(sizes) / len(near), math.fsum(works) / len(near)
-        sdd = math.fsum([(one - mean_size) ** 2 for one in sizes])
-        if not sdd:
-            return mean_work
-        slope = math.fsum([(d - mean_size) * w for d, w in zip(sizes, works, strict=True)]) / sdd
-        return max(0.0, mean_work + slope * (size - mean_size))
+        sx = sxx = sw = sxw = 0.0
+        for one, work in near:
+            x, w = one - size, min(work, most)
+            sx += x
+            sxx += x * x
+            sw += w
+            sxw += x * w
+        spread = len(near) * sxx - sx * sx
+        if spread <= ROUNDING * len(near) * sxx:
+            return sw / len(near)
+        return max(0.0, (sw * sxx - sx * sxw) / spread)  # the line at x = 0

@@ -1,7 +1,7 @@
 """The trace: one JSON line a task, what was predicted, decided and seen."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from robot_client import lines
 from robot_client.lines import VERSION, Lines
 from robot_client.policies import Decision, Outlook
 from robot_client.regret import Regret
-from robot_client.runner import UNMEASURED, Execution
+from robot_client.runner import UNMEASURED, Condition, Execution
 
 _FIELDS = (
     "v",
@@ -76,6 +76,11 @@ class Record:
     started_at: datetime = field(default_factory=lambda: datetime.now(UTC))
 
 
+_CONDITION_FIELDS, _DECISION_FIELDS, _LATE_FIELDS, _REGRET_FIELDS = (
+    tuple(one.name for one in fields(of)) for of in (Condition, Decision, Late, Regret)
+)
+
+
 class Trace(Lines):
     """Appends records to a file, unbuffered; a line that cannot be written is logged and tasks go on."""
 
@@ -106,13 +111,13 @@ def as_dict(record: Record) -> dict[str, Any]:
         "started_at": record.started_at.isoformat(timespec="milliseconds"),
         "size": record.size,
         "features": features(record),
-        "sites": {site: _outlook(outlook) for site, outlook in record.sites.items()},
-        "decision": asdict(record.decision),
-        "executions": [{name: getattr(one, name) for name in _EXECUTION_FIELDS} for one in record.executions],
+        "sites": {site: _values(outlook, _OUTLOOK_FIELDS) for site, outlook in record.sites.items()},
+        "decision": _values(record.decision, _DECISION_FIELDS),
+        "executions": [_values(one, _EXECUTION_FIELDS) for one in record.executions],
         "used": record.used,
         "waited_s": record.waited_s,
-        "late": [asdict(one) for one in record.late],
-        "regret": asdict(record.regret) if record.regret else None,
+        "late": [_values(one, _LATE_FIELDS) for one in record.late],
+        "regret": _values(record.regret, _REGRET_FIELDS) if record.regret else None,
     }
 
 
@@ -123,8 +128,9 @@ def features(record: Record) -> dict[str, float]:
         found["work"] = record.amount
     for site, outlook in record.sites.items():
         if outlook.condition is not UNMEASURED:
-            given = asdict(outlook.condition)
-            found |= {f"{site}.{name}": value for name, value in given.items() if value is not None}
+            for name, value in _values(outlook.condition, _CONDITION_FIELDS).items():
+                if value is not None:
+                    found[f"{site}.{name}"] = value
     return found
 
 
@@ -133,5 +139,5 @@ def read(path: Path) -> Iterator[dict[str, Any]]:
     return lines.read(path, _FIELDS)
 
 
-def _outlook(outlook: Outlook) -> dict[str, Any]:
-    return {name: getattr(outlook, name) for name in _OUTLOOK_FIELDS}
+def _values(of: object, names: tuple[str, ...]) -> dict[str, Any]:
+    return {name: getattr(of, name) for name in names}

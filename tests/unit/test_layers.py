@@ -16,7 +16,7 @@ ROOMS = {
 }
 # Heavy or optional libraries, and the files that may import them.
 OWNERS = {
-    "zmq": {"robot_client/cloud.py", "cloud_server/server.py"},
+    "zmq": {"common/channel.py", "robot_client/cloud.py", "cloud_server/server.py"},
     "fastapi": {"cloud_server/web.py", "loadgen/relay/control.py", "loadgen/relay/toxiproxy.py"},
     "uvicorn": {"cloud_server/web.py", "loadgen/relay/control.py"},
     "docker": {"loadgen/containers.py"},
@@ -79,8 +79,8 @@ def test_the_robot_library_needs_no_extra() -> None:
 
 @pytest.mark.parametrize("command", ["robot_client", "cloud_server", "loadgen"])
 def test_help_loads_no_heavy_library(command: str) -> None:
-    """--help answers with exit code 0 without importing zmq, numba, fastapi or what learns."""
-    heavy = ("zmq", "numba", "fastapi", "sklearn", "statsmodels", "river", "torch", "scipy")
+    """--help answers with exit code 0 without importing numpy, zmq, numba, fastapi or what learns."""
+    heavy = ("numpy", "zmq", "numba", "fastapi", "sklearn", "statsmodels", "river", "torch", "scipy")
     probe = (
         "import runpy, sys\n"
         f"sys.argv = [{command!r}, '--help']\n"
