@@ -1,9 +1,11 @@
-"""What an offloader holds does not grow with the tasks that it has run."""
+"""What an offloader costs, counted: it holds no more the more tasks it has run, and calls few functions."""
 
 import gc
+import sys
 import tracemalloc
 from concurrent.futures import Future
 from random import Random
+from types import FrameType
 
 import pytest
 
@@ -14,6 +16,7 @@ from robot_client.offloader import Offloader
 from robot_client.runner import CLOUD, ONBOARD, Execution
 
 GROWTH_BYTES = 20_000  # of a few megabytes: dictionaries that are made anew, caches of small numbers
+CALLS_MAX = {"paper": 190, policies.DEFAULT: 290}
 
 
 @task("footed", size=lambda size: size, work=lambda size: size)
@@ -35,18 +38,22 @@ class Forgetful(AtOnce):
         return future
 
 
-@pytest.mark.timeout(30)  # traced, it takes some seconds
-@pytest.mark.parametrize("policy", ["paper", policies.DEFAULT])
-def test_memory_does_not_grow_with_the_tasks(policy: str) -> None:
-    """After 4,000 tasks as much is held as after 1,500."""
+def offloader(policy: str) -> Offloader:
     name = policies.predictor_of(policy)
-    random, held = Random(1), []
-    with Offloader(
+    return Offloader(
         [Forgetful(ONBOARD), Forgetful(CLOUD)],
         policy=policies.make(policy),
         predictor=lambda: predictors.make(name.removeprefix(predictors.WORK), 50),
         shared_work=name.startswith(predictors.WORK),
-    ) as offload:
+    )
+
+
+@pytest.mark.timeout(30)  # traced, it takes some seconds
+@pytest.mark.parametrize("policy", ["paper", policies.DEFAULT])
+def test_memory_does_not_grow_with_the_tasks(policy: str) -> None:
+    """After 4,000 tasks as much is held as after 1,500."""
+    random, held = Random(1), []
+    with offloader(policy) as offload:
         tracemalloc.start()
         for count in (1_500, 2_500):
             for _ in range(count):
@@ -56,3 +63,23 @@ def test_memory_does_not_grow_with_the_tasks(policy: str) -> None:
         tracemalloc.stop()
     print(held)
     assert held[1] - held[0] < GROWTH_BYTES, held
+
+
+@pytest.mark.parametrize(("policy", "calls_max"), CALLS_MAX.items())
+def test_a_task_is_few_calls(policy: str, calls_max: int) -> None:
+    """So many Python functions are called from a task to its answer, whatever is known by then."""
+    random, calls = Random(1), 0
+
+    def count(_frame: FrameType, event: str, _argument: object) -> None:
+        nonlocal calls
+        calls += event == "call"
+
+    with offloader(policy) as offload:
+        for _ in range(300):
+            offload(footed, random.uniform(1, 5))
+        sys.setprofile(count)
+        for _ in range(200):
+            offload(footed, random.uniform(1, 5))
+        sys.setprofile(None)
+    print(calls / 200)
+    assert calls / 200 <= calls_max

@@ -1,0 +1,56 @@
+"""What an empty task costs, counted: how long that takes is for `make bench`."""
+
+from collections import Counter
+from threading import Thread
+
+import pytest
+
+from cloud_server.executors import Threads
+from cloud_server.metrics import Metrics
+from cloud_server.server import Server
+from common.channel import Channel
+from common.tasks import task
+from robot_client.offloader import Offloader
+
+pytestmark = pytest.mark.integration
+
+TASKS = 300
+WAIT_S = 8.0
+
+
+@task("costs_nothing", size=lambda: 0.0)
+def costs_nothing() -> None:
+    pass
+
+
+def test_an_empty_task_is_two_messages_and_wakes_nobody_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One request, one reply, each sent by the thread that has it: readers are hardly ever woken beside."""
+    counted: Counter[str] = Counter()
+    send, wake = Channel.send, Channel.wake
+
+    def counted_send(channel: Channel, frames: list[bytes]) -> None:
+        counted["sent"] += 1
+        send(channel, frames)
+
+    def counted_wake(channel: Channel) -> None:
+        counted["woken"] += 1
+        wake(channel)
+
+    monkeypatch.setattr(Channel, "send", counted_send)
+    monkeypatch.setattr(Channel, "wake", counted_wake)
+    server = Server(
+        "tcp://127.0.0.1:0", Threads(1), Metrics(),
+        queue_max=8, blob_bytes_max=2**20, message_bytes_max=2**20, drain_s=1.0,
+    )  # fmt: skip
+    thread = Thread(target=server.run)
+    thread.start()
+    with Offloader.connect(server.endpoint, policy="cloud") as offload:
+        assert not offload.wait_for_sites(costs_nothing, WAIT_S)
+        counted.clear()
+        for _ in range(TASKS):
+            offload(costs_nothing)
+        found = dict(counted)
+    server.drain()
+    thread.join(WAIT_S)
+    assert found["sent"] == 2 * TASKS
+    assert found.get("woken", 0) <= 0.1 * TASKS
