@@ -4,6 +4,7 @@ What the frames travel in is `common.wire`.
 """
 
 import dataclasses
+import functools
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -30,6 +31,7 @@ ARRAYS_MAX = 1000  # arrays sent beside one value
 BLOBS_MAX = 64  # blobs one value may refer to
 NESTING_MAX = 32
 DIMENSIONS_MAX = 8
+TYPES_MAX = 256  # dataclasses whose fields are remembered
 
 _IN_FRAME, _IN_BLOB, _DATACLASS = 1, 2, 3
 _SCALARS = {type(None), bool, int, float, str}
@@ -108,9 +110,12 @@ class _Encoder:
         if kind is list or kind is tuple:
             if set(map(type, value)) <= _SCALARS:
                 return value
-            return [self._tree(item, depth + 1) for item in value]
+            return [one if type(one) in _SCALARS else self._tree(one, depth + 1) for one in value]
         if kind is dict:
-            return {self._key(key): self._tree(item, depth + 1) for key, item in value.items()}
+            return {
+                self._key(key): one if type(one) in _SCALARS else self._tree(one, depth + 1)
+                for key, one in value.items()
+            }
         if kind is np.ndarray:
             return self._array(value)
         if isinstance(value, np.generic) and value.dtype.str in DTYPES and value.dtype.kind in "biuf":
@@ -151,8 +156,14 @@ class _Encoder:
         return msgpack.ExtType(_IN_BLOB, msgpack.packb((digest, dtype, shape)))
 
     def _dataclass(self, value: Any, depth: int) -> Any:
-        fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
-        return msgpack.ExtType(_DATACLASS, self.pack([type(value).__name__, fields], depth + 1))
+        kind: Any = type(value)
+        fields = {name: getattr(value, name) for name in _field_names(kind)}
+        return msgpack.ExtType(_DATACLASS, self.pack([kind.__name__, fields], depth + 1))
+
+
+@functools.lru_cache(TYPES_MAX)
+def _field_names(kind: Any) -> tuple[str, ...]:
+    return tuple(one.name for one in dataclasses.fields(kind) if one.init)
 
 
 class _Decoder:

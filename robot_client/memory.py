@@ -120,6 +120,7 @@ class SiteMemory:
         self.age = 0
         self.observations: deque[Observation] = deque(maxlen=OBSERVATIONS_MAX)
         self._conditional = predictor if isinstance(predictor, Conditional) else None
+        self.conditional = self._conditional is not None
         self._site = site
         self._failures = 0
         self._conformal = Conformal()
@@ -127,11 +128,6 @@ class SiteMemory:
         self._energy = energy
         self._bytes = _Usual()
         self._cpu_s = _Usual()
-
-    @property
-    def conditional(self) -> bool:
-        """Whether the predictor looks at what was measured."""
-        return self._conditional is not None
 
     def outlook(
         self, amount: float | None, condition: Condition, *, in_flight: int, timeout_s: float
