@@ -33,7 +33,7 @@ def running(command: Sequence[str], **environ: str) -> Iterator["subprocess.Pope
         yield process
     finally:
         process.terminate()
-        process.wait(READY_S)
+        process.communicate(timeout=READY_S)  # closes the pipes too
 
 
 @contextlib.contextmanager

@@ -174,7 +174,7 @@ class Server:
             case Request():
                 self._request(peer, message)
             case Blob(data):
-                self._blobs.add(data)
+                self._blobs.add(data, peer)
             case Ping(id):
                 self._send(peer, Pong(id, len(self._waiting)))
             case Hello():
@@ -195,14 +195,18 @@ class Server:
             self._refuse(peer, request, "busy", "the server is stopping")
         elif not self._ready:
             self._refuse(peer, request, "busy", "the server is warming up")
-        elif self._waiting.full:
+        elif self._waiting.closed_to(peer):
             self._refuse(peer, request, "busy", f"{len(self._waiting)} requests are waiting")
         elif missing := self._pin(work):
             self._refuse(peer, request, "need_blob", missing=missing)
         elif held_bytes([*self._waiting, *self._running, work]) > self._held_bytes_max:
             self._refuse(peer, request, "busy", "waiting requests hold all the memory allowed")
         else:
-            self._waiting.add(work)
+            evicted = self._waiting.add(work)
+            if evicted is not None:
+                self._refuse(
+                    evicted.peer, evicted.request, "busy", f"{len(self._waiting)} requests are waiting"
+                )
             self._dispatch()
 
     @property
@@ -226,6 +230,7 @@ class Server:
             now = time.monotonic()
             work.queue_s = now - work.arrived
             if work.expired(now):
+                self._waiting.done(work, 0.0)
                 self._refuse(work.peer, work.request, "expired", queue_s=work.queue_s)
                 continue
             self._start(work)
@@ -248,6 +253,7 @@ class Server:
 
     def _answer(self, work: Work, outcome: Outcome) -> None:
         self._running.discard(work)
+        self._waiting.done(work, outcome.run_s)
         self._last_task = time.monotonic()
         request = work.request
         size = byte_count(outcome.frames)

@@ -1,4 +1,4 @@
-"""The bounded line of accepted requests that wait for a worker."""
+"""The bounded lines of accepted requests that wait for a worker, one for each robot."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 from common.blobs import StoredBlob
 from common.wire import Request, byte_count
+
+USUAL_RATE = 0.1  # of the usual run time, with each run
+ROBOTS_MAX = 1024  # of which it is known what they had; beyond it those are forgotten that ask for nothing
 
 
 @dataclass(slots=True, eq=False)
@@ -18,41 +21,95 @@ class Work:
     arrived: float
     queue_s: float = 0.0
     wanted: bool = True
+    charged_s: float = 0.0  # to its robot, when it began
 
     def expired(self, now: float) -> bool:
         return now - self.arrived >= self.request.budget_s
 
 
 class Waiting:
-    """First come, first served; at most `queue_max` requests."""
+    """Fair between robots, first come, first served for each; at most `queue_max` requests in all.
+
+    Next is the robot that has had the least of the workers' time, where time without requests counts as
+    served (start-time fair queueing, Goyal, Vin and Cheng 1996, with what runs usually take until they are
+    over). Where all is taken, the longest line gives way.
+    """
 
     def __init__(self, queue_max: int) -> None:
         self.queue_max = queue_max
-        self._line: deque[Work] = deque()
+        self._lines: dict[bytes, deque[Work]] = {}
+        self._running: dict[bytes, int] = {}
+        self._had_s: dict[bytes, float] = {}  # worker time of each robot
+        self._least_s = 0.0  # of the robot that was last chosen: who comes anew begins there
+        self._usual_s = 0.0
+        self._count = 0
 
-    @property
-    def full(self) -> bool:
-        return len(self._line) >= self.queue_max
+    def closed_to(self, robot: bytes) -> bool:
+        """Whether all is taken, and no other robot's line is longer than this one's would be."""
+        return self._count >= self.queue_max and len(self._longest()) <= len(self._lines.get(robot, ())) + 1
 
-    def add(self, work: Work) -> None:
-        assert not self.full
-        self._line.append(work)
+    def add(self, work: Work) -> Work | None:
+        """Put it in line, unless that is closed to its robot; the request that had to go for it."""
+        evicted = None
+        if self._count >= self.queue_max:
+            line = self._longest()
+            evicted = line.pop()
+            self._count -= 1
+        self._had_s[work.peer] = max(self._had_s.get(work.peer, 0.0), self._least_s)
+        self._lines.setdefault(work.peer, deque()).append(work)
+        self._count += 1
+        return evicted
+
+    def _longest(self) -> deque[Work]:
+        return max(self._lines.values(), key=len)
 
     def next(self) -> Work | None:
-        return self._line.popleft() if self._line else None
+        """The request to run now; it is charged to its robot until `done` says what it took."""
+        if not self._lines:
+            return None
+        robot = min(self._lines, key=lambda robot: (self._had_s[robot], self._lines[robot][0].arrived))
+        self._least_s = self._had_s[robot]
+        line = self._lines[robot]
+        work = line.popleft()
+        if not line:
+            del self._lines[robot]
+        self._count -= 1
+        work.charged_s = self._usual_s
+        self._had_s[robot] += work.charged_s
+        self._running[robot] = self._running.get(robot, 0) + 1
+        return work
+
+    def done(self, work: Work, run_s: float) -> None:
+        """What `next` gave out has ended after `run_s` in a worker, 0 where it never began."""
+        robot = work.peer
+        self._had_s[robot] += run_s - work.charged_s
+        if run_s > 0:
+            self._usual_s += USUAL_RATE * (run_s - self._usual_s)
+        self._running[robot] -= 1
+        if not self._running[robot]:
+            del self._running[robot]
+        if not self._lines and not self._running:
+            self._had_s.clear()
+            self._least_s = 0.0
+        elif len(self._had_s) > ROBOTS_MAX:
+            asking = self._lines.keys() | self._running.keys()
+            self._had_s = {one: self._had_s[one] for one in asking}
 
     def take(self, matches: Callable[[Work], bool]) -> list[Work]:
         """Remove and return every waiting request that matches."""
-        taken = [work for work in self._line if matches(work)]
-        if taken:
-            self._line = deque(work for work in self._line if not matches(work))
+        taken = [work for work in self if matches(work)]
+        for robot in {work.peer for work in taken}:
+            self._lines[robot] = deque(work for work in self._lines[robot] if not matches(work))
+            if not self._lines[robot]:
+                del self._lines[robot]
+        self._count -= len(taken)
         return taken
 
     def __len__(self) -> int:
-        return len(self._line)
+        return self._count
 
     def __iter__(self) -> Iterator[Work]:
-        return iter(self._line)
+        return (work for line in self._lines.values() for work in line)
 
 
 def held_bytes(works: Iterable[Work]) -> int:

@@ -6,7 +6,7 @@ Which values become blobs is decided in `common.values`.
 import hashlib
 import math
 import weakref
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from typing import Any
 
 import numpy as np
@@ -40,25 +40,45 @@ class StoredBlob:
 
 
 class BlobStore:
-    """Blobs by SHA-256, least recently used out first beyond `bytes_max`. For one thread."""
+    """Blobs by SHA-256, for one thread at a time.
+
+    Beyond `bytes_max` the owner of most bytes loses what was least recently used: who sends many blobs does
+    not push out those of others.
+    """
 
     def __init__(self, bytes_max: int) -> None:
         self.bytes_max = bytes_max
         self.byte_count = 0
         self._blobs: OrderedDict[bytes, StoredBlob] = OrderedDict()
+        self._owners: dict[bytes, bytes] = {}
+        self._owned: Counter[bytes] = Counter()
 
-    def add(self, data: Buffer) -> bytes:
+    def add(self, data: Buffer, owner: bytes = b"") -> bytes:
         """Keep `data` and return its digest; data larger than the whole store is not kept."""
         digest = hashlib.sha256(data).digest()
         if digest in self._blobs:
             self._blobs.move_to_end(digest)
         elif byte_length(data) <= self.bytes_max:
             self._blobs[digest] = StoredBlob(data)
+            self._owners[digest] = owner
+            self._owned[owner] += byte_length(data)
             self.byte_count += byte_length(data)
         while self.byte_count > self.bytes_max:
-            _, oldest = self._blobs.popitem(last=False)
-            self.byte_count -= oldest.data.nbytes
+            self._drop(self._dispensable(digest))
         return digest
+
+    def _dispensable(self, kept: bytes) -> bytes:
+        """Of the owner of most, `kept` left out."""
+        owned = self._owned - Counter({self._owners[kept]: self._blobs[kept].data.nbytes})
+        heaviest = max(owned, key=owned.__getitem__)
+        return next(one for one in self._blobs if self._owners[one] == heaviest and one != kept)
+
+    def _drop(self, digest: bytes) -> None:
+        count, owner = self._blobs.pop(digest).data.nbytes, self._owners.pop(digest)
+        self.byte_count -= count
+        self._owned[owner] -= count
+        if not self._owned[owner]:
+            del self._owned[owner]
 
     def get(self, digest: bytes) -> StoredBlob | None:
         blob = self._blobs.get(digest)

@@ -468,6 +468,19 @@ def test_the_store_forgets_the_least_recently_used() -> None:
     assert store.byte_count == 80
 
 
+def test_who_sends_many_blobs_pushes_out_his_own() -> None:
+    """Of two owners the one with more bytes loses his oldest, and whatever was just sent stays."""
+    store = BlobStore(100)
+    grid = store.add(b"g" * 30, b"good")
+    flood = [store.add(bytes([n]) * 30, b"greedy") for n in range(6)]
+    assert store.get(grid) is not None
+    assert [store.get(one) is not None for one in flood] == [False] * 4 + [True] * 2
+    large = store.add(b"l" * 80, b"late")
+    assert store.get(large) is not None
+    assert store.byte_count == 80
+    assert dict(store._owned) == {b"late": 80}
+
+
 def test_the_hash_of_a_constant_array_is_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Read-only arrays are hashed once while they live; writeable ones, and views of them, every time."""
     hashed: list[int] = []

@@ -1,0 +1,86 @@
+"""A robot that floods the server does not take it from the others."""
+
+import select
+import subprocess
+import sys
+import time
+from collections import Counter
+
+import pytest
+import zmq
+
+from benchmarks.servers import cloud_server
+from common import wire
+from tests.probes import nap
+
+pytestmark = pytest.mark.integration
+
+ROBOTS = 6
+NAP_S = 0.01
+SECONDS = 3.0
+TIMES = 50  # its share is what the flood asks for
+FLOOD_IN_FLIGHT = 200
+
+
+def ask(socket: "zmq.Socket[bytes]", id: int) -> None:
+    body = wire.encode([NAP_S]).frames
+    socket.send_multipart(wire.pack(wire.Request(id, nap.__name__, 30.0, 1, (), body)))
+
+
+def answers(endpoint: str) -> Counter[int]:
+    """How many each of ROBOTS gets in SECONDS, that ask for one at a time."""
+    with zmq.Context() as context:
+        sockets = [context.socket(zmq.DEALER) for _ in range(ROBOTS)]
+        poller, found = zmq.Poller(), Counter[int]()
+        for socket in sockets:
+            socket.linger = 0
+            socket.connect(endpoint)
+            poller.register(socket, zmq.POLLIN)
+            ask(socket, 0)
+        until = time.monotonic() + SECONDS
+        while time.monotonic() < until:
+            for ready, _ in poller.poll(100):
+                reply = wire.unpack(ready.recv_multipart())
+                assert isinstance(reply, wire.Reply)
+                assert reply.status == "ok", reply
+                found[sockets.index(ready)] += 1
+                ask(ready, found.total())
+        for socket in sockets:
+            socket.close()
+    return found
+
+
+def flood(endpoint: str, rate: float) -> None:
+    """Until the input ends; says how many answers were of which status."""
+    told, sent, began = Counter[str](), 0, time.monotonic()
+    with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
+        socket.linger = 0
+        socket.connect(endpoint)
+        while not select.select([sys.stdin], [], [], 0.005)[0]:
+            while socket.poll(0):
+                reply = wire.unpack(socket.recv_multipart())
+                assert isinstance(reply, wire.Reply)
+                told[reply.status] += 1
+            due = int((time.monotonic() - began) * rate)
+            while sent < due and sent - told.total() < FLOOD_IN_FLIGHT:
+                ask(socket, sent)
+                sent += 1
+    print(told["ok"], told["busy"])
+
+
+@pytest.mark.timeout(60)  # measures twice, for SECONDS
+def test_a_flood_takes_its_share_and_no_more() -> None:
+    """At 50 times its share it gets `busy`; the others keep 75 % of what they had, 10 % apart at most."""
+    with cloud_server("tests.probes", CLOUD_WORKERS="1") as server:
+        alone = answers(server.endpoint)
+        rate = TIMES * alone.total() / SECONDS / (ROBOTS + 1)
+        command = f"from tests.integration.test_fairness import flood; flood({server.endpoint!r}, {rate})"
+        flooding = subprocess.Popen(
+            [sys.executable, "-c", command], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        beside = answers(server.endpoint)
+        ok, busy = map(int, flooding.communicate("")[0].split())
+    print(alone, beside, ok, busy)
+    assert busy > ok > 0
+    assert beside.total() >= 0.75 * alone.total()
+    assert min(beside.values()) >= 0.9 * max(beside.values()) - 1
