@@ -33,13 +33,13 @@ def flood(
     """Settle cells bucket by bucket until the goal's bucket opens.
 
     A bucket is one straight move wide, so its cells are final when it opens: only the two after it are
-    live. `state` is low bound, row, the three counts, expanded cells, lowest and highest cell expanded;
+    live. `state` is low bound, expanded cells, lowest and highest cell expanded, row, the three counts;
     after GROW the call is repeated with larger buckets and goes on where it was, and so it is after PAUSE.
     """
     straight, diagonal, one = np.uint64(STRAIGHT), np.uint64(DIAGONAL), np.uint64(1)
-    low, row = np.uint64(state[0]), np.uint64(state[1])
-    here, after, later = np.uint64(state[2]), np.uint64(state[3]), np.uint64(state[4])
-    expanded, lowest, highest = np.uint64(state[5]), np.uint64(state[6]), np.uint64(state[7])
+    low, row = np.uint64(state[0]), np.uint64(state[4])
+    here, after, later = np.uint64(state[5]), np.uint64(state[6]), np.uint64(state[7])
+    expanded, lowest, highest = np.uint64(state[1]), np.uint64(state[2]), np.uint64(state[3])
     capacity, pause = np.uint64(buckets.shape[1]), expanded + np.uint64(PAUSE_CELLS)
     outcome = EMPTY
     while True:
@@ -90,8 +90,8 @@ def flood(
             after, later = (count, later) if soon else (after, count)
         here, after, later = after, later, np.uint64(0)
         row, low = row_after, low + straight
-    state[0], state[1], state[2], state[3], state[4] = low, row, here, after, later
-    state[5], state[6], state[7] = expanded, lowest, highest
+    state[0], state[1], state[2], state[3] = low, expanded, lowest, highest
+    state[4], state[5], state[6], state[7] = row, here, after, later
     return outcome
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from common import search
 from common.maps import GridMap, in_cells, passable, path_size
+from common.planners import DIJKSTRA, check_planner
 from common.tasks import task
 
 RADIUS_M = 0.2
@@ -56,7 +57,8 @@ class Plan:
     """A path, or why there is none: `status` is NONE or an error of nav2's ComputePathToPose.
 
     `cells` are (row, col) from start to goal, `metres` their centres in the map frame, `cost` is in metres
-    (each times the cell's factor where costs are given), `expanded` the cells that the search settled.
+    (each times the cell's factor where costs are given), `expanded` the cells that the search settled, or its
+    jump points.
     """
 
     status: str
@@ -74,7 +76,10 @@ def size_of_plan(
 
 
 def warm() -> None:
-    """Compile, or load from the cache, all that a request runs."""
+    """Compile, or load from the cache, all that a request runs.
+
+    But A* and jump point search, which would take longer than all the rest, are left to their first request.
+    """
     grid = GridMap(np.zeros((8, 8), np.int8), 1.0)
     scan = Scan(np.full(4, 2.5, np.float32), 0.0, math.pi / 2, 10.0)
     for costs in (None, np.zeros((8, 8), np.uint8)):
@@ -82,7 +87,7 @@ def warm() -> None:
 
 
 def work_of_plan(plan: Plan) -> float:
-    """The cells that the search settled."""
+    """The cells that the search settled, or its jump points."""
     return plan.expanded
 
 
@@ -94,11 +99,14 @@ def plan_path(
     goal: Point,
     radius_m: float = RADIUS_M,
     costs: NDArray[np.uint8] | None = None,
+    planner: str = DIJKSTRA,
 ) -> Plan:
     """Plan for a robot of this radius; without `scan` on the prior map alone.
 
     `costs`, of the map's shape, weighs entering a cell as NavFn does, (50 + 0.8 c) / 50; 253 to 255 block.
+    All planners find the same cost: `dijkstra`, `astar`, or `jps`, which takes no `costs`.
     """
+    check_planner(planner, weighted=costs is not None)
     _check(grid, scan, pose, goal, radius_m, costs)
     start, end = grid.cell(pose.x, pose.y), grid.cell(goal.x, goal.y)
     if start is None:
@@ -106,7 +114,7 @@ def plan_path(
     if end is None:
         return _plan(grid, search.no_route("GOAL_OUTSIDE_MAP"))
     hits = search.NO_HITS if scan is None else scan_hits(grid, scan, pose, radius_m)
-    return _plan(grid, _prepared(grid, radius_m).route(start, end, hits, costs))
+    return _plan(grid, _prepared(grid, radius_m).route(start, end, hits, costs, planner))
 
 
 def scan_hits(grid: GridMap, scan: Scan, pose: Pose, radius_m: float) -> search.Hits:

@@ -11,6 +11,7 @@ from typing import Any
 
 from common.config import check, from_table, read_toml, setting, unknown_key
 from common.errors import ConfigError, DataError
+from common.planners import DIJKSTRA, PLANNERS
 from loadgen.chaos import Chaos
 from loadgen.check import Check, check_computable, parse_checks
 from loadgen.outcome import FIGURES
@@ -35,6 +36,7 @@ class Workload:
     map: Path | None = setting(None, "map.yaml or MovingAI .map to plan on")
     task: str | None = setting(None, "MODULE:FUNCTION in place of a map: a task of one number, its size")
     resolution: float = setting(0.025, "metres a cell to plan at", minimum=0.001)
+    planner: str = setting(DIJKSTRA, "how paths are searched", choices=PLANNERS)
     tasks: int = setting(200, "tasks of each robot", minimum=1, maximum=AT_TASK_MAX)
     sizes: tuple[str, ...] = setting((), "input sizes, as `robot-client --sizes` takes them")
     arrivals: str = setting("closed", "when the next task is due", choices=ARRIVALS)

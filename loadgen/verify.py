@@ -50,7 +50,7 @@ def wrong_plan(answer: Mapping[str, Any], expected: Plan, request: Sequence[Any]
         return f"status {answer['status']} where {expected.status} was expected"
     if expected.status != "NONE":
         return None
-    grid, _scan, pose, goal, _radius_m = request
+    grid, _scan, pose, goal, *_ = request
     cells = answers.cells_of(answer)
     if [tuple(cells[0]), tuple(cells[-1])] != [grid.cell(pose.x, pose.y), grid.cell(goal.x, goal.y)]:
         return f"a path from {tuple(cells[0])} to {tuple(cells[-1])}: not from the robot to its goal"
@@ -67,7 +67,7 @@ def wrong_plan(answer: Mapping[str, Any], expected: Plan, request: Sequence[Any]
 
 def _blocked(request: Sequence[Any], cells: NDArray[np.int32]) -> str | None:
     """The first cell after the robot's own that it must not enter: no map, a wall, or seen occupied."""
-    grid, scan, pose, _goal, radius_m = request
+    grid, scan, pose, _goal, radius_m, *_ = request
     rows, cols = cells[1:, 0], cells[1:, 1]
     if not ((cells >= 0) & (cells < grid.cells.shape)).all():
         return "a path off the map"

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from common.config import check, setting
 from common.errors import ConfigError
+from common.planners import DIJKSTRA, PLANNERS
 from robot_client import objectives, policies, predictors
 from robot_client.allowance import DUPLICATES, Allowance
 from robot_client.energy import Energy
@@ -116,6 +117,7 @@ class RobotConfig:
     trace: Path | None = setting(None, "append one JSON line a task")
     seed: int = setting(1, "of start, goals and obstacles", minimum=0)
     resolution: float = setting(0.025, "metres a cell to plan at; MovingAI maps keep 1 m", minimum=0.001)
+    planner: str = setting(DIJKSTRA, "how paths are searched; all find the same cost", choices=PLANNERS)
     obstacles: int = setting(40, "boxes in the world that the map lacks", minimum=0, maximum=10_000)
     radius_m: float = setting(0.15, "radius of the robot in metres", name="radius", minimum=0.0, maximum=10.0)
     connect_s: float = setting(

@@ -12,6 +12,7 @@ from common.errors import ConfigError
 from common.flood import covered
 from common.maps import OCCUPIED, GridMap, largest_component, passable, path_size
 from common.planner import RADIUS_CELLS_MAX, RADIUS_M, Plan, Point, Pose, Scan, scan_hits
+from common.planners import DIJKSTRA
 from robot_client.lidar import BEAMS, RANGE_MAX_M, cast_scan
 
 OBSTACLE_SIDE_M = (0.3, 1.0)
@@ -20,7 +21,7 @@ TRIES_MAX = 5  # plans for one goal before another is picked
 FAILURES_MAX = 3  # goals in a row without a path before the robot is set down elsewhere
 CANDIDATES = 32  # random cells of which the next goal is one
 
-Request = tuple[GridMap, Scan, Pose, Point, float]
+Request = tuple[GridMap, Scan, Pose, Point, float, None, str]
 
 
 class SimulatedRobot:
@@ -40,11 +41,12 @@ class SimulatedRobot:
         beams: int = BEAMS,
         range_max: float = RANGE_MAX_M,
         size: float | None = None,
+        planner: str = DIJKSTRA,
     ) -> None:
         if radius_m > RADIUS_CELLS_MAX * prior.resolution:
             allowed = f"at most {RADIUS_CELLS_MAX} cells of {prior.resolution:g} m"
             raise ConfigError(f"a radius of {radius_m:g} m is not allowed, {allowed}")
-        self.prior, self.radius_m = prior, radius_m
+        self.prior, self.radius_m, self._planner = prior, radius_m, planner
         self._beams, self._range_max = beams, range_max
         self._random = np.random.default_rng(seed)
         self.truth = _with_boxes(prior, self._free(prior), obstacles, self._random)
@@ -57,7 +59,7 @@ class SimulatedRobot:
 
     def request(self) -> Request:
         """The arguments of `plan_path`, from where the robot stands; asking twice changes nothing."""
-        return self.prior, self._scan(), self.pose, self.goal, self.radius_m
+        return self.prior, self._scan(), self.pose, self.goal, self.radius_m, None, self._planner
 
     def drive(self, plan: Plan, size: float | None = None) -> NDArray[np.int32]:
         """Follow the plan, looking again every half metre; stop before what was not there when it was made.

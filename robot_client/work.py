@@ -118,6 +118,7 @@ def make_work(config: RobotConfig) -> Work:
         seed=config.seed,
         obstacles=config.obstacles,
         radius_m=config.radius_m,
+        planner=config.planner,
         size=next(wanted) if wanted else None,
     )
     return Plans(robot, wanted, jump=config.jump)

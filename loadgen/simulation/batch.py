@@ -103,6 +103,7 @@ def _key(workload: Workload, seed: int) -> Wanted:
     return replace(
         plain,
         resolution=workload.resolution,
+        planner=workload.planner,
         jump=workload.jump,
         obstacles=workload.obstacles,
         radius_m=workload.radius_m,

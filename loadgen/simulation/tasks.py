@@ -11,7 +11,7 @@ from common import wire
 from common.errors import ConfigError
 from common.tasks import Kind, kind_of
 from loadgen.scenario import Workload
-from loadgen.simulation.costs import COSTS, PARTS, ROUNDS, Cost
+from loadgen.simulation.costs import COSTS, PARTS, PLANS, ROUNDS, Cost
 from robot_client.work import make_work
 
 HASH_BYTES = bytes(32)  # a value as long as the answers of loadgen.work
@@ -62,7 +62,8 @@ def find_tasks(workload: Workload, seed: int, count: int) -> Tasks:
         asked.append(_asked(kind, request, HASH_BYTES if answer is None else answer, units))
         work.advance(answer)
     blob_bytes = sum(raw.nbytes for raw in blobs.values())
-    return Tasks(asked, COSTS[kind.name], kind.work is not None, blob_bytes)
+    cost = PLANS[workload.planner] if kind.name == "plan_path" else COSTS[kind.name]
+    return Tasks(asked, cost, kind.work is not None, blob_bytes)
 
 
 def _asked(kind: Kind, request: tuple[Any, ...], answer: Any, units: Mapping[str, float]) -> Asked:

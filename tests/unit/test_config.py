@@ -283,6 +283,7 @@ COSTS = {"policy": "greedy"}
         (MAP | {"sizes": ("constant",)}, "--sizes: 'constant' is not constant:X"),
         (MAP | {"arrivals": "often"}, "--arrivals: 'often' is not one of closed, constant, poisson, bursts"),
         (TASK | {"arrivals": "bursts"}, "--arrivals: bursts needs --rate"),
+        (MAP | {"planner": "theta"}, "--planner: 'theta' is not one of dijkstra, astar, jps"),
         (TASK | OPEN | {"rate": 0.0}, "--rate: 0.0 is below 0.001"),
         (TASK | OPEN | {"burst": 0}, "--burst: 0 is below 1"),
         (TASK | OPEN | {"in_flight": 0}, "--in-flight: 0 is below 1"),

@@ -3,6 +3,7 @@
 import tomllib
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -19,7 +20,7 @@ from robot_client.trace import alone_path, reference_path
 CONFIGS = {CLOUD: ServerConfig, WAN: WanConfig, ROBOT: RobotConfig}
 
 
-def scenario(**workload: int) -> Scenario:
+def scenario(**workload: Any) -> Scenario:
     return Scenario("small", 7, Workload(map=Path("m.yaml"), **workload))
 
 
@@ -54,6 +55,12 @@ def test_every_key_of_the_shipped_scenarios_is_one_of_the_field() -> None:
     known = {"event", "check", *(field.name for field in fields(Scenario))}
     for name in shipped():
         assert tomllib.loads(find_scenario(name).read_text()).keys() <= known
+
+
+def test_robots_plan_as_the_scenario_says(tmp_path: Path) -> None:
+    """Every one by the planner of the workload."""
+    made = setups(scenario(robots=2, planner="jps"), tmp_path)
+    assert [setup.flags["planner"] for part, setup in made.items() if part.startswith(ROBOT)] == ["jps"] * 2
 
 
 def test_robots_differ_and_the_first_has_plain_names(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ def run(robot: SimulatedRobot, count: int) -> list[Ride]:
     """So many requests, planned and driven."""
     done = []
     for _ in range(count):
-        _, _, pose, goal, _ = request = robot.request()
+        _, _, pose, goal, *_ = request = robot.request()
         plan = plan_path(*request)
         done.append(Ride(pose, goal, plan, robot.drive(plan)))
     return done
@@ -98,7 +98,7 @@ def test_jumping_asks_the_same_whatever_was_answered() -> None:
         robot = SimulatedRobot(WILLOW, seed=5, size=size)
         found = []
         for _ in range(10):
-            _, scan, pose, goal, _ = request = robot.request()
+            _, scan, pose, goal, *_ = request = robot.request()
             found.append((pose, goal, scan.ranges.tolist()))
             if drives:
                 plan_path(*request)

@@ -101,6 +101,7 @@ def test_chaos_leaves_the_link_as_it_was() -> None:
         ('[[check]]\nfigure = "lost"\nat_most = 0\nfrom_task = 50\n', r":8: .*task 50 is not among the 50"),
         ("[chaos]\nevery_s = 3\n", r"chaos: faults by the second need arrivals that are not closed"),
         ("reference = -1\n", r"workload\.reference: -1 is below 0"),
+        ('planner = "theta"\n', r"workload\.planner: 'theta' is not one of dijkstra, astar, jps"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_one_line(read: Callable[[str], Scenario], text: str, said: str) -> None:

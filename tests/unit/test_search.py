@@ -1,99 +1,25 @@
 """The compiled search against a plain heap planner, and against the published optima of MovingAI."""
 
-import heapq
 import itertools
 import math
 import threading
 import tracemalloc
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from common import maps, planner, search
 from common.errors import Unwanted
 from common.flood import DISTANCE_MAX, PAUSE_CELLS, STRAIGHT
 from common.search import Field, Hits
 from common.wanted import call_while
+from tests.mazes import check, oracle, random_cells, random_maze, serpentine
 
 ROOT = Path(__file__).parents[2]
 SAMPLES = ROOT / "tests/samples"
 MOVINGAI = ROOT.parent / "shared/maps/movingai"
 planner.warm()  # compiles before the clock of any test runs
-
-Cell = tuple[int, int]
-FACTORS = [(50 + 0.8 * cost) / 50 for cost in range(253)]
-
-
-def oracle(
-    free: NDArray[np.bool_], start: Cell, goal: Cell, costs: NDArray[np.uint8] | None = None
-) -> float | None:
-    """Textbook Dijkstra with a heap, plain Python; None when there is no path."""
-    open_: Any = free.tolist()
-    height, width = free.shape
-    weights: Any = (np.zeros(free.shape, np.uint8) if costs is None else costs).tolist()
-    best, heap = {start: 0.0}, [(0.0, start)]
-    while heap:
-        done, (row, col) = heapq.heappop(heap)
-        if (row, col) == goal:
-            return done
-        if done > best[row, col]:
-            continue
-        for dr in (-1, 0, 1):
-            for dc in (-1, 0, 1):
-                r, c = row + dr, col + dc
-                if not (0 <= r < height and 0 <= c < width and open_[r][c]):
-                    continue
-                if dr and dc and not (open_[row][c] and open_[r][col]):
-                    continue
-                length = done + math.hypot(dr, dc) * FACTORS[weights[r][c]]
-                if length < best.get((r, c), math.inf):
-                    best[r, c] = length
-                    heapq.heappush(heap, (length, (r, c)))
-    return None
-
-
-def path_cost(
-    free: NDArray[np.bool_], cells: NDArray[np.int32], costs: NDArray[np.uint8] | None = None
-) -> float:
-    """Length of a path, every move of which must be allowed."""
-    total = 0.0
-    for (row, col), (r, c) in zip(cells.tolist(), cells[1:].tolist(), strict=False):
-        assert max(abs(r - row), abs(c - col)) == 1
-        assert free[r, c]
-        assert free[row, c]
-        assert free[r, col]
-        total += math.hypot(r - row, c - col) * FACTORS[0 if costs is None else costs[r, c]]
-    return total
-
-
-def check(
-    free: NDArray[np.bool_], start: Cell, goal: Cell, route: search.Route, expected: float | None,
-    costs: NDArray[np.uint8] | None = None,
-) -> None:  # fmt: skip
-    if expected is None:
-        assert (route.status, len(route.cells)) == ("NO_VALID_PATH", 0)
-        return
-    assert route.status == "NONE"
-    assert route.cost == pytest.approx(expected, rel=1e-9, abs=1e-9)
-    assert (tuple(route.cells[0]), tuple(route.cells[-1])) == (start, goal)
-    assert path_cost(free, route.cells, costs) == pytest.approx(expected, rel=1e-9, abs=1e-9)
-
-
-def random_maze(rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Small maps of every kind: noise of any density, corridors one cell wide, single rows and columns."""
-    height, width = rng.integers(1, 13, 2)
-    free = rng.random((height, width)) > rng.choice([0.0, 0.2, 0.35, 0.5])
-    if rng.random() < 0.3:
-        free[1::2, rng.random(width) > 0.25] = False
-    return np.asarray(free)
-
-
-def random_cells(rng: np.random.Generator, free: NDArray[np.bool_]) -> tuple[Cell, Cell]:
-    choice = rng.choice(np.argwhere(free), 2)
-    return (int(choice[0][0]), int(choice[0][1])), (int(choice[1][0]), int(choice[1][1]))
 
 
 def test_two_thousand_small_mazes_equal_the_heap() -> None:
@@ -133,15 +59,6 @@ def test_the_search_stops_at_the_goal() -> None:
     assert field.route((200, 200), (200, 210)).expanded < 4 * 11**2
     here = field.route((7, 7), (7, 7))
     assert (here.status, here.cost, here.expanded, here.cells.tolist()) == ("NONE", 0.0, 0, [[7, 7]])
-
-
-def serpentine(side: int) -> NDArray[np.bool_]:
-    """One corridor of about side * side / 2 cells, folded."""
-    free = np.zeros((side, side), np.bool_)
-    free[::2] = True
-    free[1::4, -1] = True
-    free[3::4, 0] = True
-    return free
 
 
 def test_a_path_too_long_for_uint32_is_exact() -> None:

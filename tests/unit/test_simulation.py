@@ -18,7 +18,9 @@ from loadgen.simulation.world import check_simulated
 from loadgen.testbed import ROBOT
 from robot_client.cloud import RECONNECT_MAX_MS
 from robot_client.runner import CLOUD, ONBOARD
+from tests.mazes import warm
 
+warm()  # compiles before the clock of any test runs
 HEAD = """name = "small"
 [workload]
 task = "loadgen.work:hash_rounds"
@@ -187,6 +189,16 @@ def test_shipped_scenarios_play() -> None:
                 over = FIGURES["time_over_oracle"].compute(run)
                 assert over is not None, (name, policy)
                 assert 0.95 < over < 3, (name, policy, over)
+
+
+def test_plans_cost_what_their_planner_takes() -> None:
+    """The same tasks are less work by a faster planner, and each unit of it takes longer."""
+    workload = read_scenario(find_scenario("calm")).workload
+    level, quick = (find_tasks(replace(workload, planner=name), 1, 5) for name in ("dijkstra", "jps"))
+    assert [one.size for one in quick.asked] == [one.size for one in level.asked]
+    assert quick.cost.s_a_unit > level.cost.s_a_unit
+    for one, other in zip(quick.asked, level.asked, strict=True):
+        assert quick.cost.cpu_s(one.work[CLOUD]) < level.cost.cpu_s(other.work[CLOUD])
 
 
 def test_simulated_time_is_not_waited_for() -> None:

@@ -7,19 +7,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from common import planner
 from common.errors import ConfigError, DataError
 from common.planner import Plan, plan_path, size_of_plan
+from common.planners import PLANNERS
 from loadgen.testbed import PART
 from loadgen.work import MUCH, RARE, hash_rarely_long, hash_rounds, rounds_on
 from robot_client.answers import cells_of
 from robot_client.config import RobotConfig
 from robot_client.work import Work, make_work
 from tests import probes
+from tests.mazes import warm
 
 DEPOT = Path(__file__).parents[2] / "maps/depot.yaml"
 NO_PATH = Plan("NO_VALID_PATH", np.zeros((0, 2), np.int32), np.zeros((0, 2), np.float32), 0.0, 0)
-planner.warm()  # compiles before the clock of any test runs
+warm()  # compiles before the clock of any test runs
 
 
 def on_map(*sizes: str, seed: int = 3, jump: bool = True) -> Work:
@@ -34,7 +35,7 @@ def asked(work: Work, answers: Sequence[Any]) -> list[Any]:
     """The requests that so many answers lead to, in numbers."""
     found = []
     for answer in answers:
-        _, scan, pose, goal, radius = work.request()
+        _, scan, pose, goal, radius, *_ = work.request()
         found.append((scan.ranges.tolist(), pose, goal, radius))
         work.advance(answer)
     return found
@@ -50,10 +51,19 @@ def test_with_jumps_answers_do_not_change_later_requests(sizes: tuple[str, ...])
     assert first != asked(on_map(*sizes, seed=4), [None] * 8)
 
 
+@pytest.mark.parametrize("name", PLANNERS)
+def test_plans_are_asked_for_by_the_planner_of_the_flag(name: str) -> None:
+    """The request names it; what it finds costs the same."""
+    config = RobotConfig(map=DEPOT, resolution=0.05, seed=3, planner=name)
+    first, request = on_map().request(), make_work(config).request()
+    assert request[-1] == name
+    assert plan_path(*request).cost == plan_path(*first).cost > 0
+
+
 def test_without_jumps_the_robot_drives_what_it_gets() -> None:
     """The robot stands where the plan took it, and goes for another goal where there was no answer."""
     work = on_map(jump=False)
-    _, _, pose, goal, _ = request = work.request()
+    _, _, pose, goal, *_ = request = work.request()
     work.advance(plan_path(*request))
     assert work.request()[2] != pose
     pose, goal = work.request()[2:4]

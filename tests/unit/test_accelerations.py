@@ -1,0 +1,294 @@
+"""A* and jump point search: the cost of Dijkstra to the bit, for less work."""
+
+import itertools
+import math
+import threading
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from common import maps, search
+from common.errors import Unwanted
+from common.flood import PAUSE_CELLS
+from common.planner import Point, Pose, Scan, plan_path
+from common.planners import ASTAR, DIJKSTRA, JPS, PLANNERS
+from common.search import NO_HITS, Cell, Field, Hits, Route
+from common.wanted import call_while
+from tests.mazes import FORMS, check, oracle, path_cost, random_cells, random_maze, serpentine, warm
+
+ROOT = Path(__file__).parents[2]
+WILLOW = ROOT / "maps/willow-full-0.05.yaml"
+MOVINGAI = ROOT.parent / "shared/maps/movingai"
+QUICK = (ASTAR, JPS)
+warm()  # compiles before the clock of any test runs
+
+
+def noise(height: int, width: int, blocked: float) -> NDArray[np.bool_]:
+    free = np.random.default_rng(1).random((height, width)) > blocked
+    free[0, 0] = free[-1, -1] = True
+    return free
+
+
+def same(one: Route, other: Route) -> bool:
+    return (one.status, one.cost, len(one.cells)) == (other.status, other.cost, len(other.cells))
+
+
+def test_two_thousand_small_mazes_equal_the_heap() -> None:
+    """Each planner has the cost of Dijkstra to the bit, and that and the path are textbook Dijkstra's.
+
+    Among them are problems without a path, of one cell, at the border and in corridors one cell wide.
+    """
+    rng = np.random.default_rng(12)
+    unreachable = standing = border = thin = 0
+    for _ in range(2_000):
+        free = random_maze(rng)
+        if not free.any():
+            continue
+        start, goal = random_cells(rng, free)
+        field, expected = Field(free), oracle(free, start, goal)
+        level = field.route(start, goal)
+        for planner in QUICK:
+            route = field.route(start, goal, planner=planner)
+            check(free, start, goal, route, expected)
+            assert same(route, level)
+        unreachable += expected is None
+        standing += start == goal
+        border += 0 in (*start, *goal)
+        thin += 1 in free.shape
+    assert min(unreachable, standing, border, thin) > 50, (unreachable, standing, border, thin)
+
+
+def test_two_thousand_weighted_mazes_equal_the_heap() -> None:
+    """A* on costs has the cost of Dijkstra to the bit, and that and the path are textbook Dijkstra's."""
+    rng = np.random.default_rng(13)
+    for _ in range(2_000):
+        free = random_maze(rng)
+        if not free.any():
+            continue
+        start, goal = random_cells(rng, free)
+        costs = np.where(free, rng.integers(0, rng.choice([2, 253]), free.shape), 255).astype(np.uint8)
+        field = Field(np.ones_like(free))
+        route = field.route(start, goal, costs=costs, planner=ASTAR)
+        check(free, start, goal, route, oracle(free, start, goal, costs), costs)
+        level = field.route(start, goal, costs=costs)
+        assert (route.status, route.cost) == (level.status, level.cost)
+
+
+def test_large_rooms_equal_dijkstra() -> None:
+    """Over lines longer than a word of bits, and diagonals longer than one stride of them."""
+    rng = np.random.default_rng(14)
+    for blocked in (0.0, 0.0005, 0.003, 0.02, 0.1, 0.3):
+        free = np.asarray(rng.random((180, 330)) > blocked)
+        free[100, :300] = False
+        field = Field(free)
+        for _ in range(20):
+            start, goal = random_cells(rng, free)
+            level = field.route(start, goal)
+            for planner in QUICK:
+                route = field.route(start, goal, planner=planner)
+                assert same(route, level), (blocked, planner, start, goal)
+                assert path_cost(free, route.cells) == pytest.approx(level.cost, rel=1e-9)
+
+
+@pytest.mark.skipif(not MOVINGAI.is_dir(), reason="the MovingAI files of ../shared/maps are not here")
+@pytest.mark.parametrize("name", ["arena", "32room_000", "random512-10-0", "Berlin_1_1024"])
+def test_published_optima(name: str) -> None:
+    """100 problems spread over each file have the published length within 1e-3."""
+    field = Field(maps.passable(maps.read_map(MOVINGAI / f"{name}.map")))
+    problems = (MOVINGAI / f"{name}.map.scen").read_text().splitlines()[1:]
+    for line in [problems[k] for k in np.linspace(0, len(problems) - 1, 100).astype(int)]:
+        *_, x, y, goal_x, goal_y, optimum = line.split()
+        for planner in QUICK:
+            route = field.route((int(y), int(x)), (int(goal_y), int(goal_x)), planner=planner)
+            assert route.cost == pytest.approx(float(optimum), abs=1e-3), (planner, line)
+
+
+@pytest.mark.parametrize("name", ["willow-full-0.05", "depot"])
+def test_on_real_maps_a_star_expands_no_more_than_dijkstra(name: str) -> None:
+    """Of 60 problems in none, and less than half of its cells in total; the costs are the same to the bit."""
+    grid = maps.read_map(ROOT / f"maps/{name}.yaml")
+    field = Field(maps.passable(grid))
+    total = dict.fromkeys(PLANNERS, 0)
+    for start, goal in maps.free_pairs(grid, 60, seed=4).tolist():
+        routes = {planner: field.route(start, goal, planner=planner) for planner in PLANNERS}
+        assert len({route.cost for route in routes.values()}) == 1, (start, goal)
+        assert routes[ASTAR].expanded <= routes[DIJKSTRA].expanded, (start, goal)
+        for planner, route in routes.items():
+            total[planner] += route.expanded
+    print(total)
+    assert total[JPS] < total[ASTAR] < total[DIJKSTRA] / 2
+
+
+FREE: dict[str, Callable[[], NDArray[np.bool_]]] = {
+    "room": lambda: np.ones((300, 400), np.bool_),
+    "noise": lambda: noise(300, 400, 0.1),
+    "willow": lambda: maps.largest_component(maps.passable(maps.read_map(WILLOW))),
+}
+
+
+# Cells, or jump points, that were expanded when this was written, and a tenth more for a change of order.
+@pytest.mark.parametrize(
+    ("place", "planner", "expanded_max"),
+    [
+        ("room", DIJKSTRA, 120_000),
+        ("room", ASTAR, 399),
+        ("room", JPS, 6),
+        ("noise", DIJKSTRA, 119_000),
+        ("noise", ASTAR, 23_300),
+        ("noise", JPS, 5_140),
+        ("willow", DIJKSTRA, 600_000),
+        ("willow", ASTAR, 223_000),
+        ("willow", JPS, 3_240),
+    ],
+)
+def test_fixed_problems_do_not_take_more_work(place: str, planner: str, expanded_max: int) -> None:
+    """From corner to corner no more is expanded than it was, whatever the machine."""
+    free = FREE[place]()
+    cells = np.argwhere(free)
+    start, goal = (tuple(cells[n].tolist()) for n in (cells.sum(1).argmin(), cells.sum(1).argmax()))
+    assert 0 < Field(free).route(start, goal, planner=planner).expanded <= expanded_max
+
+
+@pytest.mark.parametrize(("planner", "weighted"), FORMS)
+def test_a_second_search_allocates_nothing_of_the_maps_size(planner: str, weighted: bool) -> None:
+    """Its peak is that of the path and what tells it, far below one byte a cell."""
+    field, costs = Field(noise(1000, 1000, 0.02)), np.zeros((1000, 1000), np.uint8) if weighted else None
+    field.route((0, 0), (999, 999), costs=costs, planner=planner)
+    tracemalloc.start()
+    field.route((0, 0), (999, 999), costs=costs, planner=planner)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 250_000
+
+
+@pytest.mark.parametrize("planner", QUICK)
+def test_hits_block_their_discs_for_one_request_only(planner: str) -> None:
+    """A route goes round the disc of a hit, over the border too, and the next request does not know of it."""
+    free = noise(41, 70, 0.05)
+    free[20, 0] = free[20, 69] = True
+    field = Field(free)
+    rng = np.random.default_rng(5)
+    before = field.route((20, 0), (20, 69), planner=planner)
+    for _ in range(30):
+        hits = Hits(rng.integers(-3, 44, 5), rng.integers(5, 65, 5), rng.uniform(0, 4.5, 5))
+        world = free.copy()
+        for row, col in np.ndindex(free.shape):
+            world[row, col] &= (np.hypot(row - hits.rows, col - hits.cols) > hits.reach).all()
+        route = field.route((20, 0), (20, 69), hits, planner=planner)
+        check(world, (20, 0), (20, 69), route, oracle(world, (20, 0), (20, 69)))
+        assert same(route, field.route((20, 0), (20, 69), hits))
+        level = np.zeros(free.shape, np.uint8)
+        weighted = field.route((20, 0), (20, 69), hits, level, planner=ASTAR)
+        assert weighted.cost == pytest.approx(route.cost, rel=1e-9)
+        again = field.route((20, 0), (20, 69), planner=planner)
+        assert again.cells.tolist() == before.cells.tolist()
+    outside = Hits(np.array([20]), np.array([69]), np.array([1.0]))
+    assert field.route((20, 0), (20, 69), outside, planner=planner).status == "GOAL_OCCUPIED"
+    assert field.route((20, 69), (20, 0), outside, planner=planner).status == "START_OCCUPIED"
+
+
+@pytest.mark.parametrize("planner", QUICK)
+def test_a_path_too_long_for_uint32_is_exact(planner: str) -> None:
+    """Beyond 53,166 cells the float64 search takes over, be they of a corridor or of the map's side."""
+    free = serpentine(331)
+    moves = int(free.sum()) - 1
+    assert moves > 53_166
+    for first, length in ((0, moves), (12, int(free[12:].sum()) - 1)):
+        route = Field(free).route((first, 0), (330, 0), planner=planner)
+        assert (route.status, route.cost, len(route.cells)) == ("NONE", length, length + 1)
+    field, at_12 = Field(free), int(free[12:].sum()) - 1
+    for moves in range(53_160, 53_170):  # about the bound; row 10 is gone along backwards
+        start = (12, at_12 - moves) if moves <= at_12 else (10, moves - at_12 - 2)
+        route = field.route(start, (330, 0), planner=planner)
+        assert (route.status, route.cost) == ("NONE", moves), start
+    side = Field(np.ones((2, 60_000), np.bool_)).route((0, 0), (1, 59_999), planner=planner)
+    assert (side.status, side.cost) == ("NONE", pytest.approx(59_998 + math.sqrt(2)))
+
+
+@pytest.mark.parametrize("planner", QUICK)
+def test_room_grows_when_much_is_found(monkeypatch: pytest.MonkeyPatch, planner: str) -> None:
+    """A search that starts with little room grows and ends at the same answer."""
+    free = noise(200, 200, 0.1)
+    first = Field(free).route((0, 0), (199, 199), planner=planner)
+    monkeypatch.setattr(search, "_first_capacity", lambda *_: 8)
+    monkeypatch.setattr(search.jump, "NODES_MAX", 4)
+    again = Field(free).route((0, 0), (199, 199), planner=planner)
+    assert again.expanded == first.expanded
+    assert again.cells.tolist() == first.cells.tolist()
+
+
+def test_threads_on_one_map_do_not_meet() -> None:
+    """Four threads at once with all planners, on costs and with hits, answer as each does alone."""
+    grid = maps.read_map(ROOT / "tests/samples/random512-10-0-crop.map")
+    field = Field(maps.passable(grid))
+    costs = np.random.default_rng(0).integers(0, 253, grid.cells.shape).astype(np.uint8)
+    hits = Hits(np.arange(10, 120, 7), np.full(16, 64), np.full(16, 2.0))
+    pairs = maps.free_pairs(grid, 60, seed=9).tolist()
+
+    def answers() -> list[tuple[str, float, list[list[int]]]]:
+        routes = []
+        for n, (start, goal) in enumerate(pairs):
+            seen = hits if n % 2 else NO_HITS
+            routes.append(field.route(start, goal, seen, planner=PLANNERS[n % 3]))
+            routes.append(field.route(start, goal, seen, costs, planner=PLANNERS[n % 2]))
+        return [(route.status, route.cost, route.cells.tolist()) for route in routes]
+
+    alone = answers()
+    together: list[object] = []
+    threads = [threading.Thread(target=lambda: together.append(answers())) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert together == [alone] * 4
+
+
+@pytest.mark.parametrize(("planner", "weighted"), FORMS[2:])
+def test_a_search_stops_where_nobody_waits_for_it(planner: str, weighted: bool) -> None:
+    """It asks at least every PAUSE_CELLS cells, or looks, and the next search finds what it should."""
+    free = noise(1000, 1000, 0.3)
+    free[989], free[990:] = False, True
+    field, costs = Field(free), np.zeros(free.shape, np.uint8) if weighted else None
+    looks = itertools.count()
+
+    def route(goal: Cell = (999, 999)) -> Route:
+        return field.route((0, 0), goal, NO_HITS, costs, planner)
+
+    whole = call_while(lambda: next(looks) >= 0, route, ())
+    assert whole.status == "NO_VALID_PATH"
+    assert next(looks) >= (3 if planner == JPS else whole.expanded // PAUSE_CELLS)
+    with pytest.raises(Unwanted):
+        call_while(lambda: False, route, ())
+    near = (int(np.flatnonzero(free[:100, 5])[-1]), 5)
+    assert route(near).cost == pytest.approx(field.route((0, 0), near).cost, rel=1e-9)
+
+
+def test_what_no_planner_can_is_refused() -> None:
+    """Another name, and costs for jump point search: one line names the argument and what is allowed."""
+    grid, costs = maps.GridMap(np.zeros((9, 9), np.int8), 1.0), np.zeros((9, 9), np.uint8)
+    pose, goal = Pose(0.5, 0.5), Point(8.5, 8.5)
+    with pytest.raises(ValueError, match=r"^planner is 'theta', allowed are dijkstra, astar, jps$"):
+        plan_path(grid, None, pose, goal, 0.0, None, "theta")
+    refused = r"^costs are not allowed with planner 'jps', only with dijkstra and astar$"
+    with pytest.raises(ValueError, match=refused):
+        plan_path(grid, None, pose, goal, 0.0, costs, JPS)
+    with pytest.raises(ValueError, match=refused):
+        Field(np.ones((9, 9), np.bool_)).route((0, 0), (8, 8), costs=costs, planner=JPS)
+
+
+@pytest.mark.parametrize("planner", QUICK)
+def test_a_plan_has_the_cost_of_dijkstras_with_a_scan_too(planner: str) -> None:
+    """The task takes the planner's name, and lays the scan over the map whatever it is."""
+    willow = maps.read_map(WILLOW)
+    pairs = willow.metres(maps.free_pairs(willow, 12, seed=3, radius_m=0.2).reshape(-1, 2)).reshape(-1, 2, 2)
+    for n, ((x, y), (goal_x, goal_y)) in enumerate(pairs.tolist()):
+        scan = Scan(np.full(90, 0.5 + 0.2 * n, np.float32), 0.0, math.pi / 45, 10.0)
+        plans = [
+            plan_path(willow, scan, Pose(x, y), Point(goal_x, goal_y), 0.2, None, name)
+            for name in (DIJKSTRA, planner)
+        ]
+        assert len({(plan.status, plan.cost) for plan in plans}) == 1
