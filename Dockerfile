@@ -6,7 +6,8 @@ ENV NUMBA_CACHE_DIR=/var/cache/offboard
 RUN python3 -m venv /opt/offboard \
  && groupadd --gid 10001 offboard \
  && useradd --uid 10001 --gid offboard --no-create-home --shell /usr/sbin/nologin offboard \
- && install -d -o offboard -g offboard /var/cache/offboard /out
+ && install -d -o offboard -g offboard /var/cache/offboard /out \
+ && install -d -o offboard -g offboard -m 0700 /keys /keys-robot /token
 
 FROM base AS wheel
 WORKDIR /src

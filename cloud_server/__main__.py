@@ -8,19 +8,35 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cloud_server.config import ServerConfig
+from cloud_server.config import ROBOTS, ServerConfig
 from common.config import as_dict, load, run_command
 from common.errors import ConfigError
 
 DESCRIPTION = (
-    "Runs tasks for robots over ZMQ; /health, /ready, /metrics, /config, /tasks and /docs over HTTP."
+    "Runs tasks for robots over ZMQ; /health, /ready, /metrics, /config, /tasks and /docs over HTTP. "
+    "`cloud-server keys` makes its keys."
 )
 
 log = logging.getLogger("cloud_server")
 
 
 def main() -> int:
-    return run_command("cloud-server", lambda: serve(sys.argv[1:], os.environ))
+    command = make_keys if sys.argv[1:2] == ["keys"] else serve
+    return run_command("cloud-server", lambda: command(sys.argv[1:], os.environ))
+
+
+def make_keys(argv: Sequence[str], environ: Mapping[str, str]) -> int:
+    """`cloud-server keys`: the server's own, and the folder for those of robots."""
+    from common.keys import SERVER, run_keys
+
+    folder = run_keys(SERVER, argv[1:], prog="cloud-server keys", prefix="CLOUD_KEYS", environ=environ)
+    robots = folder / ROBOTS
+    try:
+        robots.mkdir(exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out: {robots}: {error.strerror}") from error
+    print(f"{robots}: the public key of every robot that is let in goes there")
+    return 0
 
 
 def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
@@ -35,7 +51,12 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
     from cloud_server.metrics import Metrics
     from cloud_server.server import Server
     from cloud_server.web import Web, create_app
+    from common.guard import read_token, warn_each_minute
+    from common.keys import server_keys
     from common.tasks import kinds, load_modules
+
+    token = read_token(config.token_file)
+    keys = server_keys(config.keys) if config.keys else None
 
     load_modules(config.tasks)
     if not kinds():
@@ -51,9 +72,21 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
         message_bytes_max=config.message_bytes_max,
         drain_s=config.drain_s,
         on_ready=lambda: log.info("ready: listening on %s, http://%s", server.endpoint, web.address),
+        keys=keys,
+        robots=config.robots_folder,
     )
-    web = Web(create_app(server.status, metrics.registry, as_dict(config)), config.http_address)
+    app = create_app(
+        server.status,
+        metrics.registry,
+        as_dict(config),
+        token=token,
+        loopback=config.http_on_loopback,
+        insecure=bool(config.open_ways),
+    )
+    web = Web(app, config.http_address)
     web.start()
+    if config.open_ways:
+        warn_each_minute(config.open_ways)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: _stop(server))
     try:

@@ -3,11 +3,14 @@
 import os
 import re
 from dataclasses import dataclass
+from pathlib import Path
 
 from common.config import check, setting
 from common.errors import ConfigError
+from common.guard import OPEN_REMEDY, on_loopback
 
 MIB = 1024 * 1024
+ROBOTS = "robots"  # the folder of robots in that of --keys
 PORT_MAX = 65535
 
 _LISTEN = re.compile(r"tcp://(\*|\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5})")
@@ -18,8 +21,33 @@ _HTTP = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5})")
 class ServerConfig:
     """Flag, then `CLOUD_NAME`, then TOML file, then these defaults."""
 
-    listen: str = setting("tcp://*:5555", "endpoint for robots; port 0 takes a free one", metavar="ENDPOINT")
-    http: str = setting("0.0.0.0:8000", "address of /health, /metrics, ...", metavar="HOST:PORT")
+    listen: str = setting(
+        "tcp://127.0.0.1:5555",
+        "endpoint for robots; port 0 takes a free one; beyond loopback --keys are needed",
+        metavar="ENDPOINT",
+    )
+    http: str = setting(
+        "127.0.0.1:8000",
+        "address of /health, /metrics, ...; beyond loopback --token-file is needed",
+        metavar="HOST:PORT",
+    )
+    keys: Path | None = setting(
+        None,
+        "folder with server.key_secret, as `cloud-server keys` makes it: all is encrypted (CURVE)",
+        metavar="DIR",
+    )
+    robots: Path | None = setting(
+        None,
+        "folder with the public key of every robot that is let in, read again when it changes "
+        "(default: robots in the folder of --keys)",
+        metavar="DIR",
+    )
+    token_file: Path | None = setting(
+        None, "file with the bearer token that HTTP asks for, but for /health and /ready"
+    )
+    insecure: bool = setting(
+        False, "without keys or token let in anybody from beyond loopback; warns every minute"
+    )
     executor: str = setting("threads", "where tasks run", choices=("threads", "processes"))
     workers: int = setting(
         len(os.sched_getaffinity(0)), "tasks that run at the same time", minimum=1, maximum=1024, metavar="W"
@@ -41,11 +69,34 @@ class ServerConfig:
         check(self)
         host_and_port("--listen", self.listen, _LISTEN, "tcp://HOST:PORT or tcp://*:PORT")
         host_and_port("--http", self.http, _HTTP, "HOST:PORT")
+        if self.robots is not None and self.keys is None:
+            raise ConfigError(f"--robots: {self.robots} needs --keys, the server's own")
+        for way in () if self.insecure else self.open_ways:
+            raise ConfigError(f"{way}: {OPEN_REMEDY}")
         if self.blob_mib < self.message_mib:
             raise ConfigError(
                 f"--blob-mib: {self.blob_mib} is below --message-mib {self.message_mib}; "
                 "a large argument would never fit"
             )
+
+    @property
+    def open_ways(self) -> tuple[str, ...]:
+        """What anybody may use who reaches this computer, and why."""
+        listen_host = host_and_port("--listen", self.listen, _LISTEN, "tcp://HOST:PORT or tcp://*:PORT")[0]
+        ways = []
+        if self.keys is None and not on_loopback(listen_host):
+            ways.append(f"--listen: {self.listen} is beyond loopback and without --keys")
+        if self.token_file is None and not self.http_on_loopback:
+            ways.append(f"--http: {self.http} is beyond loopback and without --token-file")
+        return tuple(ways)
+
+    @property
+    def robots_folder(self) -> Path | None:
+        return self.robots or (self.keys / ROBOTS if self.keys else None)
+
+    @property
+    def http_on_loopback(self) -> bool:
+        return on_loopback(self.http_address[0])
 
     @property
     def http_address(self) -> tuple[str, int]:

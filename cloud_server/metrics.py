@@ -40,4 +40,5 @@ class Metrics:
         self.dropped = Counter(
             "offboard_dropped", "Messages not understood, and answers nobody took", ["reason"], registry=r
         )
+        self.refused = Counter("offboard_refused", "Handshakes with a key that is not known", registry=r)
         self.restarts = Counter("offboard_executor_restarts", "Worker pools started again", registry=r)

@@ -9,16 +9,19 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
+from pathlib import Path
 
 import zmq
 
 from cloud_server.executors import Executor, Outcome
 from cloud_server.metrics import Metrics, Status
+from cloud_server.robots import ZAP_DOMAIN, Robots
 from cloud_server.waiting import Waiting, Work, held_bytes
 from common import VERSION, tasks
 from common.blobs import BlobStore, Buffer
 from common.channel import Channel
 from common.errors import ConfigError, OffloadError, ProtocolError
+from common.keys import KeyPair
 from common.wire import (
     Blob,
     Cancel,
@@ -46,7 +49,10 @@ log = logging.getLogger("cloud_server")
 
 
 class Server:
-    """One socket, read by one thread. `drain` and `status` may be called from others."""
+    """One socket, read by one thread. `drain` and `status` may be called from others.
+
+    With `keys` everything is encrypted, and only the robots whose public keys are in `robots` are let in.
+    """
 
     def __init__(
         self,
@@ -59,6 +65,8 @@ class Server:
         message_bytes_max: int,
         drain_s: float,
         on_ready: Callable[[], None] = lambda: None,
+        keys: KeyPair | None = None,
+        robots: Path | None = None,
     ) -> None:
         self.metrics = metrics
         self._executor = executor
@@ -75,7 +83,10 @@ class Server:
         self._last_task: float | None = None
         self._last_start = self._last_warning = -float("inf")
         self._context = zmq.Context()
-        self._socket = _bind(self._context, listen, message_bytes_max)
+        self._robots: Robots | None = None
+        if keys is not None and robots is not None:
+            self._robots = Robots(self._context, robots, metrics)
+        self._socket = _bind(self._context, listen, message_bytes_max, keys)
         self.endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
         self._channel = Channel(self._socket)
         self._closed = False
@@ -155,6 +166,8 @@ class Server:
         if message is None:
             return False
         peer, *raw = message
+        if self._robots is not None and not self._robots.lets_in(peer):
+            return True
         frames: list[Buffer] = [f.buffer if len(f) > COPIED_BYTES_MAX else f.bytes for f in raw]
         size = byte_count(frames)
         self.metrics.bytes_in.inc(size)
@@ -174,7 +187,7 @@ class Server:
             case Request():
                 self._request(peer, message)
             case Blob(data):
-                self._blobs.add(data, peer)
+                self._blobs.add(data, self._robot_of(peer))
             case Ping(id):
                 self._send(peer, Pong(id, len(self._waiting)))
             case Hello():
@@ -188,14 +201,14 @@ class Server:
 
     def _request(self, peer: bytes, request: Request) -> None:
         """Put the request in line, or say why not."""
-        work = Work(peer, request, {}, time.monotonic())
+        work = Work(peer, request, {}, time.monotonic(), self._robot_of(peer))
         if request.kind not in (kind.name for kind in tasks.kinds()):
             self._refuse(peer, request, "unknown_task", f"no task named {request.kind!r} on this server")
         elif self._drain_until is not None:
             self._refuse(peer, request, "busy", "the server is stopping")
         elif not self._ready:
             self._refuse(peer, request, "busy", "the server is warming up")
-        elif self._waiting.closed_to(peer):
+        elif self._waiting.closed_to(work.robot):
             self._refuse(peer, request, "busy", f"{len(self._waiting)} requests are waiting")
         elif missing := self._pin(work):
             self._refuse(peer, request, "need_blob", missing=missing)
@@ -213,6 +226,9 @@ class Server:
     def _held_bytes_max(self) -> int:
         return self._blobs.bytes_max + self._message_bytes_max
 
+    def _robot_of(self, peer: bytes) -> bytes:
+        return peer if self._robots is None else self._robots.of(peer)
+
     def _pin(self, work: Work) -> tuple[bytes, ...]:
         """Give the work its blobs; the digests of those not here."""
         for digest in work.request.blobs:
@@ -229,6 +245,10 @@ class Server:
                 return
             now = time.monotonic()
             work.queue_s = now - work.arrived
+            if not self._knows(work.peer):
+                self._waiting.done(work, 0.0)
+                self._count(work.request, "cancelled")
+                continue
             if work.expired(now):
                 self._waiting.done(work, 0.0)
                 self._refuse(work.peer, work.request, "expired", queue_s=work.queue_s)
@@ -238,7 +258,9 @@ class Server:
     def _start(self, work: Work) -> None:
         self._running.add(work)
         request = work.request
-        future = self._executor.submit(request.kind, request.body, work.blobs, lambda: work.wanted)
+        future = self._executor.submit(
+            request.kind, request.body, work.blobs, lambda: work.wanted and self._knows(work.peer)
+        )
         future.add_done_callback(lambda done: self._finished(work, done))
 
     def _finished(self, work: Work, future: "Future[Outcome]") -> None:
@@ -312,7 +334,10 @@ class Server:
         return Hello(known, VERSION, self._message_bytes_max)
 
     def _send(self, peer: bytes, message: Message) -> None:
-        """Send or drop, never wait: the robot may be gone, or not reading."""
+        """Send or drop, never wait: the robot may be gone, not reading, or not one of ours any more."""
+        if not self._knows(peer):
+            self.metrics.dropped.labels("unknown robot").inc()
+            return
         frames = pack(message)
         try:
             self._channel.send([peer, *frames])
@@ -323,6 +348,9 @@ class Server:
             if error.errno != zmq.EHOSTUNREACH:
                 raise
             self.metrics.dropped.labels("gone").inc()
+
+    def _knows(self, peer: bytes) -> bool:
+        return self._robots is None or self._robots.knows(peer)
 
     def _drop(self, reason: str, error: ProtocolError) -> None:
         self.metrics.dropped.labels(reason).inc()
@@ -354,7 +382,7 @@ class Server:
 
 
 def _bind(
-    context: "zmq.Context[zmq.Socket[bytes]]", listen: str, message_bytes_max: int
+    context: "zmq.Context[zmq.Socket[bytes]]", listen: str, message_bytes_max: int, keys: KeyPair | None
 ) -> "zmq.Socket[bytes]":
     router = context.socket(zmq.ROUTER)
     router.setsockopt(zmq.LINGER, 0)
@@ -363,6 +391,11 @@ def _bind(
     router.setsockopt(zmq.SNDHWM, PEER_MESSAGES_MAX)
     router.setsockopt(zmq.RCVHWM, PEER_MESSAGES_MAX)
     router.setsockopt(zmq.IPV6, int("[" in listen))
+    if keys is not None:
+        router.setsockopt(zmq.CURVE_SERVER, 1)
+        router.setsockopt(zmq.CURVE_SECRETKEY, keys.secret)
+        router.setsockopt(zmq.ZAP_DOMAIN, ZAP_DOMAIN)
+        router.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)  # were nobody there to ask, nobody would be let in
     try:
         router.bind(listen)
     except zmq.ZMQError as error:

@@ -19,6 +19,7 @@ class Work:
     request: Request
     blobs: dict[bytes, StoredBlob]
     arrived: float
+    robot: bytes  # its public key, or the connection where there are no keys
     queue_s: float = 0.0
     wanted: bool = True
     charged_s: float = 0.0  # to its robot, when it began
@@ -55,8 +56,8 @@ class Waiting:
             line = self._longest()
             evicted = line.pop()
             self._count -= 1
-        self._had_s[work.peer] = max(self._had_s.get(work.peer, 0.0), self._least_s)
-        self._lines.setdefault(work.peer, deque()).append(work)
+        self._had_s[work.robot] = max(self._had_s.get(work.robot, 0.0), self._least_s)
+        self._lines.setdefault(work.robot, deque()).append(work)
         self._count += 1
         return evicted
 
@@ -81,7 +82,7 @@ class Waiting:
 
     def done(self, work: Work, run_s: float) -> None:
         """What `next` gave out has ended after `run_s` in a worker, 0 where it never began."""
-        robot = work.peer
+        robot = work.robot
         self._had_s[robot] += run_s - work.charged_s
         if run_s > 0:
             self._usual_s += USUAL_RATE * (run_s - self._usual_s)
@@ -98,7 +99,7 @@ class Waiting:
     def take(self, matches: Callable[[Work], bool]) -> list[Work]:
         """Remove and return every waiting request that matches."""
         taken = [work for work in self if matches(work)]
-        for robot in {work.peer for work in taken}:
+        for robot in {work.robot for work in taken}:
             self._lines[robot] = deque(work for work in self._lines[robot] if not matches(work))
             if not self._lines[robot]:
                 del self._lines[robot]

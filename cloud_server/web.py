@@ -11,10 +11,11 @@ from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_l
 from cloud_server.metrics import Status
 from common import VERSION, tasks
 from common.errors import ConfigError, MissingExtra
+from common.guard import Guard
 
 try:
     import uvicorn
-    from fastapi import FastAPI, Response
+    from fastapi import FastAPI, Request, Response
     from fastapi.responses import JSONResponse
 except ImportError as error:
     raise MissingExtra("cloud-server", "cloud") from error
@@ -24,16 +25,29 @@ STOP_S = 2.0
 
 
 def create_app(
-    status: Callable[[], Status], registry: CollectorRegistry, settings: dict[str, Any]
+    status: Callable[[], Status],
+    registry: CollectorRegistry,
+    settings: dict[str, Any],
+    *,
+    token: str | None = None,
+    loopback: bool = True,
+    insecure: bool = False,
 ) -> FastAPI:
-    """The routes; `status` is called once a request, from the web thread."""
-    app = FastAPI(title="Offboard cloud server", version=VERSION)
+    """The routes, all to be read only; `status` is called once a request, from the web thread.
 
-    @app.get("/health", summary="200 while the loop turns")
-    async def health() -> JSONResponse:
+    With a `token` everything needs it but health, readiness and, on `loopback`, the metrics.
+    """
+    app = FastAPI(title="Offboard cloud server", version=VERSION, redoc_url=None)
+    open_paths = ("/health", "/ready", *(["/metrics"] if loopback else []))
+    app.add_middleware(Guard, token=token, open_paths=open_paths, loopback=loopback)
+
+    @app.get("/health", summary="200 while the loop turns; version and details with the token")
+    async def health(request: Request) -> JSONResponse:
         now = status()
         turning = now.last_turn_age_s < STALL_S
-        content = {"healthy": turning, "version": VERSION, **dataclasses.asdict(now)}
+        content: dict[str, Any] = {"healthy": turning, "insecure": insecure}
+        if request.state.trusted:
+            content |= {"version": VERSION, **dataclasses.asdict(now)}
         return JSONResponse(content, 200 if turning else 503)
 
     @app.get("/ready", summary="200 once every kind is warm in every worker")
@@ -71,6 +85,7 @@ class Web:
             log_level="warning",
             log_config=None,
             access_log=False,
+            server_header=False,
             lifespan="off",
             timeout_graceful_shutdown=int(STOP_S),
         )

@@ -42,6 +42,7 @@ CACHE = Path(".cache/containers")  # the compiled planner, for all containers an
 READY_S = 120.0  # compiling the planner for the first time takes most of it
 ENGINE_S = 60.0  # for one answer of the engine
 HOG_END_S = 10.0
+PIDS_MAX = 512  # processes and threads of one container
 SUBNET_TRIES = 5
 PAUSE_TRIES = 10
 _numbers = itertools.count(1)
@@ -271,6 +272,9 @@ class DockerTestbed:
             init=True,  # a part as process 1 would not hear SIGTERM before it handles it
             healthcheck={"test": ["NONE"]},  # the image's own takes from the part's CPU every 2 s
             log_config={"type": "none"},
+            cap_drop=["ALL"],
+            security_opt=["no-new-privileges:true"],
+            pids_limit=PIDS_MAX,
             **options,
         )
         for network in others:

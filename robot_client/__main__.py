@@ -24,7 +24,15 @@ log = logging.getLogger("robot_client")
 
 def main(argv: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if argv is None else argv
-    return run_command("robot-client", lambda: _run(arguments))
+    command = _make_keys if arguments[:1] == ["keys"] else _run
+    return run_command("robot-client", lambda: command(arguments))
+
+
+def _make_keys(argv: Sequence[str]) -> int:
+    from common.keys import ROBOT, run_keys
+
+    run_keys(ROBOT, argv[1:], prog="robot-client keys", prefix="ROBOT_KEYS", environ=os.environ)
+    return 0
 
 
 def _run(argv: Sequence[str]) -> int:
@@ -32,7 +40,8 @@ def _run(argv: Sequence[str]) -> int:
         RobotConfig,
         argv,
         prog="robot-client",
-        description="Drive a simulated robot over a map, or call a task; each runs onboard or in the cloud.",
+        description="Drive a simulated robot over a map, or call a task; each runs onboard or in the cloud. "
+        "`robot-client keys` makes its keys.",
         environ=os.environ,
         prefix="ROBOT",
     )
@@ -54,7 +63,7 @@ def _drive(config: RobotConfig) -> int:
     if config.task is not None:
         sys.path.insert(0, str(Path.cwd()))  # as `python -m` does, so that --task finds the user's modules
     own = OwnRecord()
-    connect = partial(Offloader.connect, config.cloud, timeout_s=config.timeout_s)
+    connect = partial(Offloader.connect, config.cloud, timeout_s=config.timeout_s, keys=config.keys)
     answers = Answers(config.answers) if config.answers else None
     if answers and answers.done and config.map and not config.jump:
         raise ConfigError(

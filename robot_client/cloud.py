@@ -3,6 +3,7 @@
 Answers are matched by id; whatever arrives late is dropped. What a message looks like is `common.wire`.
 """
 
+import contextlib
 import logging
 import threading
 import time
@@ -10,6 +11,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import zmq
@@ -30,6 +32,8 @@ from common.errors import (
     ProtocolError,
     TaskFailed,
 )
+from common.guard import on_loopback
+from common.keys import RobotKeys
 from common.tasks import Kind, Task, kinds
 from robot_client.heartbeat import Heartbeat
 from robot_client.runner import CLOUD, Condition, Execution, check_endpoint
@@ -38,7 +42,7 @@ PENDING_MAX = 1024
 ATTEMPTS_MAX = 4  # sends of one request: the first, and one after each `need_blob`
 MESSAGE_BYTES_MAX = 256 * 1024 * 1024
 SEND_QUEUE_MAX = 1000  # messages, per socket
-HELLO_EVERY_S = 1.0  # until it is answered
+HELLO_EVERY_S = 1.0  # until it is answered; a server that refused the handshake is asked as often
 RECONNECT_MS, RECONNECT_MAX_MS = 100, 1000
 # TCP alone may take a quarter of an hour to notice a peer that vanished without a word. ZMQ's own
 # heartbeats would wait behind a large argument and break a slow link that works.
@@ -47,6 +51,13 @@ KEEPALIVE_IDLE_S, KEEPALIVE_EVERY_S, KEEPALIVE_PROBES = 10, 5, 2
 UPLOADS_KEPT = 1024  # digests remembered of one connection
 PUSH_AFTER = 2  # tasks of a kind in a row, each with a blob that is new to the server: then they go unasked
 CLOSE_WAIT_S = 2.0
+REFUSED = "it does not know this robot's key"
+UNFIT = "the handshake failed: the connection broke, or keys do not fit the server's"
+HANDSHAKE_FAILURES: dict[int, tuple[str, bool]] = {  # and whether libzmq tries no more
+    zmq.EVENT_HANDSHAKE_FAILED_AUTH: (REFUSED, True),
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: (UNFIT, True),
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: (UNFIT, False),
+}
 IDLE_WAIT_S = 1.0
 
 log = logging.getLogger(__name__)
@@ -72,10 +83,18 @@ class CloudRunner:
 
     The site is available for a kind once the server has answered `hello` on the present connection with
     the same protocol version and the same source for that kind. `heartbeat_s`: seconds between heartbeats;
-    0: none, and nothing is measured but tasks.
+    0: none, and nothing is measured but tasks. `keys`: encrypted, and with the server of this key alone.
     """
 
-    def __init__(self, endpoint: str, *, site: str = CLOUD, heartbeat_s: float = 0.0, seed: int = 0) -> None:
+    def __init__(
+        self,
+        endpoint: str,
+        *,
+        site: str = CLOUD,
+        heartbeat_s: float = 0.0,
+        seed: int = 0,
+        keys: RobotKeys | None = None,
+    ) -> None:
         check_endpoint(site, endpoint)
         self.site = site
         self._heartbeat = Heartbeat(heartbeat_s, seed)
@@ -89,17 +108,21 @@ class CloudRunner:
         self._asked = False  # to find out whether the server is there
         self._closing = False
         self._wakes_s = 0.0  # when the I/O thread looks again, whatever happens
+        self._handshake_failure = ""  # the last one's, until one succeeds
+        self._given_up = False  # by libzmq, after such a failure
         self._hello_due = float("inf")
         self._messages = 0
         self._uploads: dict[bytes, int] = {}  # number of the message that last carried the blob
         self._in_vain: Counter[str] = Counter()  # tasks of a kind in a row with new blobs
         self._context = zmq.Context()
         try:
-            self._socket, self._monitor = _connect(self._context, endpoint)
+            self._socket, self._monitor = _connect(self._context, endpoint, keys)
         except zmq.ZMQError as error:
             self._context.destroy(linger=0)
             raise ConfigError(f"{site}: endpoint {endpoint!r}: {error}") from error
         self._channel = Channel(self._socket, self._monitor.FD)
+        if keys is None:
+            _warn_of_plain_text(site, endpoint)
         self._thread = threading.Thread(target=self._run, name=f"site-{site}", daemon=True)
         self._thread.start()
 
@@ -193,21 +216,40 @@ class CloudRunner:
         while self._monitor.poll(0):
             event = zmq.utils.monitor.recv_monitor_message(self._monitor)["event"]
             if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+                self._handshake_failure, self._given_up = "", False
                 self._say_hello()
+            elif event in HANDSHAKE_FAILURES:
+                failure, self._given_up = HANDSHAKE_FAILURES[event]
+                if failure == REFUSED != self._handshake_failure:
+                    log.warning("%s: %s: %s; asking again", self.site, self._endpoint, failure)
+                self._handshake_failure = failure
             elif event == zmq.EVENT_DISCONNECTED:
                 self._hello_due = float("inf")
                 self._heartbeat.stop()
                 if self._absent is None:
                     log.warning("%s: connection to %s lost", self.site, self._endpoint)
                 self._absent = f"not connected to {self._endpoint}"
+                if self._handshake_failure:
+                    self._absent += f": {self._handshake_failure}"
+                if self._given_up:
+                    self._hello_due = time.perf_counter() + HELLO_EVERY_S
                 self._uploads.clear()
                 for request_id in list(self._pending):
                     self._finish(request_id, CloudBroken("the connection was lost"))
 
     def _say_hello(self) -> None:
         self._hello_due = time.perf_counter() + HELLO_EVERY_S
+        if self._given_up:
+            self._connect_again()
+            return
         known = {kind.name: kind.source_hash for kind in kinds()}
         self._send(wire.Hello(known, SOFTWARE, MESSAGE_BYTES_MAX))
+
+    def _connect_again(self) -> None:
+        self._hello_due, self._given_up = float("inf"), False
+        with contextlib.suppress(zmq.ZMQError):  # there is no connection to end
+            self._socket.disconnect(self._endpoint)
+        self._socket.connect(self._endpoint)
 
     def _beat(self) -> None:
         now_s = time.perf_counter()
@@ -384,7 +426,9 @@ def _failure(reply: wire.Reply) -> OffloadError | None:
     return failure(reply.error or reply.status)
 
 
-def _connect(context: "zmq.Context[Any]", endpoint: str) -> tuple["zmq.Socket[bytes]", "zmq.Socket[bytes]"]:
+def _connect(
+    context: "zmq.Context[Any]", endpoint: str, keys: RobotKeys | None
+) -> tuple["zmq.Socket[bytes]", "zmq.Socket[bytes]"]:
     dealer = context.socket(zmq.DEALER)
     dealer.linger = 0
     dealer.ipv6 = "[" in endpoint
@@ -397,6 +441,16 @@ def _connect(context: "zmq.Context[Any]", endpoint: str) -> tuple["zmq.Socket[by
     dealer.setsockopt(zmq.TCP_KEEPALIVE_INTVL, KEEPALIVE_EVERY_S)
     dealer.setsockopt(zmq.TCP_KEEPALIVE_CNT, KEEPALIVE_PROBES)
     dealer.maxmsgsize = MESSAGE_BYTES_MAX
-    monitor = dealer.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED)
+    if keys is not None:
+        dealer.curve_publickey, dealer.curve_secretkey = keys.own.public, keys.own.secret
+        dealer.curve_serverkey = keys.server
+    events = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED
+    monitor = dealer.get_monitor_socket(sum(HANDSHAKE_FAILURES, events))
     dealer.connect(endpoint)
     return dealer, monitor
+
+
+@lru_cache(maxsize=256)  # once for each server, however many offloaders are made
+def _warn_of_plain_text(site: str, endpoint: str) -> None:
+    if not on_loopback(endpoint.removeprefix("tcp://").rpartition(":")[0].strip("[]")):
+        log.warning("%s: %s without keys: whoever is on the way can read and change it", site, endpoint)

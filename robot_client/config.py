@@ -35,6 +35,12 @@ class RobotConfig:
         None, "planning server; without it all runs onboard", metavar="tcp://HOST:PORT"
     )
     site: tuple[str, ...] = setting((), "a further named server; may be given again", metavar="NAME=ENDPOINT")
+    keys: Path | None = setting(
+        None,
+        "folder with robot.key_secret, as `robot-client keys` makes it, and the server's public server.key, "
+        "or NAME.key for the server of --site NAME: all is encrypted (CURVE)",
+        metavar="DIR",
+    )
     policy: str = setting("paper", f"where to run: {policies.HELP}", metavar="NAME")
     predictor: str | None = setting(
         None, f"how times are predicted, instead of the policy's own way: {predictors.HELP}", metavar="NAME"

@@ -136,14 +136,17 @@ class Offloader:
         allowance: Allowance | None = None,
         observers: Iterable[Callable[[Record], None]] = (),
         memory: Path | None = None,
+        keys: Path | str | None = None,
     ) -> Self:
         """Onboard, `cloud` at `endpoint` (tcp://HOST:PORT) and any further named `sites`.
 
         `predictor` (None: the one that the policy is meant with) may begin with `work:`, for times per work.
         `seed` is that of policies and predictors that draw. `memory`: the file in which what was learnt
-        outlives the process. Caps in the allowance put `budget` around the policy.
+        outlives the process. Caps in the allowance put `budget` around the policy. `keys`: the folder of
+        `robot-client keys` with the public key of each server, NAME.key or server.key (None: no encryption).
         """
-        from robot_client.cloud import CloudRunner  # zmq is loaded only where a socket is opened
+        from common.keys import robot_keys  # zmq is loaded only where a socket is opened
+        from robot_client.cloud import CloudRunner
 
         servers = ({CLOUD: endpoint} if endpoint else {}) | (sites or {})
         if allowance is not None and allowance.capped and "budget" not in policy.split(":"):
@@ -161,7 +164,8 @@ class Offloader:
         runners: list[Runner] = []
         try:
             for site, where in servers.items():
-                runners.append(CloudRunner(where, site=site, heartbeat_s=heartbeat_s, seed=seed))
+                own = None if keys is None else robot_keys(Path(keys), site)
+                runners.append(CloudRunner(where, site=site, heartbeat_s=heartbeat_s, seed=seed, keys=own))
             runners.append(OnboardRunner())
             return cls(
                 runners,

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import Any, Protocol
 
 from common.errors import ConfigError, MissingExtra
+from common.guard import Guard
 from loadgen.relay.link import NAMES
 from loadgen.relay.schedule import Linked, Schedule, parse_schedule
 
@@ -86,6 +87,7 @@ class ControlServer(uvicorn.Server):
 
     def __init__(self, app: FastAPI) -> None:
         options: dict[str, Any] = {"lifespan": "off", "log_level": "warning", "access_log": False}
+        options["server_header"] = False
         super().__init__(uvicorn.Config(app, timeout_graceful_shutdown=STOP_S, **options))
 
     @contextlib.contextmanager
@@ -97,17 +99,27 @@ class ControlServer(uvicorn.Server):
         self.should_exit = True
 
 
-def control_app(relay: Relayed, schedule: Schedule) -> FastAPI:
-    """The API over one relay."""
+def control_app(
+    relay: Relayed,
+    schedule: Schedule,
+    *,
+    token: str | None = None,
+    loopback: bool = True,
+    insecure: bool = False,
+) -> FastAPI:
+    """The API over one relay; with a `token` everything but health needs it."""
     app = FastAPI(
-        title="Offboard relay", description="The link between robot and cloud, read and changed live."
+        title="Offboard relay",
+        description="The link between robot and cloud, read and changed live.",
+        redoc_url=None,
     )
     app.add_middleware(BoundedBody)
+    app.add_middleware(Guard, token=token, open_paths=("/health",), loopback=loopback)
 
     @app.get("/health")
-    async def health() -> dict[str, str]:
+    async def health() -> dict[str, Any]:
         """The relay's loop turns."""
-        return {"status": "ok"}
+        return {"status": "ok", "insecure": insecure}
 
     @app.get("/link")
     async def read_link() -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """HOST:PORT as text, and the listening socket there."""
 
-import ipaddress
 import socket
 
 from common.errors import ConfigError
@@ -16,14 +15,6 @@ def address(flag: str, text: str) -> tuple[str, int]:
     if not (host and "/" not in host and port.isascii() and port.isdigit() and int(port) <= PORT_MAX):
         raise ConfigError(f"{flag}: {text!r} is not HOST:PORT with a port from 0 to {PORT_MAX}")
     return host, int(port)
-
-
-def on_loopback(host: str) -> bool:
-    """Nobody but this computer reaches it; a host name other than localhost counts as reached."""
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def bind(flag: str, text: str) -> socket.socket:

@@ -11,8 +11,9 @@ from pathlib import Path
 
 from common.config import setting
 from common.errors import ConfigError
+from common.guard import LOOPBACK, OPEN_REMEDY, on_loopback, read_token, warn_each_minute
 from loadgen.relay.control import ControlServer, control_app
-from loadgen.relay.endpoint import BACKLOG, address, bind, name_of, on_loopback
+from loadgen.relay.endpoint import BACKLOG, address, bind, name_of
 from loadgen.relay.flags import LinkFlags
 from loadgen.relay.link import CHUNK_BYTES
 from loadgen.relay.proxies import Proxies, RelaySettings
@@ -30,7 +31,17 @@ class WanConfig(LinkFlags):
 
     to: str = setting("127.0.0.1:5555", "where connections are relayed to", metavar="HOST:PORT")
     listen: str = setting("127.0.0.1:5556", "where the robot connects", metavar="HOST:PORT")
-    http: str = setting("127.0.0.1:8001", "where the link is read and changed", metavar="HOST:PORT")
+    http: str = setting(
+        "127.0.0.1:8001",
+        "where the link is read and changed; beyond loopback --token-file is needed",
+        metavar="HOST:PORT",
+    )
+    token_file: Path | None = setting(
+        None, "file with the bearer token that --http asks for, but for /health"
+    )
+    insecure: bool = setting(
+        False, "without a token let anybody beyond loopback change the link; warns every minute"
+    )
     schedule: Path | None = setting(
         None, "TOML file of changes of the link: [[event]] at_s = 5.0, loss = 0.1"
     )
@@ -54,9 +65,22 @@ class WanConfig(LinkFlags):
             address(f"--{name}", getattr(self, name))
         if self.toxiproxy is not None and not on_loopback(address("--toxiproxy", self.toxiproxy)[0]):
             raise ConfigError(
-                f"--toxiproxy: {self.toxiproxy!r} is not on loopback (127.0.0.1, [::1], localhost):"
+                f"--toxiproxy: {self.toxiproxy!r} is not on loopback ({LOOPBACK}):"
                 " whoever reaches it commands the relay"
             )
+        for way in () if self.insecure else self.open_ways:
+            raise ConfigError(f"{way}: {OPEN_REMEDY}")
+
+    @property
+    def http_on_loopback(self) -> bool:
+        return on_loopback(address("--http", self.http)[0])
+
+    @property
+    def open_ways(self) -> tuple[str, ...]:
+        """Why anybody may command the relay who reaches this computer."""
+        if self.token_file is not None or self.http_on_loopback:
+            return ()
+        return (f"--http: {self.http} is beyond loopback and without --token-file",)
 
 
 def run_wan(config: WanConfig) -> int:
@@ -67,6 +91,7 @@ def run_wan(config: WanConfig) -> int:
 
 
 async def _serve(config: WanConfig) -> None:
+    token = read_token(config.token_file)
     with contextlib.ExitStack() as sockets:
         listening = sockets.enter_context(bind("--listen", config.listen))
         http = sockets.enter_context(bind("--http", config.http))
@@ -82,7 +107,14 @@ async def _serve(config: WanConfig) -> None:
             truth=truth,
         )
         schedule = Schedule(relay)
-        servers = [(ControlServer(control_app(relay, schedule)), http)]
+        app = control_app(
+            relay,
+            schedule,
+            token=token,
+            loopback=config.http_on_loopback,
+            insecure=bool(config.open_ways),
+        )
+        servers = [(ControlServer(app), http)]
         where = f"relay {name_of(listening)} -> {config.to}, control http://{name_of(http)}/link"
         proxies = Proxies(RelaySettings(config.seed, config.connections_max, config.buffer_bytes))
         if config.toxiproxy is not None:
@@ -99,6 +131,8 @@ async def _serve(config: WanConfig) -> None:
         listener = await loop.create_server(relay.accept, sock=listening, backlog=BACKLOG)
         schedule.start(events)
         print(where, flush=True)
+        if config.open_ways:
+            warn_each_minute(config.open_ways)
         await asyncio.gather(*(server.serve(sockets=[at]) for server, at in servers))
         listener.close()
         schedule.stop()

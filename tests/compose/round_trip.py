@@ -7,7 +7,7 @@ from tests.probes import echo
 
 TASKS = 200
 
-with Offloader.connect("tcp://wan:5555", policy="cloud") as offload:
+with Offloader.connect("tcp://wan:5555", policy="cloud", keys="/keys") as offload:
     assert offload.wait_for_sites(echo, 20.0) == {}
     seconds = []
     for _ in range(TASKS):

@@ -2,6 +2,7 @@
 
 import json
 import statistics
+import urllib.error
 import urllib.request
 from pathlib import Path
 
@@ -20,9 +21,17 @@ PAIRS = 12
 SHARE_TOLERANCE = 0.15
 
 
-def get(url: str) -> tuple[int, str]:
-    with urllib.request.urlopen(url, timeout=5) as answer:
-        return answer.status, answer.read().decode()
+def get(url: str, token: str = "") -> tuple[int, str]:
+    headers = {"Authorization": f"Bearer {token}"} if token else {}
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=5) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        return error.code, ""
+
+
+def token_of(up: Compose) -> str:
+    return up("exec", "-T", "cloud", "cat", "/token/token").strip()
 
 
 def test_the_robot_finishes_and_its_table_is_printed(up: Compose, tmp_path: Path) -> None:
@@ -39,12 +48,15 @@ def test_the_robot_finishes_and_its_table_is_printed(up: Compose, tmp_path: Path
 
 
 def test_the_server_stays_up_for_curl(up: Compose) -> None:
-    """/health, /ready, /metrics and /tasks answer on the host after the robot has ended."""
+    """/health, /ready, /metrics and /tasks answer on the host after the robot has ended, with the token."""
     up.exit_code("robot")
-    assert json.loads(get(f"{up.url}/health")[1])["version"]
+    token = token_of(up)
+    assert json.loads(get(f"{up.url}/health")[1]) == {"healthy": True, "insecure": False}
+    assert json.loads(get(f"{up.url}/health", token)[1])["version"]
     assert get(f"{up.url}/ready")[0] == 200
-    assert 'offboard_requests_total{kind="plan_path",status="ok"}' in get(f"{up.url}/metrics")[1]
-    assert "plan_path" in [one["name"] for one in json.loads(get(f"{up.url}/tasks")[1])]
+    assert get(f"{up.url}/metrics")[0] == 401
+    assert 'offboard_requests_total{kind="plan_path",status="ok"}' in get(f"{up.url}/metrics", token)[1]
+    assert "plan_path" in [one["name"] for one in json.loads(get(f"{up.url}/tasks", token)[1])]
 
 
 def test_the_robot_has_no_way_to_the_cloud_but_the_relay(up: Compose) -> None:
@@ -115,9 +127,30 @@ def test_the_cloud_has_its_own_quota(up: Compose) -> None:
 
 
 def test_the_relay_can_be_read_and_changed_from_the_host(up: Compose) -> None:
-    """GET /link says what the link does."""
-    link = json.loads(get(f"{up.wan_url}/link")[1])
+    """GET /link says what the link does, to whoever has the token."""
+    link = json.loads(get(f"{up.wan_url}/link", token_of(up))[1])
     assert link["up"]["delay_ms"] == link["down"]["delay_ms"] == 15.0
+    assert get(f"{up.wan_url}/link")[0] == 401
+
+
+@pytest.mark.parametrize("service", ["keys", "cloud", "wan", "robot", "table"])
+def test_containers_can_do_little(up: Compose, service: str) -> None:
+    """No root, no capability, no new privilege, nothing to write to, memory and processes bounded."""
+    (found,) = json.loads(docker("inspect", up("ps", "-aq", service).strip()))
+    host = found["HostConfig"]
+    assert found["Config"]["User"] == "offboard"
+    assert (host["ReadonlyRootfs"], host["CapDrop"], host["Privileged"]) == (True, ["ALL"], False)
+    assert "no-new-privileges:true" in host["SecurityOpt"]
+    assert host["Memory"] > 0
+    assert host["PidsLimit"] > 0
+
+
+def test_the_robot_pins_the_server_and_has_no_key_of_it(up: Compose) -> None:
+    """The robot's keys are its own and the server's public one; it runs by CURVE."""
+    list_keys = "from pathlib import Path; print(*sorted(path.name for path in Path('/keys').iterdir()))"
+    names = up("run", "--rm", "--no-deps", "--entrypoint", "python3", "probe", "-c", list_keys).split()
+    assert names == ["robot.key", "robot.key_secret", "server.key"]
+    assert "robots known: robot" in up("logs", "cloud")
 
 
 def test_unit_tests_pass_in_the_image(engine: None) -> None:  # noqa: ARG001 - it skips

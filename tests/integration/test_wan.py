@@ -263,7 +263,7 @@ def test_the_largest_samples_and_schedule_fit(wan: Any) -> None:
 def test_the_api_describes_itself(wan: Any) -> None:
     """/health answers, and OpenAPI knows /link and its conditions."""
     relay = wan(1)
-    assert relay.ask("GET", "/health") == (200, {"status": "ok"})
+    assert relay.ask("GET", "/health") == (200, {"status": "ok", "insecure": False})
     schema = relay.ask("GET", "/openapi.json")[1]
     assert set(schema["paths"]["/link"]) == {"get", "put"}
     assert "bandwidth_mbps" in json.dumps(schema["components"])

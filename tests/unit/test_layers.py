@@ -16,7 +16,13 @@ ROOMS = {
 }
 # Heavy or optional libraries, and the files that may import them.
 OWNERS = {
-    "zmq": {"common/channel.py", "robot_client/cloud.py", "cloud_server/server.py"},
+    "zmq": {
+        "common/channel.py",
+        "common/keys.py",
+        "robot_client/cloud.py",
+        "cloud_server/robots.py",
+        "cloud_server/server.py",
+    },
     "fastapi": {"cloud_server/web.py", "loadgen/relay/control.py", "loadgen/relay/toxiproxy.py"},
     "uvicorn": {"cloud_server/web.py", "loadgen/relay/control.py"},
     "docker": {"loadgen/containers.py"},

@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.errors import ConfigError
-from loadgen.relay.endpoint import on_loopback
 from loadgen.relay.link import Link, LinkConditions
 from loadgen.relay.toxics import ATTRIBUTES, Refused, Toxic, attributes, closes_after_s, link_of
 
@@ -129,22 +128,3 @@ def test_the_share_that_is_struck() -> None:
     struck = [(down.strikes(1, number), up.strikes(1, number)) for number in range(4000)]
     assert sum(hit for hit, _ in struck) / 4000 == pytest.approx(0.3, abs=0.029)
     assert sum(hit and other for hit, other in struck) / 4000 == pytest.approx(0.09, abs=0.018)
-
-
-@pytest.mark.parametrize(
-    ("host", "inside"),
-    [
-        ("127.0.0.1", True),
-        ("127.8.8.8", True),
-        ("::1", True),
-        ("localhost", True),
-        ("0.0.0.0", False),
-        ("::", False),
-        ("192.168.1.5", False),
-        ("robot.example", False),
-        ("localhost.example", False),
-    ],
-)
-def test_what_is_loopback(host: str, inside: bool) -> None:
-    """Only addresses that no other computer reaches are, and the one name that means them."""
-    assert on_loopback(host) == inside

@@ -7,7 +7,7 @@ from common.wire import Request
 
 
 def request(robot: bytes, id: int, arrived: float = 0.0) -> Work:
-    return Work(robot, Request(id, "kind", 1.0), {}, arrived)
+    return Work(b"peer", Request(id, "kind", 1.0), {}, arrived, robot)
 
 
 def served(waiting: Waiting, count: int, took_s: dict[bytes, float]) -> Counter[bytes]:
@@ -16,9 +16,9 @@ def served(waiting: Waiting, count: int, took_s: dict[bytes, float]) -> Counter[
     for n in range(count):
         work = waiting.next()
         assert work is not None
-        waiting.done(work, took_s[work.peer])
-        found[work.peer] += 1
-        waiting.add(request(work.peer, n))
+        waiting.done(work, took_s[work.robot])
+        found[work.robot] += 1
+        waiting.add(request(work.robot, n))
     return found
 
 
@@ -87,7 +87,7 @@ def test_where_all_is_taken_the_longest_line_gives_way() -> None:
     for id in range(2):
         assert not waiting.closed_to(b"good")
         evicted.append(waiting.add(request(b"good", id)))
-    assert [(work.peer, work.request.id) for work in evicted if work] == [(b"flood", 3), (b"flood", 2)]
+    assert [(work.robot, work.request.id) for work in evicted if work] == [(b"flood", 3), (b"flood", 2)]
     assert waiting.closed_to(b"good")
     assert waiting.closed_to(b"flood")
     assert not waiting.closed_to(b"other")
@@ -100,7 +100,7 @@ def test_what_is_taken_out_is_gone_and_who_left_is_forgotten() -> None:
     for id in range(3):
         waiting.add(request(b"a", id))
         waiting.add(request(b"b", id))
-    assert {work.request.id for work in waiting.take(lambda work: work.peer == b"a")} == {0, 1, 2}
+    assert {work.request.id for work in waiting.take(lambda work: work.robot == b"a")} == {0, 1, 2}
     assert [work.request.id for work in waiting] == [0, 1, 2]
     while (work := waiting.next()) is not None:
         waiting.done(work, 0.01)
