@@ -63,9 +63,10 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
         raise ConfigError(f"--tasks: {','.join(config.tasks)} registers no task")
     log.info("settings: %s", as_dict(config))
     metrics = Metrics()
+    executor = EXECUTORS[config.executor]
     server = Server(
         config.listen,
-        EXECUTORS[config.executor](config.workers, config.tasks, config.blob_bytes_max),
+        executor(config.workers, config.tasks, config.blob_bytes_max, config.worker_memory_bytes),
         metrics,
         queue_max=config.queue_max,
         blob_bytes_max=config.blob_bytes_max,

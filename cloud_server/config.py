@@ -57,6 +57,13 @@ class ServerConfig:
         "modules that register tasks, comma-separated",
         metavar="MODULE,MODULE",
     )
+    worker_memory: int = setting(
+        2048,
+        "MiB of memory that a worker process may take; a task that asks for more fails",
+        minimum=256,
+        maximum=2**20,
+        metavar="MIB",
+    )
     queue_max: int = setting(64, "waiting requests; beyond it the answer is busy", minimum=1, maximum=100_000)
     blob_mib: int = setting(
         256, "memory for large arguments kept for later requests", minimum=1, maximum=2**20
@@ -77,6 +84,12 @@ class ServerConfig:
             raise ConfigError(
                 f"--blob-mib: {self.blob_mib} is below --message-mib {self.message_mib}; "
                 "a large argument would never fit"
+            )
+
+        if self.executor == "processes" and self.worker_memory < self.blob_mib + 2 * self.message_mib:
+            raise ConfigError(
+                f"--worker-memory: {self.worker_memory} is below --blob-mib {self.blob_mib} and twice "
+                f"--message-mib {self.message_mib}, which a worker needs for arguments and results"
             )
 
     @property
@@ -105,6 +118,10 @@ class ServerConfig:
     @property
     def blob_bytes_max(self) -> int:
         return self.blob_mib * MIB
+
+    @property
+    def worker_memory_bytes(self) -> int:
+        return self.worker_memory * MIB
 
     @property
     def message_bytes_max(self) -> int:

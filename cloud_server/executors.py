@@ -1,47 +1,27 @@
 """Where tasks run: threads of this process, or worker processes. Both speak `concurrent.futures`."""
 
-import contextlib
-import ctypes
-import os
-import signal
+import logging
+import math
 import tempfile
 import threading
-import time
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field, replace
-from multiprocessing import get_context
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
-from common import cpu, tasks
-from common.blobs import BlobStore, Buffer, StoredBlob
-from common.errors import CloudBroken, ProtocolError, describe
-from common.values import decode, encode
-from common.wanted import always, call_while
+from cloud_server.outcome import Blobs, Outcome, run_task, warm_kinds
+from cloud_server.workers import Call, Died, Setup, Worker
+from common.blobs import Buffer
+from common.errors import CloudBroken
+from common.wanted import always
 
-START_S_MAX = 300.0  # the slowest worker's start, compilation included
-PR_SET_PDEATHSIG = 1
+__all__ = ["EXECUTORS", "Executor", "Outcome", "Processes", "Threads"]
 
-Blobs = Mapping[bytes, StoredBlob]
+MEMORY_BYTES_MAX = 2 << 30  # of one worker process
+SPARES = 1  # worker processes beyond those that run tasks: a start takes longer than a crash may cost
 
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """How a task went: ok, failed, or busy where it could not start; `run_s` is the time in the worker.
-
-    `cpu_s` is the CPU time used meanwhile, by all that shares the quota, or else by the process that ran it.
-    `server_fault`: it failed, but not by its own doing.
-    """
-
-    status: str
-    error: str = ""
-    run_s: float = 0.0
-    cpu_s: float | None = None
-    frames: list[Buffer] = field(default_factory=list)
-    server_fault: bool = False
+log = logging.getLogger("cloud_server")
 
 
 class Executor(Protocol):
@@ -50,18 +30,28 @@ class Executor(Protocol):
     workers: int
 
     @property
-    def broken(self) -> bool:
-        """Workers died; `submit` must not be called until `warm` is called again and done."""
+    def up(self) -> int:
+        """The workers that run a task or can take one; the others are being started again."""
 
-    def warm(self) -> "Future[None]":
-        """Start all workers and run each kind's warm in each. Does not block."""
+    def warm(self, changed: Callable[[str], None] = lambda _: None) -> "Future[None]":
+        """Start all workers and run each kind's warm in each. Once, and does not block.
+
+        From then on `changed` is called, in any thread, with a word for why a worker died, and with none
+        when one is up again.
+        """
 
     def submit(
-        self, kind: str, frames: Sequence[Buffer], blobs: Blobs, wanted: Callable[[], bool] = always
+        self,
+        kind: str,
+        frames: Sequence[Buffer],
+        blobs: Blobs,
+        wanted: Callable[[], bool] = always,
+        budget_s: float = math.inf,
     ) -> "Future[Outcome]":
-        """Run a task now; called only while fewer than `workers` run. The future never holds an exception.
+        """Run a task now; called only while fewer than `up` run. The future never holds an exception.
 
-        A task that looks may end early once it is not `wanted`, where it runs in this process.
+        A task that looks may end early once it is not `wanted`. A worker process is killed when its task
+        is still not done a little after its budget.
         """
 
     def close(self) -> None:
@@ -69,19 +59,25 @@ class Executor(Protocol):
 
 
 class Threads:
-    """Tasks in threads of the server: no copies, for tasks that release the interpreter lock."""
+    """Tasks in threads of the server: no copies, for tasks that release the interpreter lock.
 
-    broken = False
+    A task that crashes or never ends takes the server, or one of its threads, with it.
+    """
 
     def __init__(self, workers: int) -> None:
-        self.workers = workers
+        self.workers = self.up = workers
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="task")
 
-    def warm(self) -> "Future[None]":
-        return self._pool.submit(_warm_kinds)
+    def warm(self, changed: Callable[[str], None] = lambda _: None) -> "Future[None]":  # noqa: ARG002
+        return self._pool.submit(warm_kinds)
 
     def submit(
-        self, kind: str, frames: Sequence[Buffer], blobs: Blobs, wanted: Callable[[], bool] = always
+        self,
+        kind: str,
+        frames: Sequence[Buffer],
+        blobs: Blobs,
+        wanted: Callable[[], bool] = always,
+        budget_s: float = math.inf,  # noqa: ARG002 - a thread cannot be killed
     ) -> "Future[Outcome]":
         return self._pool.submit(run_task, kind, frames, blobs, wanted)
 
@@ -92,108 +88,95 @@ class Threads:
 class Processes:
     """Tasks in worker processes: for tasks that hold the interpreter lock, or may crash.
 
-    Blobs reach the workers as files in a private directory, written once; each worker keeps what it read.
+    A worker that dies takes its own task with it; a spare one takes its place, and becomes one when it is
+    started again. Blobs reach the workers as files in a
+    private directory, written once; each worker keeps what it read.
     """
 
-    def __init__(self, workers: int, modules: Sequence[str], blob_bytes_max: int) -> None:
+    def __init__(
+        self,
+        workers: int,
+        modules: Sequence[str],
+        blob_bytes_max: int,
+        memory_bytes_max: int = MEMORY_BYTES_MAX,
+    ) -> None:
         self.workers = workers
-        self.broken = False
-        self._modules = tuple(modules)
         self._spool = _Spool(blob_bytes_max)
-        self._pool: ProcessPoolExecutor | None = None
-        self._pids: list[int] = []
-        self._running: set[Future[Any]] = set()
+        self._setup = Setup(tuple(modules), str(self._spool.folder), blob_bytes_max, memory_bytes_max)
+        self._changed: Callable[[str], None] = lambda _: None
+        self._started: Future[None] = Future()
+        self._workers: list[Worker] = []
+        self._lock = threading.Lock()  # for what follows: the workers' threads change it
+        self._up: set[Worker] = set()
+        self._idle: list[Worker] = []
 
-    def warm(self) -> "Future[None]":
-        # Workers die with the thread that starts them (PDEATHSIG), hence the rule of one thread above.
-        if self._pool is not None:
-            self._pool.shutdown(wait=False)
-        context = get_context("spawn")
-        start = (self._modules, str(self._spool.folder), self._spool.bytes_max, os.getpid())
-        self._barrier = context.Barrier(self.workers)  # no worker takes two of the calls below
-        self._pool = ProcessPoolExecutor(self.workers, context, _start_worker, (*start, self._barrier))
-        self.broken = False
-        self._pids.clear()
-        try:
-            met = [self._pool.submit(_meet) for _ in range(self.workers)]
-        except BrokenProcessPool as error:
-            return _failed(error)
-        return _all_started(met, self._pids)
+    @property
+    def up(self) -> int:
+        return min(len(self._up), self.workers)
+
+    def warm(self, changed: Callable[[str], None] = lambda _: None) -> "Future[None]":
+        assert not self._workers, "warm is called once"
+        self._changed = changed
+        self._workers = [Worker(self._setup, self._free, self._died) for _ in range(self.workers + SPARES)]
+        return self._started
 
     def submit(
         self,
         kind: str,
         frames: Sequence[Buffer],
         blobs: Blobs,
-        wanted: Callable[[], bool] = always,  # noqa: ARG002 - a worker is not told
+        wanted: Callable[[], bool] = always,
+        budget_s: float = math.inf,
     ) -> "Future[Outcome]":
-        answer: Future[Outcome] = Future()
-        assert self._pool is not None, "submit before warm"
+        call = Call(kind, frames, tuple(blobs), wanted, budget_s)
+        call.answer.add_done_callback(lambda _: self._spool.unpin(blobs))
         try:
             self._spool.pin(blobs)
-            running = self._pool.submit(_run_in_worker, kind, [bytes(f) for f in frames], list(blobs))
-        except (BrokenProcessPool, OSError) as error:  # a worker died idle; no room for the blob
-            self.broken = isinstance(error, BrokenProcessPool)
-            self._spool.unpin(blobs)
-            answer.set_result(Outcome("busy", f"no worker can take it: {error}"))
-            return answer
-        self._running.add(running)
-        running.add_done_callback(lambda done: self._done(done, answer, blobs))
-        return answer
+        except OSError as error:
+            call.answer.set_result(Outcome("busy", f"no room for the blobs: {error}"))
+            return call.answer
+        with self._lock:
+            if self._idle:
+                self._idle.pop().give(call)  # the last that ran: its caches are warm
+                return call.answer
+        call.answer.set_result(Outcome("busy", "a worker died, and the next one is not there yet"))
+        return call.answer
 
     def close(self) -> None:
-        if self._pool is not None:
-            if len(self._pids) < self.workers:
-                self._barrier.abort()  # still starting
-            elif self._running:
-                for pid in self._pids:
-                    with contextlib.suppress(ProcessLookupError):
-                        os.kill(pid, signal.SIGKILL)
-            self._pool.shutdown(wait=True, cancel_futures=True)
-            self._pool = None
+        workers, self._workers = self._workers, []
+        for worker in workers:
+            worker.stop()
+        for worker in workers:
+            worker.join()
         self._spool.close()
 
-    def _done(self, running: "Future[Outcome]", answer: "Future[Outcome]", blobs: Blobs) -> None:
-        self._running.discard(running)
-        self._spool.unpin(blobs)
-        if running.cancelled():
-            answer.set_result(Outcome("busy", "the executor was closed before the task ran"))
-            return
-        error = running.exception()
-        if error is None:
-            answer.set_result(running.result())
-        elif isinstance(error, BrokenProcessPool):
-            self.broken = True
-            answer.set_result(
-                Outcome("failed", "a worker process died while this task ran", server_fault=True)
-            )
-        else:
-            answer.set_result(Outcome("failed", describe(error), server_fault=True))
+    def _free(self, worker: Worker) -> None:
+        with self._lock:
+            self._idle.append(worker)
+            known = worker in self._up
+            self._up.add(worker)
+            if len(self._up) == self.workers + SPARES and not self._started.done():
+                self._started.set_result(None)
+        if not known:
+            self._changed("")
+
+    def _died(self, worker: Worker, death: Died) -> None:
+        with self._lock:
+            self._up.discard(worker)
+            if worker in self._idle:
+                self._idle.remove(worker)
+            if not self._started.done():
+                self._started.set_exception(CloudBroken(f"worker processes did not start: one {death}"))
+                return
+        if death.reason != "closed":
+            log.warning("worker %d %s; another one takes its place", worker.pid, death)
+            self._changed(death.reason)
 
 
-EXECUTORS: dict[str, Callable[[int, Sequence[str], int], Executor]] = {
-    "threads": lambda workers, modules, blob_bytes_max: Threads(workers),  # noqa: ARG005
+EXECUTORS: dict[str, Callable[..., Executor]] = {
+    "threads": lambda workers, *_: Threads(workers),
     "processes": Processes,
 }
-
-
-def run_task(
-    kind_name: str, frames: Sequence[Buffer], blobs: Blobs, wanted: Callable[[], bool] = always
-) -> Outcome:
-    """Decode the arguments, call the task, encode its result; whatever it raises becomes the outcome."""
-    cpu_before_s, started = cpu.used_s(), time.perf_counter()
-    status, failure = "ok", ""
-    result: list[Buffer] = []
-    try:
-        kind = tasks.kind_named(kind_name)
-        args = decode(frames, kind.types, blobs)
-        if not isinstance(args, list):
-            raise ProtocolError("the body is not a list of arguments")
-        result = encode(call_while(wanted, kind.function, args), kind.types).frames
-    except BaseException as error:  # noqa: BLE001 - a task may raise anything
-        status, failure = "failed", describe(error)
-    run_s = time.perf_counter() - started
-    return Outcome(status, failure, run_s, cpu.used_s() - cpu_before_s, result)
 
 
 class _Spool:
@@ -234,82 +217,3 @@ class _Spool:
                 return
             del self._sizes[digest]
             (self.folder / digest.hex()).unlink()
-
-
-@dataclass(frozen=True, slots=True)
-class _Worker:
-    """State of one worker process."""
-
-    folder: Path
-    store: BlobStore
-    barrier: Any
-
-    def blob(self, digest: bytes) -> StoredBlob:
-        blob = self.store.get(digest)
-        if blob is None:
-            self.store.add((self.folder / digest.hex()).read_bytes())
-            blob = self.store.get(digest)
-        assert blob is not None, "a blob larger than the store passed the server"
-        return blob
-
-
-_worker: _Worker | None = None
-
-
-def _start_worker(modules: Sequence[str], folder: str, bytes_max: int, parent: int, barrier: Any) -> None:
-    global _worker
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the group; the server drains
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        os._exit(1)  # the parent died before the line above
-    _worker = _Worker(Path(folder), BlobStore(bytes_max), barrier)
-    tasks.load_modules(modules)
-    _warm_kinds()
-
-
-def _meet() -> int:
-    """Wait until every worker is here, so that each has started; its process id."""
-    assert _worker is not None
-    _worker.barrier.wait(START_S_MAX)
-    return os.getpid()
-
-
-def _run_in_worker(kind: str, frames: list[bytes], digests: list[bytes]) -> Outcome:
-    assert _worker is not None
-    outcome = run_task(kind, frames, {digest: _worker.blob(digest) for digest in digests})
-    return replace(outcome, frames=[bytes(f) for f in outcome.frames])
-
-
-def _warm_kinds() -> None:
-    cpu.used_s()  # the first call looks for what to read
-    for kind in tasks.kinds():
-        if kind.warm is not None:
-            kind.warm()
-
-
-def _all_started(met: "list[Future[int]]", pids: list[int]) -> "Future[None]":
-    """Done when every worker met the others; `pids` is filled."""
-    started: Future[None] = Future()
-    left = threading.Semaphore(len(met) - 1)
-
-    def one_met(future: "Future[int]") -> None:
-        # Cancelled: the executor was closed before this worker came to it.
-        error = CancelledError("closed") if future.cancelled() else future.exception()
-        if error is None:
-            pids.append(future.result())
-        if left.acquire(blocking=False):
-            return
-        if len(pids) == len(met):
-            started.set_result(None)
-        else:
-            started.set_exception(CloudBroken(f"worker processes did not start: {error}"))
-
-    for future in met:
-        future.add_done_callback(one_met)
-    return started
-
-
-def _failed(error: Exception) -> "Future[None]":
-    future: Future[None] = Future()
-    future.set_exception(CloudBroken(f"worker processes did not start: {error}"))
-    return future

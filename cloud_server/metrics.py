@@ -41,4 +41,6 @@ class Metrics:
             "offboard_dropped", "Messages not understood, and answers nobody took", ["reason"], registry=r
         )
         self.refused = Counter("offboard_refused", "Handshakes with a key that is not known", registry=r)
-        self.restarts = Counter("offboard_executor_restarts", "Worker pools started again", registry=r)
+        self.restarts = Counter(
+            "offboard_executor_restarts", "Workers that died and were replaced", ["reason"], registry=r
+        )

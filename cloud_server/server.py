@@ -16,7 +16,7 @@ import zmq
 from cloud_server.executors import Executor, Outcome
 from cloud_server.metrics import Metrics, Status
 from cloud_server.robots import ZAP_DOMAIN, Robots
-from cloud_server.waiting import Waiting, Work, held_bytes
+from cloud_server.waiting import CRASHES_MAX, Crashes, Waiting, Work, held_bytes
 from common import VERSION, tasks
 from common.blobs import BlobStore, Buffer
 from common.channel import Channel
@@ -42,7 +42,6 @@ COPIED_BYTES_MAX = 64 * 1024  # a larger frame is used where the transport put i
 RECEIVE_MAX = 64  # messages taken in one turn
 PEER_MESSAGES_MAX = 256  # unsent replies, and unread requests, of one robot
 SEND_LAST_S = 1.0  # time for the last replies to leave when the server stops
-RESTART_PAUSE_S = 2.0  # least time between two starts of the executor
 LOG_PAUSE_S = 10.0  # least time between two warnings about bad messages
 
 log = logging.getLogger("cloud_server")
@@ -71,6 +70,7 @@ class Server:
         self.metrics = metrics
         self._executor = executor
         self._waiting = Waiting(queue_max)
+        self._crashes = Crashes()
         self._running: set[Work] = set()
         self._blobs = BlobStore(blob_bytes_max)
         self._message_bytes_max = message_bytes_max
@@ -81,7 +81,7 @@ class Server:
         self._ready = self._was_ready = False
         self._started = self._last_turn = time.monotonic()
         self._last_task: float | None = None
-        self._last_start = self._last_warning = -float("inf")
+        self._last_warning = -float("inf")
         self._context = zmq.Context()
         self._robots: Robots | None = None
         if keys is not None and robots is not None:
@@ -127,7 +127,7 @@ class Server:
     def _turn(self) -> None:
         with self._channel.lock:
             now = self._last_turn = time.monotonic()
-            self._tend_executor(now)
+            self._tend_executor()
             for _ in range(RECEIVE_MAX):
                 if not self._receive():
                     break
@@ -135,30 +135,27 @@ class Server:
                 self._refuse(work.peer, work.request, "expired", queue_s=now - work.arrived)
             self._dispatch()
 
-    def _tend_executor(self, now: float) -> None:
-        """Start the executor, or start it again when its workers died; notice when it is warm."""
-        if self._ready and self._executor.broken:
-            self._ready = False
-            self.metrics.restarts.inc()
-            log.warning("worker processes died; starting them again")
-        if self._warming is not None:
-            if self._warming.done():
-                self._warmed(self._warming)
-        elif not self._ready and now - self._last_start >= RESTART_PAUSE_S:
-            self._last_start = now
-            self._warming = self._executor.warm()
+    def _tend_executor(self) -> None:
+        """Start the executor; once it is warm the server is ready while any of its workers is up."""
+        if self._warming is None:
+            self._warming = self._executor.warm(self._worker_changed)
             self._warming.add_done_callback(lambda _: self._channel.wake())
-
-    def _warmed(self, warming: "Future[None]") -> None:
-        self._warming = None
-        error = warming.exception()
-        if error is None:
-            self._ready = self._was_ready = True
-            self._on_ready()
         elif self._was_ready:
-            log.error("worker processes did not start again: %s", error)
-        else:
+            self._ready = self._executor.up > 0
+        elif self._warming.done():
+            self._warmed(self._warming.exception())
+
+    def _warmed(self, error: BaseException | None) -> None:
+        if error is not None:
             raise OffloadError(f"tasks could not be warmed up: {type(error).__name__}: {error}") from error
+        self._ready = self._was_ready = True
+        self._on_ready()
+
+    def _worker_changed(self, died: str) -> None:
+        """Called in a worker's thread."""
+        if died:
+            self.metrics.restarts.labels(died).inc()
+        self._channel.wake()
 
     def _receive(self) -> bool:
         """Take one message, if there is one."""
@@ -204,6 +201,8 @@ class Server:
         work = Work(peer, request, {}, time.monotonic(), self._robot_of(peer))
         if request.kind not in (kind.name for kind in tasks.kinds()):
             self._refuse(peer, request, "unknown_task", f"no task named {request.kind!r} on this server")
+        elif self._crashes.too_many(peer, request.id):
+            self._refuse(peer, request, "failed", f"its worker died {CRASHES_MAX} times; it is not run again")
         elif self._drain_until is not None:
             self._refuse(peer, request, "busy", "the server is stopping")
         elif not self._ready:
@@ -239,7 +238,7 @@ class Server:
 
     def _dispatch(self) -> None:
         """Start waiting work while workers are free."""
-        while self._ready and not self._executor.broken and len(self._running) < self._executor.workers:
+        while self._ready and len(self._running) < self._executor.up:
             work = self._waiting.next()
             if work is None:
                 return
@@ -258,8 +257,9 @@ class Server:
     def _start(self, work: Work) -> None:
         self._running.add(work)
         request = work.request
+        left_s = request.budget_s - work.queue_s
         future = self._executor.submit(
-            request.kind, request.body, work.blobs, lambda: work.wanted and self._knows(work.peer)
+            request.kind, request.body, work.blobs, lambda: work.wanted and self._knows(work.peer), left_s
         )
         future.add_done_callback(lambda done: self._finished(work, done))
 
@@ -278,6 +278,8 @@ class Server:
         self._waiting.done(work, outcome.run_s)
         self._last_task = time.monotonic()
         request = work.request
+        if outcome.crashed:
+            self._crashes.note(work.peer, request.id)
         size = byte_count(outcome.frames)
         if size > self._message_bytes_max:
             error = f"BadValue: the result takes {size} bytes, at most {self._message_bytes_max} are allowed"

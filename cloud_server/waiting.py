@@ -1,6 +1,6 @@
-"""The bounded lines of accepted requests that wait for a worker, one for each robot."""
+"""The bounded lines of accepted requests, one for each robot, and requests that are not let in again."""
 
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
@@ -9,6 +9,8 @@ from common.wire import Request, byte_count
 
 USUAL_RATE = 0.1  # of the usual run time, with each run
 ROBOTS_MAX = 1024  # of which it is known what they had; beyond it those are forgotten that ask for nothing
+CRASHES_MAX = 3  # of one request
+CRASHED_KEPT = 1024  # requests whose crashes are remembered
 
 
 @dataclass(slots=True, eq=False)
@@ -111,6 +113,24 @@ class Waiting:
 
     def __iter__(self) -> Iterator[Work]:
         return (work for line in self._lines.values() for work in line)
+
+
+class Crashes:
+    """How often a request's worker died of it; of the last CRASHED_KEPT requests with which one did."""
+
+    def __init__(self) -> None:
+        self._counts: OrderedDict[tuple[bytes, int], int] = OrderedDict()
+
+    def note(self, peer: bytes, id: int) -> None:
+        self._counts[peer, id] = self._counts.pop((peer, id), 0) + 1
+        if len(self._counts) > CRASHED_KEPT:
+            self._counts.popitem(last=False)
+
+    def too_many(self, peer: bytes, id: int) -> bool:
+        return self._counts.get((peer, id), 0) >= CRASHES_MAX
+
+    def __len__(self) -> int:
+        return len(self._counts)
 
 
 def held_bytes(works: Iterable[Work]) -> int:

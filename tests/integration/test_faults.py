@@ -204,7 +204,7 @@ def test_a_task_that_must_not_run_twice_did_not(
 
 
 def test_a_worker_that_dies_costs_no_answer(testbed: Beds, connect: Connect) -> None:
-    """A killed worker process is the server's fault: its task is answered onboard, the pool comes back."""
+    """A worker that others killed is the server's fault: its task is answered onboard, the next one comes."""
     offload = connect(testbed({"executor": "processes"}), policy=CLOUD, timeout_s=10.0)
     worker = offload(process_id)
     threading.Timer(0.3, os.kill, (worker, signal.SIGKILL)).start()

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import zmq
 
-from cloud_server.executors import EXECUTORS
+from cloud_server.executors import EXECUTORS, SPARES
 from cloud_server.metrics import Metrics
 from cloud_server.server import Server
 from cloud_server.web import Web, create_app
@@ -351,18 +351,63 @@ def test_a_result_too_large_is_a_clear_failure(serve: Serve, join: Join) -> None
     assert reply.error.startswith("BadValue: the result takes 524293 bytes, at most 262144")
 
 
-def test_a_dead_worker_process_is_replaced(serve: Serve, join: Join) -> None:
-    """The task that killed its worker fails; the answer is busy until new workers are warm."""
+def test_without_a_worker_the_server_is_busy(serve: Serve, join: Join) -> None:
+    """The task that killed the last worker fails; the answer is busy until the next one is warm."""
     running = serve("processes")
     peer = join(running.server.endpoint)
+    for _ in range(SPARES):
+        peer.request(0, "served_die")
+        peer.reply()
+        assert running.server.status().ready
     peer.request(1, "served_die")
-    assert peer.reply().status == "failed"
+    reply = peer.reply()
+    assert (reply.status, reply.server_fault, reply.run_s > 0) == ("failed", True, True)
+    assert reply.error == "the worker was killed by signal SIGKILL while this task ran"
     until(lambda: not running.server.status().ready)
     peer.request(2, "served_count")
     assert peer.reply().status == "busy"
     until(lambda: running.server.status().ready)
     assert peer.value(3, "served_sum", np.ones(9)) == 9
-    assert running.counted("executor_restarts_total") == 1
+    assert running.counted("executor_restarts_total", reason="signal") == 1 + SPARES
+
+
+def test_a_dead_worker_leaves_the_others_at_work(serve: Serve, join: Join, pipe: Path) -> None:
+    """While one of two is replaced the server stays ready, and takes tasks."""
+    running = serve("processes", workers=2)
+    peer = join(running.server.endpoint)
+    peer.request(1, "served_pipe", str(pipe))
+    peer.request(2, "served_die")
+    assert (peer.reply().id, running.server.status().ready) == (2, True)
+    peer.request(3, "served_zeros", 3)
+    assert (peer.reply().id, running.server.status().ready) == (3, True)
+    pipe.write_text("go")
+    reply = peer.reply()
+    assert (reply.id, reply.status) == (1, "ok")
+
+
+def test_a_request_that_killed_three_workers_is_not_run_again(serve: Serve, join: Join) -> None:
+    """The same id of the same robot is refused from then on; other ids and other robots are not."""
+    running = serve("processes")
+    peer, other = join(running.server.endpoint), join(running.server.endpoint)
+    for crashes in range(1, 4):
+        peer.request(7, "served_die")
+        assert "SIGKILL" in peer.reply().error
+        until(lambda: running.counted("executor_restarts_total", reason="signal") == crashes)  # noqa: B023
+        until(lambda: running.server.status().ready)
+    peer.request(7, "served_die")
+    reply = peer.reply()
+    assert (reply.status, reply.error) == ("failed", "its worker died 3 times; it is not run again")
+    assert peer.value(8, "served_count") == other.value(7, "served_count") == 0
+    assert running.counted("executor_restarts_total", reason="signal") == 3
+
+
+def test_a_run_beyond_its_budget_is_failed_not_expired(serve: Serve, join: Join, pipe: Path) -> None:
+    """Expired says that it never began; one whose worker was killed for it did, and must not run twice."""
+    peer = join(serve("processes").server.endpoint)
+    peer.request(1, "served_pipe", str(pipe), budget_s=0.2)
+    reply = peer.reply()
+    assert (reply.status, reply.server_fault) == ("failed", True)
+    assert reply.error == "the worker was killed 1 s after the budget was over while this task ran"
 
 
 def test_random_and_mutated_frames_do_no_harm(serve: Serve, join: Join) -> None:
@@ -602,6 +647,10 @@ def test_a_task_that_hangs_does_not_hold_the_exit(folder: Path, join: Join, pipe
         (["--workers", "0"], "--workers: 0 is below 1, the least allowed"),
         (["--executor", "ray"], "--executor: 'ray' is not one of threads, processes"),
         (["--blob-mib", "1"], "--blob-mib: 1 is below --message-mib 64; a large argument would never fit"),
+        (
+            ["--executor", "processes", "--worker-memory", "256"],
+            "--worker-memory: 256 is below --blob-mib 256 and twice --message-mib 64, which a worker needs",
+        ),
         (["--tasks", "no_such_module"], "task module 'no_such_module' cannot be imported"),
     ],
 )  # fmt: skip

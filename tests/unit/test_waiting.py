@@ -2,7 +2,7 @@
 
 from collections import Counter
 
-from cloud_server.waiting import ROBOTS_MAX, Waiting, Work
+from cloud_server.waiting import CRASHED_KEPT, CRASHES_MAX, ROBOTS_MAX, Crashes, Waiting, Work
 from common.wire import Request
 
 
@@ -114,3 +114,28 @@ def test_what_is_taken_out_is_gone_and_who_left_is_forgotten() -> None:
         assert work is not None
         waiting.done(work, 0.01)
     assert len(waiting._had_s) <= ROBOTS_MAX + 1
+
+
+def test_a_request_is_refused_after_its_last_crash() -> None:
+    """Its robot and its id make a request; others of the same id are not refused."""
+    crashes = Crashes()
+    for _ in range(CRASHES_MAX):
+        assert not crashes.too_many(b"robot", 7)
+        crashes.note(b"robot", 7)
+    assert crashes.too_many(b"robot", 7)
+    assert not crashes.too_many(b"robot", 8)
+    assert not crashes.too_many(b"other", 7)
+
+
+def test_what_is_remembered_of_crashes_is_bounded() -> None:
+    """The request that crashed longest ago is forgotten first."""
+    crashes = Crashes()
+    for _ in range(CRASHES_MAX):
+        for id in (1, 2):
+            crashes.note(b"robot", id)
+    for id in range(3, 3 + CRASHED_KEPT - 2):
+        crashes.note(b"robot", id)
+    crashes.note(b"robot", 1)
+    crashes.note(b"robot", 0)
+    assert len(crashes) == CRASHED_KEPT
+    assert [crashes.too_many(b"robot", id) for id in (1, 2)] == [True, False]
