@@ -308,13 +308,16 @@ def test_a_stopped_run_answers_nothing_that_it_gave_up(tmp_path: Path) -> None:
             closed.set()
             super().close()
 
-    def act(number: int) -> None:
-        if number == 2:
+    ran = itertools.count()  # four threads ask: which tasks come first is theirs to say
+
+    def act(_number: int) -> None:
+        place = next(ran)
+        if place == 2:
             until = time.monotonic() + WAIT_S
             while len(path.read_text().splitlines()) < 2 and time.monotonic() < until:
                 time.sleep(0.001)
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-        if number >= 2:
+        if place >= 2:
             assert closed.wait(WAIT_S)
 
     script.act = act
@@ -328,8 +331,7 @@ def test_a_stopped_run_answers_nothing_that_it_gave_up(tmp_path: Path) -> None:
         with pytest.raises(KeyboardInterrupt):
             run.run()
     answers.close()
-    lines = list(answers_file.read(path))
-    assert sorted((line["i"], line["error"]) for line in lines) == [(0, None), (1, None)]
+    assert [line["error"] for line in answers_file.read(path)] == [None, None]
 
 
 def test_tasks_are_made_ahead_in_order_and_bounded() -> None:
