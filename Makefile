@@ -32,9 +32,11 @@ lint: $(DEV_READY) ## ruff
 type: $(DEV_READY) ## mypy, strict on the four packages
 	$(BIN)/mypy
 
+# Tests that do not mind another one beside them.
+CROWDED := tests/unit $(addprefix tests/integration/test_,$(addsuffix .py,blobs cost crashes keys own_task processes wheel))
 test: $(DEV_READY) ## every test that this machine can run; what is skipped says why
-	$(BIN)/pytest --numprocesses 2 tests/unit
-	$(BIN)/pytest --ignore tests/unit
+	$(BIN)/pytest --numprocesses 2 $(CROWDED)
+	$(BIN)/pytest $(addprefix --ignore ,$(CROWDED))
 
 unit: $(DEV_READY) ## tests without sockets
 	$(BIN)/pytest --numprocesses 2 tests/unit
