@@ -1,4 +1,4 @@
-"""What the processes take at rest, and until they are ready."""
+"""What the processes take at rest and until they are ready, and what is installed for them."""
 
 import contextlib
 import os
@@ -19,6 +19,7 @@ COMMANDS = {"robot-client": "robot_client", "cloud-server": "cloud_server", "loa
 ROBOTS = 500  # that are connected and idle
 REST_S = 10.0
 HEAVY = ("zmq", "numba")
+ROOT = Path(__file__).parents[1]
 TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 # A robot that has planned once, and now waits.
 ROBOT = """
@@ -34,7 +35,7 @@ with Offloader.connect(sys.argv[1], policy="hedge:probe:greedy") as offload:
 
 
 def tables() -> list[Table]:
-    return [_help(), _rest()]
+    return [_help(), _rest(), _installed()]
 
 
 def _help() -> Table:
@@ -114,3 +115,25 @@ def _connected(stack: contextlib.ExitStack, server: Server) -> float:
         if not socket.poll(READY_S * 1e3):
             raise RuntimeError("the server did not answer hello")
     return (_mib(server.pid) - before) * 1024 * 1.024 / ROBOTS
+
+
+def _installed() -> Table:
+    """As pip installs the package and what it needs into an empty folder."""
+    rows, bars = [], []
+    for what, extra, limit in (("base", "", 110), ("with planning", "[planning]", 330)):
+        with tempfile.TemporaryDirectory() as folder:
+            command = [
+                sys.executable,
+                "-m",
+                "pip",
+                "install",
+                "--quiet",
+                "--target",
+                folder,
+                f"{ROOT}{extra}",
+            ]
+            subprocess.run(command, check=True, capture_output=True)
+            mb = sum(file.stat().st_size for file in Path(folder).rglob("*") if file.is_file()) / 1e6
+        rows.append([what, f"{mb:.0f}"])
+        bars.append(Bar(f"installed, {what}", mb, limit, " MB"))
+    return Table("Installed", ("what", "MB"), rows, bars)

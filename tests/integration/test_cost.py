@@ -24,7 +24,8 @@ def costs_nothing() -> None:
 
 
 def test_an_empty_task_is_two_messages_and_wakes_nobody_else(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One request, one reply, each sent by the thread that has it: readers are hardly ever woken beside."""
+    """One request, one reply, each sent by the thread that has it; a reader that were woken for each would
+    make two of them a task. Where the answer is there before a send is over, it is woken to be sure."""
     counted: Counter[str] = Counter()
     send, wake = Channel.send, Channel.wake
 
@@ -53,4 +54,4 @@ def test_an_empty_task_is_two_messages_and_wakes_nobody_else(monkeypatch: pytest
     server.drain()
     thread.join(WAIT_S)
     assert found["sent"] == 2 * TASKS
-    assert found.get("woken", 0) <= 0.1 * TASKS
+    assert found.get("woken", 0) < 0.5 * TASKS
