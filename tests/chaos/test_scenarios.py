@@ -78,7 +78,7 @@ def drawn(truth: Path) -> dict[Any, tuple[float, float]]:
 
 
 @pytest.mark.integration
-def test_a_minute_of_faults_costs_nothing(tmp_path: Path) -> None:
+def test_a_while_of_faults_costs_nothing(tmp_path: Path) -> None:
     """The soak, shortened: twenty tasks a second and random faults; none lost, none wrong, nothing grows."""
     played = play(read_scenario(find_scenario("soak")).changed(tasks=SOAK_TASKS), tmp_path, quiet=True)
     played.check_robots()
