@@ -70,7 +70,7 @@ def test_a_check_fails_with_what_it_names(broken: Callable[..., Played], name: s
     assert all("too much" in str(one) or "too little" in str(one) for one in played.verdicts if not one.holds)
 
 
-@pytest.mark.skipif(not ALL, reason="half a minute: make chaos plays it")
+@pytest.mark.skipif(not ALL, reason="CHAOS=1 is not set: make chaos plays it")
 def test_a_leak_fails_the_soak(broken: Callable[..., Played]) -> None:
     """A server that keeps a little of every task shows as growth of memory and of open files."""
     scenario = read_scenario(find_scenario("soak")).changed(tasks=LEAK_TASKS)

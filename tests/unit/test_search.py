@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import threading
 import tracemalloc
 from pathlib import Path
 
@@ -164,31 +163,6 @@ def test_buckets_grow_when_a_frontier_is_long(monkeypatch: pytest.MonkeyPatch) -
     for one, other in zip(wide, small, strict=True):
         assert (one.cost, one.expanded) == (other.cost, other.expanded)
         assert one.cells.tolist() == other.cells.tolist()
-
-
-def test_threads_on_one_map_do_not_meet() -> None:
-    """Four threads at once, plain and weighted and with hits, answer as each does alone."""
-    grid = maps.read_map(SAMPLES / "random512-10-0-crop.map")
-    field = Field(maps.passable(grid))
-    costs = np.random.default_rng(0).integers(0, 253, grid.cells.shape).astype(np.uint8)
-    pairs = maps.free_pairs(grid, 60, seed=9).tolist()
-    hits = Hits(np.arange(10, 120, 7), np.full(16, 64), np.full(16, 2.0))
-
-    def answers() -> list[tuple[str, float, list[list[int]]]]:
-        routes = []
-        for n, (start, goal) in enumerate(pairs):
-            seen = hits if n % 2 else search.NO_HITS
-            routes.append(field.route(start, goal, seen, costs if n % 3 == 0 else None))
-        return [(route.status, route.cost, route.cells.tolist()) for route in routes]
-
-    alone = answers()
-    together: list[object] = []
-    threads = [threading.Thread(target=lambda: together.append(answers())) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert together == [alone] * 4
 
 
 def test_requests_allocate_nothing_of_the_maps_size() -> None:
