@@ -8,7 +8,7 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
-TABLES = ("planner", "decision", "wire", "load", "start")
+TABLES = ("planner", "decision", "wire", "load", "attacks", "start")
 
 
 def main() -> int:

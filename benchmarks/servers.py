@@ -21,6 +21,7 @@ class Server:
     """A `cloud-server` that is ready, after `took_s`."""
 
     endpoint: str
+    http_port: int
     pid: int
     took_s: float
 
@@ -47,7 +48,7 @@ def cloud_server(tasks: str = "benchmarks.tasks", **environ: str) -> Iterator[Se
             with contextlib.suppress(OSError), urllib.request.urlopen(f"http://{http}/ready", timeout=1):
                 break
             time.sleep(POLL_S)
-        yield Server(endpoint, process.pid, time.perf_counter() - began)
+        yield Server(endpoint, int(http.rpartition(":")[2]), process.pid, time.perf_counter() - began)
 
 
 def serve(stack: contextlib.ExitStack, name: str) -> int:

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import resource
 import signal
 import sys
 from collections.abc import Mapping, Sequence
@@ -55,6 +56,7 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
     from common.keys import server_keys
     from common.tasks import kinds, load_modules
 
+    files_max = raise_file_limit()
     token = read_token(config.token_file)
     keys = server_keys(config.keys) if config.keys else None
 
@@ -62,6 +64,7 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
     if not kinds():
         raise ConfigError(f"--tasks: {','.join(config.tasks)} registers no task")
     log.info("settings: %s", as_dict(config))
+    log.info("at most %d open files, one for each robot's connection", files_max)
     metrics = Metrics()
     executor = EXECUTORS[config.executor]
     server = Server(
@@ -71,6 +74,7 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
         queue_max=config.queue_max,
         blob_bytes_max=config.blob_bytes_max,
         message_bytes_max=config.message_bytes_max,
+        robot_bytes_a_s=config.robot_bytes_a_s,
         drain_s=config.drain_s,
         on_ready=lambda: log.info("ready: listening on %s, http://%s", server.endpoint, web.address),
         keys=keys,
@@ -100,6 +104,13 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
         os._exit(1)  # an abandoned thread cannot be stopped, and exit would wait for it
     log.info("stopped; every accepted request was answered")
     return 0
+
+
+def raise_file_limit() -> int:
+    """Let this process open as many files as it may; how many that is."""
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+    return most
 
 
 def _stop(server: Any) -> None:

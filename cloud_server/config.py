@@ -69,6 +69,12 @@ class ServerConfig:
         256, "memory for large arguments kept for later requests", minimum=1, maximum=2**20
     )
     message_mib: int = setting(64, "largest message taken or sent", minimum=1, maximum=2**11 - 1)
+    robot_mib_s: int = setting(
+        256,
+        "MiB a second that one robot may send, a message counting for 64 KiB at least; else busy",
+        minimum=1,
+        maximum=2**20,
+    )
     drain_s: float = setting(10.0, "time for accepted tasks after SIGTERM or Ctrl-C", minimum=0, maximum=3600)
     log: str = setting("info", "log level", choices=("debug", "info", "warning", "error"))
 
@@ -122,6 +128,10 @@ class ServerConfig:
     @property
     def worker_memory_bytes(self) -> int:
         return self.worker_memory * MIB
+
+    @property
+    def robot_bytes_a_s(self) -> int:
+        return self.robot_mib_s * MIB
 
     @property
     def message_bytes_max(self) -> int:

@@ -41,6 +41,9 @@ class Metrics:
             "offboard_dropped", "Messages not understood, and answers nobody took", ["reason"], registry=r
         )
         self.refused = Counter("offboard_refused", "Handshakes with a key that is not known", registry=r)
+        self.cut_off = Counter(
+            "offboard_cut_off", "Connections ended for sending more than was read of them", registry=r
+        )
         self.restarts = Counter(
             "offboard_executor_restarts", "Workers that died and were replaced", ["reason"], registry=r
         )

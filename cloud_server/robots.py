@@ -3,10 +3,7 @@
 libzmq asks at the handshake alone, so who is removed later is found here: its connection is closed.
 """
 
-import contextlib
 import logging
-import os
-import socket
 import threading
 import time
 from dataclasses import dataclass
@@ -16,6 +13,7 @@ from typing import Any
 import zmq
 from zmq.utils import z85
 
+from cloud_server.connections import end, other_end
 from cloud_server.metrics import Metrics
 from common.errors import ConfigError
 from common.keys import PUBLIC, read_public
@@ -40,7 +38,7 @@ class _Connection:
     user: str
     name: str
     file: int
-    peer_name: Any
+    other_end: Any
 
 
 class Robots:
@@ -77,7 +75,7 @@ class Robots:
         connection = self._connections.get(peer.bytes)
         if connection is None or connection.user != user:
             file = int(peer.get(zmq.SRCFD))
-            self._connections[peer.bytes] = _Connection(user, name, file, _peer_name(file))
+            self._connections[peer.bytes] = _Connection(user, name, file, other_end(file))
             self._cut.pop(peer.bytes, None)
         return True
 
@@ -116,7 +114,7 @@ class Robots:
         for peer, connection in list(self._connections.items()):
             if connection.user not in self._known:
                 self._cut_off(peer, connection)
-            if connection.peer_name is None or _peer_name(connection.file) != connection.peer_name:
+            if connection.other_end is None or other_end(connection.file) != connection.other_end:
                 self._connections.pop(peer, None)
 
     def _reload(self) -> list[str]:
@@ -179,10 +177,7 @@ class Robots:
         while len(self._cut) > CUT_KEPT:
             del self._cut[next(iter(self._cut))]
         log.warning("cut off robot %s: its key is no longer in %s", connection.name, self._folder)
-        # The number may be another file's by now: hold it first, then look whose it is.
-        with contextlib.suppress(OSError), socket.socket(fileno=os.dup(connection.file)) as held:
-            if held.getpeername() == connection.peer_name:
-                held.shutdown(socket.SHUT_RDWR)  # libzmq finds the other end gone
+        end(connection.file, connection.other_end)
 
 
 def _user(peer: zmq.Frame) -> str:
@@ -199,12 +194,3 @@ def _state(path: Path) -> tuple[int, ...]:
     except OSError:
         return (0,)
     return found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
-
-
-def _peer_name(file: int) -> Any:
-    """The address of the other end; None where this is no longer an open connection."""
-    try:
-        with socket.socket(fileno=os.dup(file)) as held:
-            return held.getpeername()
-    except OSError:
-        return None

@@ -13,9 +13,12 @@ from pathlib import Path
 
 import zmq
 
+from cloud_server.connections import Backlog
 from cloud_server.executors import Executor, Outcome
 from cloud_server.metrics import Metrics, Status
+from cloud_server.quota import Quota, Verdict
 from cloud_server.robots import ZAP_DOMAIN, Robots
+from cloud_server.unsent import LARGE_BYTES, Unsent
 from cloud_server.waiting import CRASHES_MAX, Crashes, Waiting, Work, held_bytes
 from common import VERSION, tasks
 from common.blobs import BlobStore, Buffer
@@ -41,6 +44,12 @@ POLL_S = 0.5
 COPIED_BYTES_MAX = 64 * 1024  # a larger frame is used where the transport put it
 RECEIVE_MAX = 64  # messages taken in one turn
 PEER_MESSAGES_MAX = 256  # unsent replies, and unread requests, of one robot
+HANDSHAKE_S = 10.0  # for who connects to say who it is
+KEEPALIVE_IDLE_S, KEEPALIVE_EVERY_S, KEEPALIVE_PROBES = (
+    60,
+    10,
+    6,
+)  # until a robot that is silent counts as gone
 SEND_LAST_S = 1.0  # time for the last replies to leave when the server stops
 LOG_PAUSE_S = 10.0  # least time between two warnings about bad messages
 
@@ -62,6 +71,7 @@ class Server:
         queue_max: int,
         blob_bytes_max: int,
         message_bytes_max: int,
+        robot_bytes_a_s: float,
         drain_s: float,
         on_ready: Callable[[], None] = lambda: None,
         keys: KeyPair | None = None,
@@ -74,6 +84,8 @@ class Server:
         self._running: set[Work] = set()
         self._blobs = BlobStore(blob_bytes_max)
         self._message_bytes_max = message_bytes_max
+        self._quota = Quota(robot_bytes_a_s, message_bytes_max)
+        self._unsent = Unsent(message_bytes_max)
         self._drain_s = drain_s
         self._drain_until: float | None = None
         self._on_ready = on_ready
@@ -88,6 +100,8 @@ class Server:
             self._robots = Robots(self._context, robots, metrics)
         self._socket = _bind(self._context, listen, message_bytes_max, keys)
         self.endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        port = int(self.endpoint.rpartition(":")[2])
+        self._backlog = Backlog(port, message_bytes_max, blob_bytes_max, metrics, encrypted=keys is not None)
         self._channel = Channel(self._socket)
         self._closed = False
         metrics.queue_depth.set_function(lambda: len(self._waiting))
@@ -163,15 +177,21 @@ class Server:
         if message is None:
             return False
         peer, *raw = message
+        sizes = [len(frame) for frame in raw]
+        self._backlog.took(int(peer.get(zmq.SRCFD)), sizes)
         if self._robots is not None and not self._robots.lets_in(peer):
             return True
-        frames: list[Buffer] = [f.buffer if len(f) > COPIED_BYTES_MAX else f.bytes for f in raw]
-        size = byte_count(frames)
+        size = sum(sizes)
         self.metrics.bytes_in.inc(size)
+        verdict = self._quota.judge(self._robot_of(peer.bytes), size, self._last_turn)
+        if verdict is Verdict.DROP:
+            self.metrics.dropped.labels("quota").inc()
+            return True
+        frames: list[Buffer] = [f.buffer if len(f) > COPIED_BYTES_MAX else f.bytes for f in raw]
         try:
             if size > self._message_bytes_max:
                 raise ProtocolError(f"message of {size} bytes, at most {self._message_bytes_max} are allowed")
-            self._take(peer.bytes, unpack(frames))
+            self._take(peer.bytes, unpack(frames), verdict)
         except VersionMismatch as error:
             self._drop("version", error)
             self._send(peer.bytes, self._hello())
@@ -179,8 +199,12 @@ class Server:
             self._drop("malformed", error)
         return True
 
-    def _take(self, peer: bytes, message: Message) -> None:
+    def _take(self, peer: bytes, message: Message, verdict: Verdict) -> None:
         match message:
+            case Request() if verdict is Verdict.REFUSE:
+                self._refuse(peer, message, "busy", "more bytes or messages a second than one robot may send")
+            case _ if verdict is Verdict.REFUSE:
+                self.metrics.dropped.labels("quota").inc()
             case Request():
                 self._request(peer, message)
             case Blob(data):
@@ -341,9 +365,15 @@ class Server:
             self.metrics.dropped.labels("unknown robot").inc()
             return
         frames = pack(message)
+        size = byte_count(frames)
+        if size > LARGE_BYTES:
+            if not self._unsent.has_room(peer, size):
+                self.metrics.dropped.labels("not reading").inc()
+                return
+            frames = self._unsent.tracked(peer, frames, size)
         try:
             self._channel.send([peer, *frames])
-            self.metrics.bytes_out.inc(byte_count(frames))
+            self.metrics.bytes_out.inc(size)
         except zmq.Again:
             self.metrics.dropped.labels("not reading").inc()
         except zmq.ZMQError as error:
@@ -376,6 +406,7 @@ class Server:
 
     def _close(self) -> None:
         self._executor.close()
+        self._backlog.close()
         with self._channel.lock:
             self._closed = True
             self._socket.close(linger=int(SEND_LAST_S * 1000))
@@ -392,6 +423,11 @@ def _bind(
     router.setsockopt(zmq.MAXMSGSIZE, message_bytes_max)
     router.setsockopt(zmq.SNDHWM, PEER_MESSAGES_MAX)
     router.setsockopt(zmq.RCVHWM, PEER_MESSAGES_MAX)
+    router.setsockopt(zmq.HANDSHAKE_IVL, int(HANDSHAKE_S * 1000))
+    router.setsockopt(zmq.TCP_KEEPALIVE, 1)
+    router.setsockopt(zmq.TCP_KEEPALIVE_IDLE, KEEPALIVE_IDLE_S)
+    router.setsockopt(zmq.TCP_KEEPALIVE_INTVL, KEEPALIVE_EVERY_S)
+    router.setsockopt(zmq.TCP_KEEPALIVE_CNT, KEEPALIVE_PROBES)
     router.setsockopt(zmq.IPV6, int("[" in listen))
     if keys is not None:
         router.setsockopt(zmq.CURVE_SERVER, 1)

@@ -16,7 +16,9 @@ from common.guard import Guard
 try:
     import uvicorn
     from fastapi import FastAPI, Request, Response
-    from fastapi.responses import JSONResponse
+    from fastapi.responses import JSONResponse, PlainTextResponse
+
+    from common.bounded_http import BoundedHttp
 except ImportError as error:
     raise MissingExtra("cloud-server", "cloud") from error
 
@@ -56,7 +58,7 @@ def create_app(
         taking = now.ready and not now.draining
         return JSONResponse({"ready": taking}, 200 if taking else 503)
 
-    @app.get("/metrics", summary="Prometheus text")
+    @app.get("/metrics", summary="Prometheus text", response_class=PlainTextResponse)
     async def metrics() -> Response:
         return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)
 
@@ -82,7 +84,8 @@ class Web:
         self.address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
         config = uvicorn.Config(
             app,
-            log_level="warning",
+            http=BoundedHttp,
+            log_level="error",  # a line for every bad request would be the attacker's to write
             log_config=None,
             access_log=False,
             server_header=False,

@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common import search
-from common.maps import GridMap, in_cells, passable, path_size
+from common.maps import CELLS_MAX, GridMap, in_cells, passable, path_size
 from common.planners import DIJKSTRA, check_planner
 from common.tasks import task
 
 RADIUS_M = 0.2
 PREPARED_MAX = 4  # maps kept ready; 9 bytes a cell each with one search at a time
+PREPARED_CELLS_MAX = CELLS_MAX  # of them together, but for the one in use
 BEAMS_MAX = 10_000
 RADIUS_CELLS_MAX = 200  # with the most beams the overlay stays a matter of seconds
 BEHIND_CELLS = 0.001  # a beam ends on a surface, between two cells: this far on is the occupied one
@@ -156,9 +157,13 @@ def _prepared(grid: GridMap, radius_m: float) -> search.Field:
         if key not in _fields:
             _fields[key] = (weakref.ref(grid.cells), search.Field(passable(grid, radius_m)))
         _fields.move_to_end(key)
-        while len(_fields) > PREPARED_MAX:
+        while len(_fields) > PREPARED_MAX or (len(_fields) > 1 and _prepared_cells() > PREPARED_CELLS_MAX):
             _fields.popitem(last=False)
         return _fields[key][1]
+
+
+def _prepared_cells() -> int:
+    return sum(field.size for _, field in _fields.values())
 
 
 def _check(

@@ -73,9 +73,10 @@ class Route:
 
 
 class Field:
-    """The passable cells of one map, ready for searches from many threads."""
+    """The passable cells of one map, of `size` cells in all, ready for searches from many threads."""
 
     def __init__(self, passable: NDArray[np.bool_]) -> None:
+        self.size = passable.size
         height, self.width = passable.shape[0], passable.shape[1] + 2
         self._template = np.zeros((height + 2) * self.width, np.uint32)  # a blocked border: no bounds checks
         self._template.reshape(height + 2, self.width)[1:-1, 1:-1][passable] = FREE

@@ -2,25 +2,13 @@
 
 import math
 
+from common.bucket import Bucket
 from common.errors import ConfigError
 
 DUPLICATES = 0.1  # second runs a task
 DUPLICATES_MAX = 6.0  # saved up at most, and owed at most
 DUPLICATES_FIRST = 6.0  # there from the start: warm-up takes about so many
 MINUTE_S = 60.0
-
-
-class Bucket:
-    """Fills by `rate` a unit up to `most`; taking more than is there leaves a debt."""
-
-    def __init__(self, rate: float, most: float, level: float = 0.0) -> None:
-        self.rate, self.most, self.level = rate, most, level
-
-    def fill(self, units: float) -> None:
-        self.level = min(self.most, self.level + self.rate * units)
-
-    def take(self, amount: float) -> None:
-        self.level -= amount
 
 
 class Allowance:

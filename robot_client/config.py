@@ -41,7 +41,7 @@ class RobotConfig:
         "or NAME.key for the server of --site NAME: all is encrypted (CURVE)",
         metavar="DIR",
     )
-    policy: str = setting("paper", f"where to run: {policies.HELP}", metavar="NAME")
+    policy: str = setting(policies.DEFAULT, f"where to run: {policies.HELP}", metavar="NAME")
     predictor: str | None = setting(
         None, f"how times are predicted, instead of the policy's own way: {predictors.HELP}", metavar="NAME"
     )

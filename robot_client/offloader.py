@@ -126,7 +126,7 @@ class Offloader:
         endpoint: str | None = None,
         *,
         sites: dict[str, str] | None = None,
-        policy: str = "paper",
+        policy: str = policies.DEFAULT,
         predictor: str | None = None,
         window: int = WINDOW,
         timeout_s: float = TIMEOUT_S,

@@ -63,13 +63,21 @@ class Keys:
 
 
 class Served:
-    """`python -m cloud_server` as a child process, ready when made; `lines` is its log."""
+    """`python -m cloud_server` as a child process, ready when made; `lines` is its log.
 
-    def __init__(self, *flags: str) -> None:
+    `files`: its soft limit of open files at first.
+    """
+
+    def __init__(self, *flags: str, files: int | None = None) -> None:
         command = [sys.executable, "-W", "error", "-m", "cloud_server", "--tasks", "tests.probes"]
         free = ["--listen", "tcp://127.0.0.1:0", "--http", "127.0.0.1:0", "--workers", "2"]
+        limit = [] if files is None else ["prlimit", f"--nofile={files}:", "--"]
         self.process = subprocess.Popen(
-            [*command, *free, *flags], stderr=subprocess.PIPE, text=True, cwd=ROOT, env=clean_environ()
+            [*limit, *command, *free, *flags],
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=ROOT,
+            env=clean_environ(),
         )
         self.lines: list[str] = []
         self._reader = threading.Thread(target=self._read)

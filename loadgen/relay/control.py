@@ -20,6 +20,8 @@ try:
     from pydantic import BaseModel, ConfigDict, Field
     from starlette.exceptions import HTTPException
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+    from common.bounded_http import BoundedHttp
 except ImportError as error:
     raise MissingExtra("the relay", "bench") from error
 
@@ -86,8 +88,8 @@ class ControlServer(uvicorn.Server):
     """Serves an API in the relay's own event loop; signals are left to the relay."""
 
     def __init__(self, app: FastAPI) -> None:
-        options: dict[str, Any] = {"lifespan": "off", "log_level": "warning", "access_log": False}
-        options["server_header"] = False
+        options: dict[str, Any] = {"lifespan": "off", "log_level": "error", "access_log": False}
+        options |= {"server_header": False, "http": BoundedHttp}
         super().__init__(uvicorn.Config(app, timeout_graceful_shutdown=STOP_S, **options))
 
     @contextlib.contextmanager

@@ -145,6 +145,14 @@ def test_containers_can_do_little(up: Compose, service: str) -> None:
     assert host["PidsLimit"] > 0
 
 
+@pytest.mark.parametrize("image", ["offboard-cloud", "offboard-robot", "offboard-bench"])
+def test_images_have_no_compiler(up: Compose, image: str) -> None:  # noqa: ARG001 - it builds them
+    """Who gets into a container finds nothing to build with."""
+    tools = "cc gcc g++ c++ clang tcc make ld as"
+    look = f"for tool in {tools}; do command -v $tool || true; done"
+    assert docker("run", "--rm", "--network", "none", "--entrypoint", "sh", image, "-c", look).split() == []
+
+
 def test_the_robot_pins_the_server_and_has_no_key_of_it(up: Compose) -> None:
     """The robot's keys are its own and the server's public one; it runs by CURVE."""
     list_keys = "from pathlib import Path; print(*sorted(path.name for path in Path('/keys').iterdir()))"

@@ -32,7 +32,8 @@ class Served:
 
     def __init__(self) -> None:
         self.metrics = Metrics()
-        bounds = {"queue_max": 8, "blob_bytes_max": 2**24, "message_bytes_max": 2**24, "drain_s": 1.0}
+        bounds = {"queue_max": 8, "blob_bytes_max": 2**24, "message_bytes_max": 2**24}
+        bounds |= {"robot_bytes_a_s": 2**30, "drain_s": 1}
         self.server = Server("tcp://127.0.0.1:0", Threads(1), self.metrics, **bounds)  # type: ignore[arg-type]
 
     @property

@@ -41,7 +41,7 @@ def test_an_empty_task_is_two_messages_and_wakes_nobody_else(monkeypatch: pytest
     monkeypatch.setattr(Channel, "wake", counted_wake)
     server = Server(
         "tcp://127.0.0.1:0", Threads(1), Metrics(),
-        queue_max=8, blob_bytes_max=2**20, message_bytes_max=2**20, drain_s=1.0,
+        queue_max=8, blob_bytes_max=2**20, message_bytes_max=2**20, robot_bytes_a_s=2**30, drain_s=1.0,
     )  # fmt: skip
     thread = Thread(target=server.run)
     thread.start()

@@ -80,7 +80,13 @@ class Running:
     """A server in a thread of this process."""
 
     def __init__(self, executor: str = "threads", *, workers: int = 1, **bounds: Any) -> None:
-        bounds = {"queue_max": 8, "blob_bytes_max": 2**20, "message_bytes_max": 2**20, "drain_s": 5} | bounds
+        bounds = {
+            "queue_max": 8,
+            "blob_bytes_max": 2**20,
+            "message_bytes_max": 2**20,
+            "robot_bytes_a_s": 2**30,
+            "drain_s": 5,
+        } | bounds
         self.metrics = Metrics()
         ready = threading.Event()
         pool = EXECUTORS[executor](workers, ["served_tasks"], bounds["blob_bytes_max"])
@@ -567,7 +573,8 @@ def test_the_web_shows_the_server(serve: Serve, join: Join) -> None:
 def test_a_port_in_use_is_a_config_error(serve: Serve) -> None:
     """Both sockets name the flag and the address."""
     running = serve()
-    bounds: dict[str, Any] = {"queue_max": 1, "blob_bytes_max": 1, "message_bytes_max": 1, "drain_s": 1.0}
+    bounds: dict[str, Any] = {"queue_max": 1, "blob_bytes_max": 1, "message_bytes_max": 1}
+    bounds |= {"robot_bytes_a_s": 1, "drain_s": 1.0}
     with pytest.raises(ConfigError, match=r"--listen: 'tcp://127.0.0.1:\d+' cannot be bound: Address"):
         Server(running.server.endpoint, running.pool, Metrics(), **bounds)
     first = Web(create_app(running.server.status, running.metrics.registry, {}), ("127.0.0.1", 0))

@@ -45,4 +45,7 @@ def test_a_wrong_name_is_one_line() -> None:
     command = [sys.executable, "-m", "benchmarks", "planer"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert "table 'planer' is not one of planner, decision, wire, load, start" in done.stderr.splitlines()[-1]
+    assert (
+        "table 'planer' is not one of planner, decision, wire, load, attacks, start"
+        in done.stderr.splitlines()[-1]
+    )

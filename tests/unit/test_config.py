@@ -177,7 +177,7 @@ FILES = {
             "--metrics: '127.0.0.1:99999'",
         ),
         (
-            ["robot_client", "--map", "open.map", "--objective", "p95"],
+            ["robot_client", "--map", "open.map", "--policy", "paper", "--objective", "p95"],
             "--objective: p95 changes nothing with",
         ),
         (
@@ -307,7 +307,10 @@ COSTS = {"policy": "greedy"}
         (MAP | COSTS | {"deadline_s": 0.5}, "--deadline: 0.5 needs --objective deadline"),
         (MAP | COSTS | {"s_per_joule": 2.0}, "--s-per-joule: 2 needs --objective energy"),
         (MAP | COSTS | {"objective": "deadline", "deadline_s": 0.0}, "--deadline: 0.0 is below 0.001"),
-        (MAP | {"objective": "p95"}, "--objective: p95 changes nothing with --policy paper"),
+        (
+            MAP | {"objective": "p95", "policy": "paper"},
+            "--objective: p95 changes nothing with --policy paper",
+        ),
         (MAP | {"objective": "p95", "policy": "hedge:cloud"}, "--objective: p95 changes nothing with"),
         (MAP | {"duplicates": 1.5}, "--duplicates: 1.5 is above 1"),
         (MAP | {"compute_watts": -1.0}, "--compute-watts: -1.0 is below 0"),

@@ -138,6 +138,9 @@ def test_bad_files_are_named(tmp_path: Path) -> None:
     broken.write_text("image: [\n")
     text.write_text("just words\n")
     (tmp_path / "huge.pgm").write_bytes(b"P5 10000 10000 255\n")
+    (tmp_path / "enormous.pgm").write_bytes(b"P5 32000 32000 255\n")
+    enormous = tmp_path / "enormous.yaml"
+    enormous.write_text("".join(f"{n}: {v}\n" for n, v in {**FIELDS, "image": "enormous.pgm"}.items()))
     huge.write_text("".join(f"{n}: {v}\n" for n, v in {**FIELDS, "image": "huge.pgm"}.items()))
     for path, said in (
         (tmp_path / "absent.yaml", "no such file"),
@@ -146,6 +149,7 @@ def test_bad_files_are_named(tmp_path: Path) -> None:
         (broken, "not readable as YAML"),
         (text, "it holds no fields"),
         (huge, "cells, allowed are"),
+        (enormous, "exceeds limit"),
     ):
         with pytest.raises(DataError, match=said) as error:
             read_map(path)

@@ -4,6 +4,7 @@ import json
 import logging
 import os
 import resource
+import time
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from common.errors import CloudTimeout, ConfigError, DataError
 from robot_client.policies import Decision, Outlook
 from robot_client.regret import Regret
 from robot_client.runner import CLOUD, ONBOARD, Condition, Execution
-from robot_client.trace import Late, Record, Trace, read
+from robot_client.trace import WAITING_MAX, WRITE_EVERY_S, Late, Record, Trace, read
 
 
 def record(i: int = 0) -> Record:
@@ -191,6 +192,7 @@ def test_a_full_disk_is_logged_and_tasks_go_on(tmp_path: Path, caplog: pytest.Lo
     resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 50, limits[1]))
     try:
         trace.write(record(1))
+        trace.flush()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert "task 1 lost (1 so far)" in caplog.text
@@ -208,6 +210,20 @@ def test_a_closed_trace_takes_no_more(tmp_path: Path) -> None:
     trace.close()
     assert trace.lost == 0
     assert [fields["i"] for fields in read(trace.path)] == [0]
+
+
+def test_lines_are_written_without_being_asked_for(tmp_path: Path) -> None:
+    """A robot that goes on, or is killed, has left its records but for those of the last moments."""
+    trace = Trace(tmp_path / "trace.jsonl")
+    for i in range(WAITING_MAX + 3):
+        trace.write(record(i))
+    assert len(list(read(trace.path))) >= WAITING_MAX
+    until = time.monotonic() + 10
+    while len(list(read(trace.path))) < WAITING_MAX + 3:
+        assert time.monotonic() < until
+        time.sleep(WRITE_EVERY_S)
+    assert [fields["i"] for fields in read(trace.path)] == list(range(WAITING_MAX + 3))
+    trace.close()
 
 
 def write(folder: Path, count: int) -> Path:

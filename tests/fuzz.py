@@ -1,0 +1,87 @@
+"""Coverage-guided fuzzing of what a robot may send: `python -m tests.fuzz CORPUS [libFuzzer's flags]`.
+
+An input is the frames of one message, each after its length. Whatever they are, reading them gives a
+message or a ProtocolError, and what a plan is asked with gives a plan or an ordinary exception.
+`-max_total_time=3600` is an hour.
+"""
+
+import contextlib
+import struct
+import sys
+from pathlib import Path
+
+import atheris
+
+from common import search  # first: compiled code cannot be instrumented
+
+with atheris.instrument_imports(
+    include=["msgpack", "common.wire", "common.values", "common.blobs", "common.planner"]
+):
+    from common import wire
+    from common.blobs import BlobStore
+    from common.errors import BadValue, ProtocolError
+    from common.planner import Plan, plan_path
+    from common.tasks import kind_of
+
+from benchmarks.attackers import Frames, bombs, valid_messages
+from common import planner
+
+FRAMES_MAX = 40
+SEED_BYTES_MAX = 4096  # a larger bomb teaches nothing
+LENGTH = struct.Struct("<H")
+
+
+def joined(frames: Frames) -> bytes:
+    return b"".join(LENGTH.pack(len(frame)) + frame for frame in frames)
+
+
+def split(data: bytes) -> Frames:
+    frames: Frames = []
+    while len(data) >= LENGTH.size and len(frames) < FRAMES_MAX:
+        (size,) = LENGTH.unpack_from(data)
+        frames.append(data[LENGTH.size : LENGTH.size + size])
+        data = data[LENGTH.size + size :]
+    return frames
+
+
+def check(data: bytes) -> None:
+    """One message, as the server and then its worker take it."""
+    frames = split(data)
+    try:
+        message = wire.unpack(frames)
+    except ProtocolError:
+        return
+    assert wire.unpack(wire.pack(message)) == message
+    if not isinstance(message, wire.Request | wire.Reply):
+        return
+    store, kind = BlobStore(1 << 20), kind_of(plan_path)
+    digest = store.add(bytes(70_000))
+    blob = store.get(digest)
+    assert blob is not None
+    digests = message.blobs if isinstance(message, wire.Request) else ()
+    try:
+        arguments = (
+            wire.decode(message.body, kind.types, dict.fromkeys(digests, blob)) if message.body else []
+        )
+    except ProtocolError:
+        return
+    with contextlib.suppress(BadValue):  # one frame too many, say
+        wire.encode(arguments, kind.types)
+    if isinstance(message, wire.Request) and isinstance(arguments, list):
+        with contextlib.suppress(Exception):  # the task's own: answered `failed`
+            assert isinstance(plan_path(*arguments), Plan)
+
+
+def main() -> None:
+    corpus = Path(sys.argv[1])
+    corpus.mkdir(parents=True, exist_ok=True)
+    for n, frames in enumerate([*valid_messages(), *bombs().values()]):
+        if sum(map(len, frames)) <= SEED_BYTES_MAX and len(frames) <= FRAMES_MAX:
+            (corpus / f"seed-{n:02}").write_bytes(joined(frames))
+    planner.warm()
+    atheris.Setup(sys.argv, check)
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()

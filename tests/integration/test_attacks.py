@@ -1,0 +1,334 @@
+"""What a wicked robot, or a stranger, sends to a server: rows of docs/security.md."""
+
+import contextlib
+import random
+import socket
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+import zmq
+
+from benchmarks.attackers import (
+    ATTACKS,
+    IDLE,
+    PLAIN_GREETING,
+    READY,
+    Target,
+    bombs,
+    curve_greeting,
+    dealer,
+    mutate,
+    request,
+    valid_messages,
+)
+from cloud_server.server import HANDSHAKE_S
+from common import wire
+from common.bounded_http import CONNECTIONS_MAX, REQUEST_S
+from common.maps import GridMap
+from common.planner import Point, Pose, plan_path
+from robot_client.offloader import Offloader
+from tests.curves import WAIT_S, Keys, Served, until
+from tests.probes import echo
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
+
+MIB = 1 << 20
+MESSAGE_MIB, BLOB_MIB = 16, 32
+SIZES = ("--message-mib", f"{MESSAGE_MIB}", "--blob-mib", f"{BLOB_MIB}")
+GARBAGE = 100_000  # messages
+MUTATED = 20_000
+CLAIMED = 2**32  # bytes
+PING = 777_777
+UNREAD_MIB = 400  # two messages, and what loopback brings in a tenth of a second
+CONNECTION_BYTES = 80_000  # of the server, for a robot that says nothing
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Keys:
+    return Keys(tmp_path_factory.mktemp("keys"))
+
+
+@pytest.fixture(scope="module")
+def wicked(keys: Keys) -> Path:
+    return keys.add("wicked")
+
+
+@pytest.fixture(scope="module")
+def good(keys: Keys) -> Path:
+    return keys.add("good")
+
+
+@pytest.fixture(scope="module")
+def served(keys: Keys, wicked: Path, good: Path) -> Iterator[Served]:  # noqa: ARG001 - their keys come first
+    """A server for all attacks: what one of them broke, the next would find."""
+    served = Served("--keys", str(keys.server), "--tasks", "tests.probes,common.planner", *SIZES)
+    yield served
+    served.close()
+    forged = [line for line in served.lines if "mallory" in line and "\\n" not in line]
+    assert not forged, forged
+
+
+@pytest.fixture
+def target(served: Served, wicked: Path) -> Target:
+    return Target(served.endpoint, int(served.http.rpartition(":")[2]), wicked)
+
+
+def memory(served: Served) -> int:
+    """Resident bytes."""
+    lines = Path(f"/proc/{served.process.pid}/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmRSS:"))
+
+
+def dropped(served: Served) -> float:
+    text = httpx.get(f"{served.http}/metrics").text
+    return sum(
+        float(line.split()[-1]) for line in text.splitlines() if line.startswith("offboard_dropped_total")
+    )
+
+
+def is_served(served: Served, keys: Path | None) -> None:
+    """A good robot has a task answered in the cloud."""
+    with Offloader.connect(served.endpoint, policy="cloud", keys=keys) as offload:
+        assert offload.wait_for_sites(echo, WAIT_S) == {}
+        assert offload(echo, "still there") == "still there"
+        assert offload.last is not None
+        assert offload.last.used == "cloud", offload.last.executions
+
+
+def until_pong(client: "zmq.Socket[bytes]") -> list[wire.Message]:
+    """What the server answers until it answers a ping; pings beyond the quota are not read."""
+    answers: list[wire.Message] = []
+    until_s = time.monotonic() + WAIT_S
+    while not any(isinstance(one, wire.Pong) and one.id == PING for one in answers):
+        assert time.monotonic() < until_s, "no answer to the ping"
+        client.send_multipart(wire.pack(wire.Ping(PING)))
+        while client.poll(200):
+            answers.append(wire.unpack(client.recv_multipart()))
+    return answers
+
+
+def test_garbage_is_dropped_and_counted(served: Served, target: Target, good: Path) -> None:
+    """100,000 messages of random bytes: none is taken, none costs memory, and the next robot is served."""
+    before, at_first = dropped(served), memory(served)
+    attack = ATTACKS["garbage"](target)
+    with contextlib.closing(attack):
+        for _ in range(GARBAGE):
+            next(attack)
+        until(lambda: dropped(served) - before > GARBAGE / 2)  # what finds a full queue is not sent
+    is_served(served, good)
+    assert memory(served) - at_first < 2 * MESSAGE_MIB * MIB
+
+
+def test_changed_messages_do_no_harm(served: Served, target: Target, good: Path) -> None:
+    """Good messages with changed bits, bytes, lengths or frames: the server answers, or drops them."""
+    rng, messages = random.Random(5), valid_messages()
+    with dealer(target) as client:
+        client.sndtimeo = int(WAIT_S * 1000)
+        answers = []
+        for _ in range(MUTATED):
+            client.send_multipart(mutate(rng.choice(messages), rng))
+            while client.poll(0):
+                answers.append(wire.unpack(client.recv_multipart()))
+        answers += until_pong(client)
+    statuses = Counter(one.status for one in answers if isinstance(one, wire.Reply))
+    assert statuses["ok"] > 0
+    assert statuses["failed"] > 0
+    is_served(served, good)
+
+
+@pytest.mark.parametrize("name", bombs())
+def test_bombs_cost_nothing(served: Served, target: Target, good: Path, name: str) -> None:
+    """What is small and says that it is large, or is code: refused or dropped, and no memory is taken."""
+    at_first = memory(served)
+    with dealer(target) as client:
+        client.send_multipart(bombs()[name])
+        answers = until_pong(client)
+    replies = [one for one in answers if isinstance(one, wire.Reply)]
+    assert all(one.status in ("failed", "unknown_task", "need_blob") for one in replies), replies
+    assert served.process.poll() is None
+    assert memory(served) - at_first < MESSAGE_MIB * MIB
+    is_served(served, good)
+
+
+@pytest.mark.parametrize("encrypted", [False, True], ids=["plain", "curve"])
+def test_a_claim_of_4_gb_is_not_believed(served: Served, good: Path, encrypted: bool) -> None:
+    """A frame that says it has 4 GB: the connection is closed, and no memory taken for it."""
+    at_first = memory(served)
+    greeting = curve_greeting() if encrypted else PLAIN_GREETING + READY
+    with socket.create_connection(("127.0.0.1", served.port), WAIT_S) as client:
+        client.sendall(greeting + b"\x06" + CLAIMED.to_bytes(8, "big"))
+        with contextlib.suppress(ConnectionResetError):
+            while client.recv(65536):
+                pass
+    assert memory(served) - at_first < MESSAGE_MIB * MIB
+    is_served(served, good)
+
+
+def test_a_claim_of_4_gb_is_not_believed_without_keys() -> None:
+    """After a handshake that any may make: a connection is closed that says a frame has 4 GB."""
+    served = Served(*SIZES)
+    try:
+        at_first = memory(served)
+        with socket.create_connection(("127.0.0.1", served.port), WAIT_S) as client:
+            client.sendall(PLAIN_GREETING + READY)
+            answered = b""
+            while b"READY" not in answered:
+                answered += client.recv(65536)
+            client.sendall(b"\x02" + CLAIMED.to_bytes(8, "big"))
+            with contextlib.suppress(ConnectionResetError):
+                while client.recv(65536):
+                    pass
+        assert memory(served) - at_first < MESSAGE_MIB * MIB
+    finally:
+        served.close()
+
+
+def test_a_message_without_end_is_cut_off() -> None:
+    """Small frames of one message that never ends: the connection goes before the memory does."""
+    served = Served(*SIZES)
+    try:
+        at_first, most = memory(served), 0
+        attack = ATTACKS["endless"](Target(served.endpoint, 0, None))
+        with contextlib.closing(attack):
+            until_s = time.monotonic() + WAIT_S
+            while served.logged("could not be read") < 3 and time.monotonic() < until_s:
+                next(attack)
+                most = max(most, memory(served) - at_first)
+        print(f"{most / MIB:.0f} MiB")
+        assert served.logged("could not be read") == 3
+        assert most < UNREAD_MIB * MIB
+        is_served(served, None)
+    finally:
+        served.close()
+
+
+def test_who_does_not_read_is_not_answered_for_ever(served: Served, target: Target, good: Path) -> None:
+    """A robot asks for large results and reads none: what waits for it is bounded by bytes."""
+    at_first = memory(served)
+    body = wire.encode([MESSAGE_MIB * MIB // 2]).frames
+    with dealer(target) as client:
+        client.rcvhwm = 1
+        for _ in range(60):
+            client.send_multipart(request(body, "zeros"))
+            time.sleep(0.02)
+        assert memory(served) - at_first < 6 * MESSAGE_MIB * MIB
+        assert dropped(served) > 0
+    is_served(served, good)
+
+
+def test_bytes_a_second_are_bounded(keys: Keys, wicked: Path, good: Path) -> None:
+    """More than --robot-mib-s: requests are `busy`; another robot is served."""
+    served = Served("--keys", str(keys.server), *SIZES, "--robot-mib-s", "1")
+    try:
+        with dealer(Target(served.endpoint, 0, wicked)) as client:
+            body = wire.encode([bytes(60_000)]).frames
+            statuses = []
+            for _ in range(350):  # 64 KiB each, of which there are 16 MiB at first
+                client.send_multipart(request(body, "echo"))
+                assert client.poll(int(WAIT_S * 1000))
+                reply = wire.unpack(client.recv_multipart())
+                assert isinstance(reply, wire.Reply)
+                statuses.append(reply.status)
+            assert statuses[:250] == ["ok"] * 250
+            assert statuses.count("busy") > 50
+            is_served(served, good)
+    finally:
+        served.close()
+
+
+def test_slow_handshakes_end(served: Served, good: Path) -> None:
+    """200 connections that say a byte now and then are closed after HANDSHAKE_S; robots are served."""
+    clients = [socket.create_connection(("127.0.0.1", served.port), WAIT_S) for _ in range(200)]
+    began = time.monotonic()
+    text = iter(curve_greeting())
+    try:
+        while clients and time.monotonic() - began < 2 * HANDSHAKE_S:
+            said = bytes([next(text, 0)])
+            for client in list(clients):
+                try:
+                    client.sendall(said)
+                    client.settimeout(0.001)
+                    with contextlib.suppress(TimeoutError):
+                        while client.recv(4096):
+                            pass
+                        raise ConnectionResetError
+                except OSError:
+                    client.close()
+                    clients.remove(client)
+            time.sleep(0.3)
+            is_served(served, good)
+    finally:
+        for client in clients:
+            client.close()
+    assert not clients
+
+
+def test_slow_http_ends_and_lets_others_in(served: Served) -> None:
+    """More connections than the server holds, each with half a request: health is answered, and they end."""
+    address = ("127.0.0.1", int(served.http.rpartition(":")[2]))
+    clients = [socket.create_connection(address, WAIT_S) for _ in range(CONNECTIONS_MAX + 50)]
+    began = time.monotonic()
+    try:
+        for client in clients:
+            with contextlib.suppress(OSError):
+                client.sendall(b"GET /health HTTP/1.1\r\nX: ")
+        assert httpx.get(f"{served.http}/health").status_code == 200
+        while time.monotonic() - began < REQUEST_S + 2:
+            for client in clients:
+                with contextlib.suppress(OSError):
+                    client.sendall(b"x")
+            time.sleep(0.5)
+            assert httpx.get(f"{served.http}/health").status_code == 200
+        for client in clients:
+            with contextlib.suppress(ConnectionResetError):
+                assert client.recv(1) == b""
+    finally:
+        for client in clients:
+            client.close()
+
+
+def test_five_thousand_robots_may_be_idle(keys: Keys, wicked: Path, good: Path) -> None:
+    """The server raises its soft limit of open files; another robot is served, memory is as the docs say."""
+    served = Served("--keys", str(keys.server), *SIZES, files=1024)
+    try:
+        at_first = memory(served)
+        attack = ATTACKS["idle"](Target(served.endpoint, 0, wicked))
+        with contextlib.closing(attack):
+            for _ in range(IDLE):
+                next(attack)
+            files = Path(f"/proc/{served.process.pid}/fd")
+            until(lambda: len(list(files.iterdir())) > IDLE, 60.0)
+            is_served(served, good)
+            print((memory(served) - at_first) / IDLE, "bytes each")
+            assert memory(served) - at_first < IDLE * CONNECTION_BYTES
+    finally:
+        served.close()
+
+
+def test_a_good_robot_is_served_beside_all_attacks(served: Served, target: Target, good: Path) -> None:
+    """Every attack but the idle one at once, each by half a core: no plan of a good robot is lost."""
+    command = [sys.executable, "-m", "benchmarks.attackers"]
+    place = [target.endpoint, str(target.http_port), str(target.keys)]
+    attackers = [
+        subprocess.Popen([*command, name, *place], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        for name in ATTACKS
+        if name != "idle"
+    ]
+    try:
+        grid = GridMap(np.zeros((40, 60), np.int8), 0.1)
+        with Offloader.connect(served.endpoint, policy="cloud", keys=good, timeout_s=WAIT_S) as offload:
+            assert offload.wait_for_sites(plan_path, 3 * WAIT_S) == {}
+            for n in range(100):
+                plan = offload(plan_path, grid, None, Pose(0.5, 0.5), Point(0.6 + n / 100, 0.6))
+                assert plan.status == "NONE"
+    finally:
+        steps = [int(one.communicate(timeout=WAIT_S)[0]) for one in attackers]
+    assert all(steps), dict(zip(ATTACKS, steps, strict=False))
+    is_served(served, good)

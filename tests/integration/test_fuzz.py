@@ -1,0 +1,60 @@
+"""Inputs that look for a way to break what reads them; one hour by hand is `python -m tests.fuzz`."""
+
+import re
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from tests.curves import ROOT, Served, clean_environ
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
+
+FUZZ_S = 60
+TOKEN = "a-token-of-the-tests"
+
+
+@pytest.mark.skipif(
+    find_spec("atheris") is None, reason="atheris is not installed: it has no wheel for this computer"
+)
+def test_no_message_breaks_its_reader(tmp_path: Path) -> None:
+    """A minute of changes that seek new ways through the code: no crash, no hang, no error but ours."""
+    limits = [f"-max_total_time={FUZZ_S}", "-timeout=10", "-rss_limit_mb=2048", "-max_len=8192", "-seed=1"]
+    command = [sys.executable, "-m", "tests.fuzz", str(tmp_path / "corpus"), *limits]
+    done = subprocess.run(
+        [*command, f"-artifact_prefix={tmp_path}/"],
+        cwd=ROOT,
+        env=clean_environ(),
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr[-4000:]
+    runs = re.search(r"Done (\d+) runs", done.stderr)
+    assert runs is not None, done.stderr[-2000:]
+    assert int(runs[1]) > 10_000
+    print(done.stderr.splitlines()[-1])
+
+
+@pytest.mark.parametrize("guarded", [False, True], ids=["open", "token"])
+def test_http_is_what_its_openapi_says(tmp_path: Path, guarded: bool) -> None:
+    """Requests made from the server's own OpenAPI, good and bad, get what it says, and never a 5xx."""
+    token = tmp_path / "token"
+    token.touch(0o600)
+    token.write_text(TOKEN)
+    served = Served(*(["--token-file", str(token)] if guarded else []))
+    try:
+        flags = ["--checks", "all", "--max-examples", "30", "--seed", "1", "--workers", "1", "--no-color"]
+        if guarded:
+            flags += ["--header", f"Authorization: Bearer {TOKEN}"]
+        done = subprocess.run(
+            [sys.executable, "-m", "schemathesis.cli", "run", f"{served.http}/openapi.json", *flags],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
+        assert served.process.poll() is None
+    finally:
+        served.close()
