@@ -61,10 +61,11 @@ Attack = Callable[[Target], Generator[None]]
 def main() -> None:
     name, endpoint, http_port, keys = sys.argv[1:]
     target = Target(endpoint, int(http_port), Path(keys) if keys else None)
-    attack, steps, began = ATTACKS[name](target), 0, time.monotonic()
+    attack, steps = ATTACKS[name](target), 0
+    began, used = time.monotonic(), time.process_time()
     for _ in attack:
         steps += 1
-        ahead = time.process_time() - SHARE * (time.monotonic() - began)
+        ahead = time.process_time() - used - SHARE * (time.monotonic() - began)
         if select.select([sys.stdin], [], [], max(0.0, ahead / SHARE))[0]:
             break
     attack.close()

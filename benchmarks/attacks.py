@@ -63,9 +63,13 @@ class _Phase:
 
 
 def beside(keys: Keyring, plans: int, attacks: dict[str, object]) -> Table:
-    """The same plans in turn alone and beside each attack."""
-    good, wicked = keys.robot("good"), keys.robot("wicked")
-    sizes = {"CLOUD_BLOB_MIB": f"{BLOB_MIB}", "CLOUD_MESSAGE_MIB": f"{MESSAGE_MIB}"}
+    """The same plans in turn alone and beside each attack, each by another robot: floods are shut out."""
+    good, wicked = keys.robot("good"), {name: keys.robot(f"wicked-{name}") for name in attacks}
+    sizes = {
+        "CLOUD_BLOB_MIB": f"{BLOB_MIB}",
+        "CLOUD_MESSAGE_MIB": f"{MESSAGE_MIB}",
+        "CLOUD_ROBOT_MIB_S": "64",  # the server's own default
+    }
     rows, quiet, attacked = [], _Phase(), _Phase()
     with (
         cloud_server("common.planner", CLOUD_KEYS=str(keys.server), **sizes) as server,
@@ -79,7 +83,7 @@ def beside(keys: Keyring, plans: int, attacks: dict[str, object]) -> Table:
             before, beside = _Phase(), _Phase()
             plan(before, plans)
             command = [sys.executable, "-m", "benchmarks.attackers", name]
-            with running([*command, server.endpoint, str(server.http_port), str(wicked)]) as attacker:
+            with running([*command, server.endpoint, str(server.http_port), str(wicked[name])]) as attacker:
                 time.sleep(SETTLE_IDLE_S if name == "idle" else SETTLE_S)
                 plan(beside, plans)
                 steps = attacker.communicate(timeout=READY_S)[0].strip()

@@ -18,6 +18,8 @@ DESCRIPTION = (
     "`cloud-server keys` makes its keys."
 )
 
+SWITCH_S = 0.0005  # in which a thread that computes lets others in: a reply shall not wait for a flood
+
 log = logging.getLogger("cloud_server")
 
 
@@ -56,6 +58,7 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
     from common.keys import server_keys
     from common.tasks import kinds, load_modules
 
+    sys.setswitchinterval(SWITCH_S)
     files_max = raise_file_limit()
     token = read_token(config.token_file)
     keys = server_keys(config.keys) if config.keys else None

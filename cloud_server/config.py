@@ -70,7 +70,7 @@ class ServerConfig:
     )
     message_mib: int = setting(64, "largest message taken or sent", minimum=1, maximum=2**11 - 1)
     robot_mib_s: int = setting(
-        256,
+        64,
         "MiB a second that one robot may send, a message counting for 64 KiB at least; else busy",
         minimum=1,
         maximum=2**20,

@@ -56,6 +56,7 @@ class Robots:
         self._problems: list[str] = []
         self._connections: dict[bytes, _Connection] = {}
         self._cut: dict[bytes, None] = {}
+        self._shut_out: dict[str, float] = {}  # public keys, until when
         self._last_warning = -float("inf")
         for problem in self._reload():
             raise ConfigError(f"--robots: {problem}")
@@ -83,6 +84,15 @@ class Robots:
         """Whose connection this is, however many of his there are."""
         connection = self._connections.get(peer)
         return peer if connection is None else connection.user.encode()
+
+    def shut_out(self, peer: bytes, seconds: float) -> str:
+        """Refuse the handshakes of this robot for a while; its name."""
+        connection = self._connections.get(peer)
+        if connection is None:  # it is gone
+            return "a robot"
+        self._shut_out = {user: until for user, until in self._shut_out.items() if until > time.monotonic()}
+        self._shut_out[connection.user] = time.monotonic() + seconds
+        return connection.name
 
     def knows(self, peer: bytes) -> bool:
         """Whether a connection that was let in may still have tasks run, and hear of them."""
@@ -159,14 +169,15 @@ class Robots:
         request_id = asked[1] if len(asked) > 1 else b""
         well_formed = len(asked) == ZAP_FRAMES and asked[0] == ZAP_VERSION and asked[5] == b"CURVE"
         user = z85.encode(asked[6]).decode() if well_formed and len(asked[6]) == 32 else ""
-        if user in self._known:
+        if user in self._known and self._shut_out.get(user, 0.0) <= time.monotonic():
             return [ZAP_VERSION, request_id, b"200", b"OK", user.encode(), b""]
         self._metrics.refused.inc()
         now = time.monotonic()
         if now - self._last_warning >= LOG_PAUSE_S:
             self._last_warning = now
             where = asked[3].decode(errors="replace") if well_formed else "?"
-            log.warning("refused a robot at %s: its key %s is not in %s", where, user, self._folder)
+            why = "is shut out for a while" if user in self._known else f"is not in {self._folder}"
+            log.warning("refused a robot at %s: its key %s %s", where, user, why)
         return [ZAP_VERSION, request_id, b"400", b"unknown robot", b"", b""]
 
     def _cut_off(self, peer: bytes, connection: _Connection) -> None:

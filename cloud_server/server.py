@@ -13,10 +13,10 @@ from pathlib import Path
 
 import zmq
 
-from cloud_server.connections import Backlog
+from cloud_server.connections import Backlog, end, other_end
 from cloud_server.executors import Executor, Outcome
 from cloud_server.metrics import Metrics, Status
-from cloud_server.quota import Quota, Verdict
+from cloud_server.quota import CUT_OFF_S, Quota, Verdict
 from cloud_server.robots import ZAP_DOMAIN, Robots
 from cloud_server.unsent import LARGE_BYTES, Unsent
 from cloud_server.waiting import CRASHES_MAX, Crashes, Waiting, Work, held_bytes
@@ -178,14 +178,17 @@ class Server:
             return False
         peer, *raw = message
         sizes = [len(frame) for frame in raw]
-        self._backlog.took(int(peer.get(zmq.SRCFD)), sizes)
+        file = int(peer.get(zmq.SRCFD))
+        self._backlog.took(file, sizes)
         if self._robots is not None and not self._robots.lets_in(peer):
             return True
         size = sum(sizes)
         self.metrics.bytes_in.inc(size)
         verdict = self._quota.judge(self._robot_of(peer.bytes), size, self._last_turn)
-        if verdict is Verdict.DROP:
+        if verdict in (Verdict.DROP, Verdict.CUT_OFF):
             self.metrics.dropped.labels("quota").inc()
+            if verdict is Verdict.CUT_OFF:
+                self._cut_off(peer.bytes, file)
             return True
         frames: list[Buffer] = [f.buffer if len(f) > COPIED_BYTES_MAX else f.bytes for f in raw]
         try:
@@ -198,6 +201,13 @@ class Server:
         except ProtocolError as error:
             self._drop("malformed", error)
         return True
+
+    def _cut_off(self, peer: bytes, file: int) -> None:
+        """End a connection that sends more and more; a robot that is known is not let in for a while."""
+        self.metrics.cut_off.inc()
+        name = other_end(file) if self._robots is None else self._robots.shut_out(peer, CUT_OFF_S)
+        log.warning("cut off %s for %g s: it sends far more than one robot may", name, CUT_OFF_S)
+        end(file, other_end(file))
 
     def _take(self, peer: bytes, message: Message, verdict: Verdict) -> None:
         match message:

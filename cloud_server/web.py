@@ -3,6 +3,7 @@
 import dataclasses
 import socket
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +11,7 @@ from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_l
 
 from cloud_server.metrics import Status
 from common import VERSION, tasks
+from common.bucket import Bucket
 from common.errors import ConfigError, MissingExtra
 from common.guard import Guard
 
@@ -22,6 +24,7 @@ try:
 except ImportError as error:
     raise MissingExtra("cloud-server", "cloud") from error
 
+CONNECTIONS_A_S, CONNECTIONS_AT_ONCE = 100, 512
 STALL_S = 2.0  # the loop turns at least every 0.5 s
 STOP_S = 2.0
 
@@ -75,6 +78,23 @@ def create_app(
     return app
 
 
+class PacedHttp(BoundedHttp):
+    """Takes only so many new connections a second: the web thread shall not take the robots' time."""
+
+    _left = Bucket(CONNECTIONS_A_S, CONNECTIONS_AT_ONCE, CONNECTIONS_AT_ONCE)
+    _at_s = 0.0
+
+    def connection_made(self, transport: Any) -> None:
+        left, now_s = PacedHttp._left, time.monotonic()
+        left.fill(now_s - PacedHttp._at_s)
+        PacedHttp._at_s = now_s
+        if left.level < 1:
+            time.sleep(1 / CONNECTIONS_A_S)  # others wait in the kernel's queue
+        else:
+            left.take(1)
+        super().connection_made(transport)
+
+
 class Web:
     """Serves an app in a daemon thread, from `start` until `close`."""
 
@@ -84,7 +104,7 @@ class Web:
         self.address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
         config = uvicorn.Config(
             app,
-            http=BoundedHttp,
+            http=PacedHttp,
             log_level="error",  # a line for every bad request would be the attacker's to write
             log_config=None,
             access_log=False,

@@ -12,8 +12,6 @@ from pathlib import Path
 
 import atheris
 
-from common import search  # first: compiled code cannot be instrumented
-
 with atheris.instrument_imports(
     include=["msgpack", "common.wire", "common.values", "common.blobs", "common.planner"]
 ):

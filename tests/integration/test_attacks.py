@@ -28,13 +28,15 @@ from benchmarks.attackers import (
     request,
     valid_messages,
 )
+from cloud_server.quota import CUT_OFF_S
 from cloud_server.server import HANDSHAKE_S
 from common import wire
 from common.bounded_http import CONNECTIONS_MAX, REQUEST_S
+from common.keys import robot_keys
 from common.maps import GridMap
 from common.planner import Point, Pose, plan_path
 from robot_client.offloader import Offloader
-from tests.curves import WAIT_S, Keys, Served, until
+from tests.curves import WAIT_S, Dealer, Keys, Served, until
 from tests.probes import echo
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
@@ -68,7 +70,8 @@ def good(keys: Keys) -> Path:
 @pytest.fixture(scope="module")
 def served(keys: Keys, wicked: Path, good: Path) -> Iterator[Served]:  # noqa: ARG001 - their keys come first
     """A server for all attacks: what one of them broke, the next would find."""
-    served = Served("--keys", str(keys.server), "--tasks", "tests.probes,common.planner", *SIZES)
+    unbounded = ("--robot-mib-s", "65536")  # nothing is cut off for its number
+    served = Served("--keys", str(keys.server), "--tasks", "tests.probes,common.planner", *SIZES, *unbounded)
     yield served
     served.close()
     forged = [line for line in served.lines if "mallory" in line and "\\n" not in line]
@@ -241,6 +244,28 @@ def test_bytes_a_second_are_bounded(keys: Keys, wicked: Path, good: Path) -> Non
             is_served(served, good)
     finally:
         served.close()
+
+
+def test_a_flood_is_cut_off(keys: Keys, wicked: Path, good: Path) -> None:
+    """Who sends on and on is disconnected, and not let in for a while; other robots are."""
+    served = Served("--keys", str(keys.server), *SIZES)
+    try:
+        with contextlib.closing(ATTACKS["flood"](Target(served.endpoint, 0, wicked))) as attack:
+            until_s = time.monotonic() + WAIT_S
+            while not served.logged("cut off wicked") and time.monotonic() < until_s:
+                next(attack)
+        assert served.logged("cut off wicked") == 1
+        assert not is_let_in(served, wicked)
+        is_served(served, good)
+        until(lambda: is_let_in(served, wicked), CUT_OFF_S + WAIT_S)
+    finally:
+        served.close()
+
+
+def is_let_in(served: Served, keys: Path) -> bool:
+    own = robot_keys(keys, "cloud")
+    with Dealer(served.port, own.own.public, own.own.secret, own.server) as dealer:
+        return dealer.handshake == zmq.EVENT_HANDSHAKE_SUCCEEDED
 
 
 def test_slow_handshakes_end(served: Served, good: Path) -> None:

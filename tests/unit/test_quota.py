@@ -1,6 +1,6 @@
 """What one robot may send in a second."""
 
-from cloud_server.quota import BUSY_A_S, MESSAGE_BYTES, ROBOTS_MAX, Quota, Verdict
+from cloud_server.quota import BUSY_A_S, CUT_OFF_S, EXCESS_S, MESSAGE_BYTES, ROBOTS_MAX, Quota, Verdict
 
 RATE = 100 * MESSAGE_BYTES
 
@@ -10,16 +10,30 @@ def verdicts(quota: Quota, robot: bytes, count: int, now_s: float, size: int = 1
 
 
 def test_small_messages_are_bounded_by_number() -> None:
-    """As many as the rate bears at 64 KiB each, then refusals, then what is not even read."""
-    found = verdicts(Quota(RATE, MESSAGE_BYTES), b"a", 1_000, 0.0)
-    refused = int(BUSY_A_S)
-    assert found == [Verdict.TAKE] * 100 + [Verdict.REFUSE] * refused + [Verdict.DROP] * (900 - refused)
+    """As many as the rate bears at 64 KiB each, then refusals, then what is not even read, then the end."""
+    quota = Quota(RATE, MESSAGE_BYTES)
+    found = verdicts(quota, b"a", 1_000, 0.0)
+    refused, excess = int(BUSY_A_S), int(EXCESS_S * 100)
+    assert refused == excess
+    end = 100 + excess
+    assert found[:end] == [Verdict.TAKE] * 100 + [Verdict.REFUSE] * refused
+    assert found[end:] == [Verdict.CUT_OFF] + [Verdict.DROP] * (1_000 - end - 1)
+    assert verdicts(quota, b"a", 1, CUT_OFF_S - 0.01) == [Verdict.DROP]
+    assert verdicts(quota, b"a", 1, CUT_OFF_S) == [Verdict.TAKE]
+
+
+def test_twice_the_rate_is_dropped_but_not_cut_off() -> None:
+    """A robot that is a little too eager loses messages, not its connection."""
+    quota = Quota(RATE, MESSAGE_BYTES)
+    found = [quota.judge(b"a", 10, n / 192) for n in range(100_000)]
+    assert Verdict.CUT_OFF not in found
+    assert found.count(Verdict.REFUSE) > 40_000
 
 
 def test_the_rate_is_what_it_says() -> None:
     """In ten seconds a robot that never stops has ten seconds' worth taken, and its burst."""
     quota = Quota(RATE, MESSAGE_BYTES)
-    found = [quota.judge(b"a", 10, n / 1_024) for n in range(10_241)]
+    found = [quota.judge(b"a", 10, n / 128) for n in range(1_281)]
     assert found.count(Verdict.TAKE) == 1_100
 
 
@@ -34,7 +48,7 @@ def test_a_message_of_the_largest_size_is_taken_at_any_rate() -> None:
 def test_what_is_refused_costs_nothing() -> None:
     """A robot that asks on and on is served at its rate, not shut out."""
     quota = Quota(RATE, MESSAGE_BYTES)
-    verdicts(quota, b"a", 100_000, 0.0)
+    verdicts(quota, b"a", 250, 0.0)
     assert verdicts(quota, b"a", 50, 0.5) == [Verdict.TAKE] * 50
 
 
