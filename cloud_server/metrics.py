@@ -42,7 +42,7 @@ class Metrics:
         )
         self.refused = Counter("offboard_refused", "Handshakes with a key that is not known", registry=r)
         self.cut_off = Counter(
-            "offboard_cut_off", "Connections ended for sending more than was read of them", registry=r
+            "offboard_cut_off", "Connections ended for sending more than may be, or could be read", registry=r
         )
         self.restarts = Counter(
             "offboard_executor_restarts", "Workers that died and were replaced", ["reason"], registry=r

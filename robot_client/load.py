@@ -6,6 +6,7 @@ missing to this process, and so is the time that all of them are throttled for.
 
 import contextlib
 import os
+import threading
 import time
 from pathlib import Path
 
@@ -87,6 +88,37 @@ class Load:
         except OSError:  # it has just ended
             return 0.0
         return TICK_S * (int(fields[11]) + int(fields[12]))
+
+
+class LoadWatch:
+    """Reads a load every EVERY_S in a thread of its own, from the first look at it on.
+
+    A process that asks for its CPU time is charged what it owes, and waits there for its quota: a thread that
+    decides must not be the one to ask.
+    """
+
+    def __init__(self, load: Load) -> None:
+        self._load = load
+        self._share = 0.0
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="load", daemon=True)
+        self._starting = threading.Lock()
+
+    def latest(self) -> float:
+        """The share that was read last."""
+        if self._thread.ident is None:
+            with self._starting:
+                if self._thread.ident is None and not self._closed.is_set():
+                    self._thread.start()
+        return self._share
+
+    def close(self) -> None:
+        self._closed.set()
+
+    def _run(self) -> None:
+        self._share = self._load.share()
+        while not self._closed.wait(EVERY_S):
+            self._share = self._load.share()
 
 
 def _read(path: str | Path) -> bytes:

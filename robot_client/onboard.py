@@ -13,7 +13,7 @@ from common.cpu import SELF
 from common.errors import OffloadError, Overtaken, TaskFailed, describe
 from common.tasks import Kind, Task
 from common.wanted import call_while
-from robot_client.load import Load
+from robot_client.load import Load, LoadWatch
 from robot_client.runner import ONBOARD, Condition, Execution
 
 ASIDE_MAX = 4  # runs that nobody waits for any more and that still go on
@@ -48,7 +48,7 @@ class OnboardRunner:
         self._aside = 0
         self._closed = False
         self._lock = threading.Lock()
-        self._load = Load(SELF)
+        self._load = LoadWatch(Load(SELF))
 
     def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - onboard always exists
         return None
@@ -82,13 +82,14 @@ class OnboardRunner:
         pass
 
     def condition(self) -> Condition:
-        return Condition(load=self._load.share())
+        return Condition(load=self._load.latest())
 
     def close(self) -> None:
         with self._lock:
             if self._closed:
                 return
             self._closed = True
+            self._load.close()
             waiting = [run for run in self._runs.values() if run.thread is None]
             for run in waiting:
                 del self._runs[run.task.id]

@@ -1,5 +1,6 @@
 """The trace: one JSON line a task, what was predicted, decided and seen."""
 
+import atexit
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping
@@ -100,6 +101,7 @@ class Trace(Lines):
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="trace", daemon=True)
         self._thread.start()
+        atexit.register(self.close)  # whoever does not close it loses nothing by that
 
     def write(self, record: Record) -> None:
         """Any thread."""
@@ -108,7 +110,8 @@ class Trace(Lines):
             self.flush()
 
     def close(self) -> None:
-        """Everything is written."""
+        """Everything is written. Safe to call twice."""
+        atexit.unregister(self.close)
         self._closing.set()
         self._thread.join()
         self.flush()

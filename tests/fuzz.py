@@ -6,12 +6,14 @@ message or a ProtocolError, and what a plan is asked with gives a plan or an ord
 """
 
 import contextlib
+import importlib
 import struct
 import sys
 from pathlib import Path
 
 import atheris
 
+importlib.import_module("common.search")  # first: what is compiled cannot be instrumented
 with atheris.instrument_imports(
     include=["msgpack", "common.wire", "common.values", "common.blobs", "common.planner"]
 ):

@@ -1,12 +1,14 @@
 """What others take of the CPU, from files laid out as a kernel shows them."""
 
 import os
+import threading
+import time
 from pathlib import Path
 
 import pytest
 
 from robot_client import load
-from robot_client.load import EVERY_S, TICK_S, Load
+from robot_client.load import EVERY_S, TICK_S, Load, LoadWatch
 from tests.unit.test_cpu import Machine
 
 CPUS = os.cpu_count() or 1
@@ -175,3 +177,24 @@ def test_a_group_that_counts_nothing_is_the_sum_of_its_processes(machine: Machin
         other(1.0 + 0.125 * n)
         share = one.share()
     assert share == pytest.approx(0.5, abs=0.05)
+
+
+def test_a_watch_reads_in_a_thread_of_its_own() -> None:
+    """Whoever looks at it only takes what was read; nothing is read before the first look, or once closed."""
+    read_by: list[threading.Thread] = []
+
+    class Counted(Load):
+        def share(self) -> float:
+            read_by.append(threading.current_thread())
+            return float(len(read_by))
+
+    watch = LoadWatch(Counted(Path("/proc/self")))
+    assert read_by == []
+    until = time.monotonic() + 10
+    while watch.latest() < 2:
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    assert threading.current_thread() not in read_by
+    watch.close()
+    read_by[0].join(10)
+    assert not read_by[0].is_alive()

@@ -4,6 +4,8 @@ import json
 import logging
 import os
 import resource
+import subprocess
+import sys
 import time
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,6 +17,8 @@ from robot_client.policies import Decision, Outlook
 from robot_client.regret import Regret
 from robot_client.runner import CLOUD, ONBOARD, Condition, Execution
 from robot_client.trace import WAITING_MAX, WRITE_EVERY_S, Late, Record, Trace, read
+
+ROOT = Path(__file__).parents[2]
 
 
 def record(i: int = 0) -> Record:
@@ -224,6 +228,17 @@ def test_lines_are_written_without_being_asked_for(tmp_path: Path) -> None:
         time.sleep(WRITE_EVERY_S)
     assert [fields["i"] for fields in read(trace.path)] == list(range(WAITING_MAX + 3))
     trace.close()
+
+
+def test_a_program_that_ends_without_closing_it_loses_nothing(tmp_path: Path) -> None:
+    """The last records are written when the interpreter ends."""
+    path = tmp_path / "trace.jsonl"
+    program = (
+        "from pathlib import Path; from tests.unit.test_trace import Trace, record; "
+        f"trace = Trace(Path({str(path)!r})); trace.write(record(0)); trace.write(record(1))"
+    )
+    subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True)
+    assert [fields["i"] for fields in read(path)] == [0, 1]
 
 
 def write(folder: Path, count: int) -> Path:
