@@ -23,8 +23,8 @@ with atheris.instrument_imports(
     from common.planner import Plan, plan_path
     from common.tasks import kind_of
 
-from benchmarks.attackers import Frames, bombs, valid_messages
-from common import planner
+from benchmarks.attackers import Frames, bombs, valid_messages  # noqa: E402
+from common import planner  # noqa: E402
 
 FRAMES_MAX = 40
 SEED_BYTES_MAX = 4096  # a larger bomb teaches nothing

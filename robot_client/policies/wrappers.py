@@ -4,7 +4,7 @@ import math
 from collections.abc import Collection
 from dataclasses import replace
 
-from robot_client.policies.base import Decision, Forecast, Outlook, Policy, cheapest
+from robot_client.policies.base import Decision, Forecast, Policy, cheapest
 from robot_client.runner import ONBOARD
 
 PROBE_EVERY = 20  # tasks without news of a site that is expected to take as long
@@ -18,9 +18,8 @@ BROKEN_FOR, BROKEN_MAX = 10, 160  # tasks: after the first break, doubling, at m
 class Probe:
     """Runs a task in the shadow on a site that nothing was heard of for PROBE_EVERY tasks.
 
-    The first answer is used, and both times are learnt. What is tried onboard holds up the robot itself where
-    it has little CPU; so if it is expected to take r times as long there, it is tried r * r times as seldom.
-    A site whose heartbeats go unanswered is not tried: the first one that is answered says more.
+    The first answer is used, and both times are learnt: nobody waits for what is only tried. A site whose
+    heartbeats go unanswered is not tried: the first one that is answered says more.
     """
 
     def __init__(self, inner: Policy) -> None:
@@ -34,7 +33,7 @@ class Probe:
             site: one.age
             for site, one in forecast.sites.items()
             if site != decision.site
-            and one.age >= _probe_after(site, one, forecast.sites[decision.site])
+            and one.age >= PROBE_EVERY
             and not one.in_flight
             and not one.condition.silent
         }
@@ -44,14 +43,6 @@ class Probe:
         return replace(
             decision, second=stalest, second_after_s=0.0, reason=f"{decision.reason}; {stalest} is probed"
         )
-
-
-def _probe_after(site: str, tried: Outlook, chosen: Outlook) -> float:
-    """Tasks without news of a site until it is worth a probe."""
-    if site != ONBOARD or not tried.predicted_s or not chosen.predicted_s:
-        return PROBE_EVERY
-    times_as_long = max(1.0, tried.predicted_s / chosen.predicted_s)
-    return min(PROBE_EVERY_MAX, PROBE_EVERY * times_as_long**2)
 
 
 class Hedge:

@@ -1,6 +1,5 @@
 """The policy contract for every rule in every wrapping, and what each rule and wrapper does."""
 
-import math
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -13,7 +12,7 @@ from common.errors import ConfigError
 from robot_client import policies
 from robot_client.policies import Decision, Forecast, Outlook, Policy
 from robot_client.policies.rules import EPSILON, WARM_UP
-from robot_client.policies.wrappers import BREAK_AFTER, BROKEN_FOR, BROKEN_MAX, PROBE_EVERY, PROBE_EVERY_MAX
+from robot_client.policies.wrappers import BREAK_AFTER, BROKEN_FOR, BROKEN_MAX, PROBE_EVERY
 from robot_client.runner import CLOUD, ONBOARD
 from tests import policy_checks
 from tests.policy_checks import EDGE, SILENT
@@ -148,19 +147,6 @@ def test_a_site_without_news_is_probed_at_once(age: int, probed: bool) -> None:
         0,
     )
     assert ("cloud is probed" in decision.reason) == probed
-
-
-@pytest.mark.parametrize(
-    ("onboard_s", "after"),
-    [(0.2, PROBE_EVERY), (0.22, 1.212 * PROBE_EVERY), (0.5, PROBE_EVERY_MAX), (90.0, PROBE_EVERY_MAX)],
-)
-def test_a_slow_computer_of_its_own_is_probed_more_seldom(onboard_s: float, after: float) -> None:
-    """By the square of how many times as long it takes, at most PROBE_EVERY_MAX; other sites are not."""
-    for age, probed in ((math.ceil(after) - 1, None), (math.ceil(after), ONBOARD)):
-        sites = {ONBOARD: known(onboard_s, age=age), CLOUD: known(0.1999), EDGE: known(90.0)}
-        assert decide("probe:greedy", sites).second == probed, age
-    far = {ONBOARD: known(0.1), CLOUD: known(90.0, age=PROBE_EVERY)}
-    assert decide("probe:greedy", far).second == CLOUD
 
 
 def test_a_probe_leaves_a_second_run_to_hedges() -> None:
