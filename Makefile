@@ -33,7 +33,7 @@ type: $(DEV_READY) ## mypy, strict on the four packages
 	$(BIN)/mypy
 
 # Tests that do not mind another one beside them.
-CROWDED := tests/unit $(addprefix tests/integration/test_,$(addsuffix .py,alone blobs compare crashes dataset demo keys own_task processes robot_workload toxiproxy wheel))
+CROWDED := tests/unit $(addprefix tests/integration/test_,$(addsuffix .py,alone attacks blobs compare crashes dataset demo fuzz keys own_task processes robot_workload toxiproxy wheel))
 test: $(DEV_READY) ## every test that this machine can run; what is skipped says why
 	$(BIN)/pytest --numprocesses 2 $(CROWDED)
 	$(BIN)/pytest $(addprefix --ignore ,$(CROWDED))

@@ -7,8 +7,7 @@ from dataclasses import replace
 from robot_client.policies.base import Decision, Forecast, Policy, cheapest
 from robot_client.runner import ONBOARD
 
-PROBE_EVERY = 20  # tasks without news of a site that is expected to take as long
-PROBE_EVERY_MAX = 40  # of one that is far slower
+PROBE_EVERY = 20  # tasks without news of a site
 RESERVED = 1  # second runs that are left for hedges
 HEDGE_MIN_S = 1e-3  # a wait of 0 is a probe
 BREAK_AFTER = 3  # failures in a row
