@@ -45,11 +45,8 @@ COPIED_BYTES_MAX = 64 * 1024  # a larger frame is used where the transport put i
 RECEIVE_MAX = 64  # messages taken in one turn
 PEER_MESSAGES_MAX = 256  # unsent replies, and unread requests, of one robot
 HANDSHAKE_S = 10.0  # for who connects to say who it is
-KEEPALIVE_IDLE_S, KEEPALIVE_EVERY_S, KEEPALIVE_PROBES = (
-    60,
-    10,
-    6,
-)  # until a robot that is silent counts as gone
+# Until a robot that is silent counts as gone: seconds, seconds, questions that are not answered.
+KEEPALIVE_IDLE_S, KEEPALIVE_EVERY_S, KEEPALIVE_PROBES = 60, 10, 6
 SEND_LAST_S = 1.0  # time for the last replies to leave when the server stops
 LOG_PAUSE_S = 10.0  # least time between two warnings about bad messages
 
