@@ -202,12 +202,12 @@ def test_plans_cost_what_their_planner_takes() -> None:
 
 
 def test_simulated_time_is_not_waited_for() -> None:
-    """A run takes less computing than a twentieth of what it plays; measured a hundred-and-fiftieth."""
+    """A run takes less computing than what it plays, though it plays a robot with a tenth of a CPU."""
     scenario = read_scenario(find_scenario("nonlinear"))
     tasks = tasks_of(scenario)
-    began_s = time.process_time()
+    began_s = time.thread_time()
     run = simulate(scenario.changed(policy="hedge:probe:greedy"), tasks)
-    assert time.process_time() - began_s < run.answered[-1].ended_s / 20
+    assert time.thread_time() - began_s < run.answered[-1].ended_s
 
 
 @pytest.mark.parametrize(
