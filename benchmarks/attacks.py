@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks.attackers import ATTACKS, IDLE
+from benchmarks.keyring import Keys
 from benchmarks.measure import Bar, Table, each_of
-from benchmarks.servers import READY_S, Server, cloud_server, running
+from benchmarks.servers import READY_S, cloud_server, running
 from benchmarks.tasks import nothing
 from common import planner
-from common.keys import ROBOT, SERVER, make_keys
 from common.maps import free_pairs, read_map
 from common.planner import Point, Pose, plan_path
 from robot_client.offloader import Offloader
@@ -32,25 +32,8 @@ PERCENT = 0.99
 
 def tables() -> list[Table]:
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
-        keys = Keyring(Path(folder))
+        keys = Keys(Path(folder))
         return [beside(keys, PLANS, ATTACKS), _keys(keys, stack)]
-
-
-class Keyring:
-    """Keys of a server, and of robots that it knows."""
-
-    def __init__(self, folder: Path) -> None:
-        self.server = folder / "server"
-        make_keys(self.server, SERVER)
-        (self.server / "robots").mkdir()
-        self._folder = folder
-
-    def robot(self, name: str) -> Path:
-        own = self._folder / name
-        make_keys(own, ROBOT)
-        (own / "server.key").write_bytes((self.server / "server.key").read_bytes())
-        (self.server / "robots" / f"{name}.key").write_bytes((own / "robot.key").read_bytes())
-        return own
 
 
 @dataclass(slots=True)
@@ -62,9 +45,9 @@ class _Phase:
         return sorted(self.seconds)[int(share * (len(self.seconds) - 1))]
 
 
-def beside(keys: Keyring, plans: int, attacks: dict[str, object]) -> Table:
+def beside(keys: Keys, plans: int, attacks: dict[str, object]) -> Table:
     """The same plans in turn alone and beside each attack, each by another robot: floods are shut out."""
-    good, wicked = keys.robot("good"), {name: keys.robot(f"wicked-{name}") for name in attacks}
+    good, wicked = keys.add("good"), {name: keys.add(f"wicked-{name}") for name in attacks}
     sizes = {
         "CLOUD_BLOB_MIB": f"{BLOB_MIB}",
         "CLOUD_MESSAGE_MIB": f"{MESSAGE_MIB}",
@@ -78,7 +61,7 @@ def beside(keys: Keyring, plans: int, attacks: dict[str, object]) -> Table:
         plan = _plans(offload, plans)
         offload.wait_for_sites(plan_path, READY_S)
         plan(_Phase(), WARM)
-        at_rest = memory(server, "VmRSS")
+        at_rest = memory(server.pid, "VmRSS")
         for name in attacks:
             before, beside = _Phase(), _Phase()
             plan(before, plans)
@@ -91,8 +74,8 @@ def beside(keys: Keyring, plans: int, attacks: dict[str, object]) -> Table:
             attacked.seconds += beside.seconds
             attacked.lost += beside.lost
             ratios = [f"{beside.at(share) / before.at(share):.2f}" for share in (0.5, PERCENT)]
-            rows.append([name, steps, *ratios, f"{beside.lost}", f"{memory(server, 'VmRSS') / MIB:.0f}"])
-        most = memory(server, "VmHWM")
+            rows.append([name, steps, *ratios, f"{beside.lost}", f"{memory(server.pid, 'VmRSS') / MIB:.0f}"])
+        most = memory(server.pid, "VmHWM")
     bound = memory_bound(at_rest)
     bars = [
         Bar("median beside attacks over alone", attacked.at(0.5) / quiet.at(0.5), 1.5),
@@ -110,9 +93,9 @@ def memory_bound(at_rest: int) -> float:
     return at_rest + FRAGMENTS * asked
 
 
-def memory(server: Server, name: str) -> int:
-    """Bytes, of the process's status."""
-    lines = Path(f"/proc/{server.pid}/status").read_text().splitlines()
+def memory(pid: int, name: str) -> int:
+    """Bytes that a process takes: VmRSS, or VmHWM at most so far."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{name}:"))
 
 
@@ -131,9 +114,9 @@ def _plans(offload: Offloader, count: int) -> Callable[[_Phase, int], None]:
     return plan
 
 
-def _keys(keys: Keyring, stack: contextlib.ExitStack) -> Table:
+def _keys(keys: Keys, stack: contextlib.ExitStack) -> Table:
     """An empty task with and without encryption."""
-    own = keys.robot("measured")
+    own = keys.add("measured")
     cases = {}
     for name, folder, environ in (("open", None, {}), ("with keys", own, {"CLOUD_KEYS": str(keys.server)})):
         endpoint = stack.enter_context(cloud_server(**environ)).endpoint

@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import shutil
 import socket
 import subprocess
 import sys
@@ -16,7 +15,6 @@ import zmq
 import zmq.utils.monitor
 
 from common import wire
-from common.keys import ROBOT, SERVER, make_keys
 
 ROOT = Path(__file__).parents[1]
 WAIT_S = 20.0
@@ -30,36 +28,6 @@ def until(condition: Callable[[], Any], within_s: float = WAIT_S) -> float:
         assert time.monotonic() - began < within_s, f"it did not happen within {within_s:g} s"
         time.sleep(0.01)
     return time.monotonic() - began
-
-
-class Keys:
-    """A server's folder of keys, and robots with folders of their own."""
-
-    def __init__(self, folder: Path) -> None:
-        self.server = folder / "server"
-        self.robots = self.server / "robots"
-        make_keys(self.server, SERVER)
-        self.robots.mkdir()
-        self._folder = folder
-
-    def make(self, name: str) -> Path:
-        """The keys of a robot that nobody knows yet."""
-        folder = self._folder / name
-        make_keys(folder, ROBOT)
-        shutil.copy(self.server / "server.key", folder)
-        return folder
-
-    def add(self, name: str) -> Path:
-        """The keys of a robot that the server knows."""
-        folder = self.make(name)
-        self.let_in(name)
-        return folder
-
-    def let_in(self, name: str) -> None:
-        shutil.copy(self._folder / name / "robot.key", self.robots / f"{name}.key")
-
-    def remove(self, name: str) -> None:
-        (self.robots / f"{name}.key").unlink()
 
 
 class Served:

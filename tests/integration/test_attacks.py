@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import zmq
 
+from benchmarks import attacks
 from benchmarks.attackers import (
     ATTACKS,
     IDLE,
@@ -28,6 +29,7 @@ from benchmarks.attackers import (
     request,
     valid_messages,
 )
+from benchmarks.keyring import Keys
 from cloud_server.quota import CUT_OFF_S
 from cloud_server.server import HANDSHAKE_S
 from common import wire
@@ -36,7 +38,7 @@ from common.keys import robot_keys
 from common.maps import GridMap
 from common.planner import Point, Pose, plan_path
 from robot_client.offloader import Offloader
-from tests.curves import WAIT_S, Dealer, Keys, Served, until
+from tests.curves import WAIT_S, Dealer, Served, until
 from tests.probes import echo
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
@@ -49,7 +51,6 @@ MUTATED = 20_000
 CLAIMED = 2**32  # bytes
 PING = 777_777
 UNREAD_MIB = 400  # two messages, and what loopback brings in a tenth of a second
-CONNECTION_BYTES = 80_000  # of the server, for a robot that says nothing
 
 
 @pytest.fixture(scope="module")
@@ -84,9 +85,7 @@ def target(served: Served, wicked: Path) -> Target:
 
 
 def memory(served: Served) -> int:
-    """Resident bytes."""
-    lines = Path(f"/proc/{served.process.pid}/status").read_text().splitlines()
-    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmRSS:"))
+    return attacks.memory(served.process.pid, "VmRSS")
 
 
 def dropped(served: Served) -> float:
@@ -332,7 +331,7 @@ def test_five_thousand_robots_may_be_idle(keys: Keys, wicked: Path, good: Path) 
             until(lambda: len(list(files.iterdir())) > IDLE, 60.0)
             is_served(served, good)
             print((memory(served) - at_first) / IDLE, "bytes each")
-            assert memory(served) - at_first < IDLE * CONNECTION_BYTES
+            assert memory(served) - at_first < IDLE * attacks.CONNECTION_BYTES
     finally:
         served.close()
 

@@ -15,11 +15,12 @@ import httpx
 import pytest
 import zmq
 
+from benchmarks.keyring import Keys
 from common import VERSION, wire
 from common.keys import PRIVATE, make_keys, robot_keys, server_keys
 from robot_client.cloud import REFUSED, UNFIT
 from robot_client.offloader import Offloader
-from tests.curves import ROOT, WAIT_S, Dealer, Keys, Served, clean_environ, recorded, says_until_closed, until
+from tests.curves import ROOT, WAIT_S, Dealer, Served, clean_environ, recorded, says_until_closed, until
 from tests.probes import echo, mark_once, nap
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(90)]

@@ -1,0 +1,36 @@
+"""The keys of one server and its robots, in a folder."""
+
+import shutil
+from pathlib import Path
+
+from common.keys import ROBOT, SERVER, make_keys
+
+
+class Keys:
+    """A server's folder of keys, and robots with folders of their own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.server = folder / "server"
+        self.robots = self.server / "robots"
+        make_keys(self.server, SERVER)
+        self.robots.mkdir()
+        self._folder = folder
+
+    def make(self, name: str) -> Path:
+        """The keys of a robot that nobody knows yet."""
+        folder = self._folder / name
+        make_keys(folder, ROBOT)
+        shutil.copy(self.server / "server.key", folder)
+        return folder
+
+    def add(self, name: str) -> Path:
+        """The keys of a robot that the server knows."""
+        folder = self.make(name)
+        self.let_in(name)
+        return folder
+
+    def let_in(self, name: str) -> None:
+        shutil.copy(self._folder / name / "robot.key", self.robots / f"{name}.key")
+
+    def remove(self, name: str) -> None:
+        (self.robots / f"{name}.key").unlink()
