@@ -43,10 +43,13 @@ class Channel:
     def receive(self) -> "list[zmq.Frame] | None":
         """The next message; None where there is none. For the reader."""
         with self.lock:
-            if self._readable:
-                with contextlib.suppress(zmq.Again):
-                    return self._socket.recv_multipart(zmq.DONTWAIT, copy=False)
-        return None
+            if not self._readable:
+                return None
+            frames: list[zmq.Frame] = []
+            with contextlib.suppress(zmq.Again):
+                while not frames or frames[-1].more:
+                    frames.append(self._socket.recv(zmq.DONTWAIT, copy=False))
+            return frames or None
 
     def wait(self, timeout_s: float) -> None:
         """Until there is something to read, or `wake` was called. For the reader."""

@@ -1,5 +1,6 @@
 """`robot-client`: a simulated robot that plans on a real map, or calls of a task; where its policy says."""
 
+import gc
 import logging
 import os
 import signal
@@ -109,6 +110,8 @@ def _drive(config: RobotConfig) -> int:
                 absent = absent or again.wait_for_sites(work.function, config.connect_s)
                 drive.warm(again)
             _say_absent("starting", absent)
+            gc.collect()
+            gc.freeze()  # what is there before the first task stays: no collection looks at it again
             drive.run()
         if alone:
             # An offloader of its own: what the run learnt, wrote and counted is of the run alone.

@@ -4,7 +4,7 @@ import hashlib
 import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,8 +24,10 @@ BEGIN_S = 0.25
 # higher rows (the map's y).
 STEPS = ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1))
 _OFFSETS = np.array(STEPS, np.int32)
-_DIGITS = np.full((3, 3), ord("?"), np.uint8)
-_DIGITS[_OFFSETS[:, 0] + 1, _OFFSETS[:, 1] + 1] = [ord(str(digit)) for digit in range(len(STEPS))]
+_NINE = np.array((3, 1), np.int32)  # a step to a neighbour times this is a number from -4 to 4: an index
+_DIGITS = np.full(9, ord("?"), np.uint8)
+_DIGITS[_OFFSETS @ _NINE] = [ord(str(digit)) for digit in range(len(STEPS))]
+STRAY = "the path steps to a cell that is no neighbour"
 _FIELDS = ("i", "id", "due_s", "began_s", "ended_s", "error", "answer")
 
 
@@ -74,7 +76,7 @@ class Answers:
 
     def write(self, answered: Answered) -> None:
         assert self._lines is not None, "not begun"
-        self._lines.append(answered.i, {"v": VERSION, **asdict(answered)})
+        self._lines.append(answered.i, {"v": VERSION, **{name: getattr(answered, name) for name in _FIELDS}})
 
     def close(self) -> None:
         if self._lines:
@@ -120,8 +122,10 @@ def cells_of(answer: Mapping[str, Any]) -> NDArray[np.int32]:
 
 
 def _steps(cells: NDArray[np.int32]) -> str:
-    moves = np.diff(cells, axis=0)
-    if len(moves) and (np.abs(moves).max() > 1 or not np.abs(moves).any(axis=1).all()):
-        raise DataError("the path steps to a cell that is no neighbour")
-    digits: bytes = _DIGITS[moves[:, 0] + 1, moves[:, 1] + 1].tobytes()
+    moves = cells[1:] - cells[:-1]
+    if moves.size and max(moves.max(), -moves.min()) > 1:
+        raise DataError(STRAY)
+    digits: bytes = _DIGITS[moves @ _NINE].tobytes()
+    if b"?" in digits:
+        raise DataError(STRAY)
     return digits.decode()

@@ -213,7 +213,7 @@ class CloudRunner:
             return self._wakes_s - now_s
 
     def _watch_connection(self) -> None:
-        while self._monitor.poll(0):
+        while int(self._monitor.EVENTS) & zmq.POLLIN:
             event = zmq.utils.monitor.recv_monitor_message(self._monitor)["event"]
             if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
                 self._handshake_failure, self._given_up = "", False
@@ -358,6 +358,8 @@ class CloudRunner:
             except ProtocolError as error:
                 failure = CloudBroken(f"answer cannot be read: {error}")
         seconds = received - pending.published
+        network_s = max(0.0, seconds - reply.queue_s - reply.run_s)
+        self._heartbeat.cross(received, network_s)
         execution = Execution(
             self.site,
             seconds,
@@ -365,7 +367,7 @@ class CloudRunner:
             failure,
             queue_s=reply.queue_s,
             run_s=reply.run_s,
-            network_s=max(0.0, seconds - reply.queue_s - reply.run_s),
+            network_s=network_s,
             cpu_s=reply.cpu_s,
             bytes_out=pending.bytes_out,
             bytes_in=bytes_in,

@@ -1,11 +1,13 @@
 """The robot at work: asks for each task when it is due, notes what came back, goes on, and sums it up."""
 
 import contextlib
+import itertools
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from functools import partial
 from typing import Any, TypeVar
 
 from common import cpu, errors
@@ -22,6 +24,7 @@ from robot_client.work import Work
 from robot_client.workload import CLOSED, due_instants
 
 MADE_MAX = 32  # tasks that wait, ready made, for their instant
+MADE_FIRST_MAX = 1000  # made before the first is asked for, where none depends on an answer
 WAYS = (ONBOARD, CLOUD, BOTH)  # in which `Drive.run_alone` runs each of its tasks
 
 T = TypeVar("T")
@@ -113,7 +116,9 @@ class Drive:
                 record = offload.last
                 assert record is not None
                 ran += _ran(record, way)
-                show_progress(number * len(WAYS) + n, self._config.alone * len(WAYS), describe(record))
+                show_progress(
+                    number * len(WAYS) + n, self._config.alone * len(WAYS), partial(describe, record)
+                )
             self._work.advance(answer)
             whole += ran == len(WAYS)
         missing = f"; the {CLOUD} did not answer for the others" if whole < self._config.alone else ""
@@ -122,13 +127,25 @@ class Drive:
         )
 
     def _run_closed(self) -> None:
-        """Each task when the last is answered."""
+        """Each task when the last is answered.
+
+        Where they can, they are made before: what simulates a LiDAR is not to take the CPU of the robot.
+        """
+        if self._work.independent:
+            requests = self._requests()
+            first = deque(itertools.islice(requests, MADE_FIRST_MAX))
+            self._begin()
+            while first:
+                self._ask(*first.popleft())
+            for number, request in requests:
+                self._ask(number, request)
+            return
         for number in range(self._config.tasks):
             answer = None
             if number not in self._done:
                 request = self._work.request()
                 self._begin()
-                answer = self._ask(number, None, request)
+                answer = self._ask(number, request)
             self._work.advance(answer)
 
     def _run_open(self) -> None:
@@ -144,13 +161,13 @@ class Drive:
 
         try:
             with contextlib.closing(made_ahead(self._made())) as made:
-                for number, due_s, request in made:
+                for number, request, due_s in made:
                     self._begin()
                     time.sleep(max(0.0, due_s - self._now_s()))
                     slots.acquire()
                     if failures:
                         break
-                    pool.submit(self._ask, number, due_s, request).add_done_callback(finish)
+                    pool.submit(self._ask, number, request, due_s).add_done_callback(finish)
             pool.shutdown()
             if failures:
                 raise failures[0]
@@ -159,16 +176,22 @@ class Drive:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
 
-    def _made(self) -> Iterator[tuple[int, float, tuple[Any, ...]]]:
-        """Number, due instant in s after that of the first, and arguments of each task without an answer."""
+    def _requests(self) -> Iterator[tuple[int, tuple[Any, ...]]]:
+        """Number and arguments of each task without an answer; none depends on the one before."""
+        for number in range(self._config.tasks):
+            if number not in self._done:
+                yield number, self._work.request()
+            self._work.advance(None)
+
+    def _made(self) -> Iterator[tuple[int, tuple[Any, ...], float]]:
+        """Number, arguments and due instant, in s after that of the first, of each task without an answer."""
         config, first_s = self._config, None
         assert config.rate is not None, "checked by the config"
-        instants = due_instants(config.arrivals, config.rate, config.burst, config.seed)
-        for number, due_s in zip(range(config.tasks), instants, strict=False):
-            if number not in self._done:
-                first_s = due_s if first_s is None else first_s
-                yield number, due_s - first_s, self._work.request()
-            self._work.advance(None)
+        instants = enumerate(due_instants(config.arrivals, config.rate, config.burst, config.seed))
+        for number, request in self._requests():
+            due_s = next(due_s for task, due_s in instants if task == number)
+            first_s = due_s if first_s is None else first_s
+            yield number, request, due_s - first_s
 
     def _begin(self) -> None:
         """The first task is due: times count from here."""
@@ -181,7 +204,7 @@ class Drive:
         assert self._start_s is not None, "not begun"
         return time.monotonic() - self._start_s
 
-    def _ask(self, number: int, due_s: float | None, request: tuple[Any, ...]) -> Any:
+    def _ask(self, number: int, request: tuple[Any, ...], due_s: float | None = None) -> Any:
         """Run the task now and note how it went; its answer, None where it has none."""
         where = BOTH if number < self._config.measure else None
         answer, described, error = None, None, None
@@ -215,7 +238,9 @@ class Drive:
             else:
                 self._summary.add(record, got=self._work.got(answer), late_s=late_s)
             self._noted += 1
-            show_progress(self._noted, self._left, describe(record) if record else str(error))
+            show_progress(
+                self._noted, self._left, partial(describe, record) if record else partial(str, error)
+            )
 
 
 def made_ahead(tasks: Iterator[T]) -> Generator[T]:

@@ -15,6 +15,8 @@ from common.errors import ConfigError, DataError
 VERSION = 1
 LINE_START = b'{"v":'
 
+_ENCODE = json.JSONEncoder(separators=(",", ":")).encode
+
 log = logging.getLogger(__name__)
 
 
@@ -39,7 +41,7 @@ class Lines:
 
     def append(self, number: int, fields: Mapping[str, Any]) -> None:
         """Append the line of task `number`; its first field is `v`. Once closed the file takes no more."""
-        line = json.dumps(fields, separators=(",", ":")).encode() + b"\n"
+        line = _ENCODE(fields).encode() + b"\n"
         with self._lock:
             if self._file.closed:
                 log.debug("%s %s: task %d ended after the run", self._what, self.path, number)

@@ -12,9 +12,8 @@ from pathlib import Path
 
 from common.cpu import READ_BYTES_MAX, QuotaGroup, parse_usage, quota_group
 
-EVERY_S = 0.25  # read no more often: a reading costs what a decision does
+EVERY_S = 0.5  # read no more often: a reading costs more than a decision
 QUOTA_EVERY = 8  # readings: how often the quota is looked up again
-MEMORY_S = 0.5  # the share is that of about the last so many seconds
 FREE_MIN = 0.1  # of the CPU: where this process leaves less to others, what they take says nothing
 PROCESSES_MAX = 64  # of a group whose CPU time is the sum of theirs
 TICK_S = 1 / os.sysconf("SC_CLK_TCK")
@@ -61,8 +60,7 @@ class Load:
         if first:
             return
         if left_s >= FREE_MIN * cpus * since_s:
-            fresh = min(1.0, max(0.0, took_s / left_s))
-            self._share += min(1.0, since_s / MEMORY_S) * (fresh - self._share)
+            self._share = min(1.0, max(0.0, took_s / left_s))
 
     def _total_s(self) -> float:
         """CPU seconds of all, this process among them."""

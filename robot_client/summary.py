@@ -3,7 +3,7 @@
 import statistics
 import sys
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from robot_client.runner import ONBOARD
 from robot_client.trace import Record
@@ -88,14 +88,14 @@ def describe(record: Record) -> str:
     return f"size {record.size:.2f} -> {took} ({record.decision.reason})"
 
 
-def show_progress(done: int, total: int, about: str) -> None:
+def show_progress(done: int, total: int, about: Callable[[], str]) -> None:
     """One line that is written over on a terminal; every so many tasks a line elsewhere."""
     if sys.stdout.isatty():
-        print(f"\r\x1b[K{done}/{total} {about}"[:160], end="", flush=True)
+        print(f"\r\x1b[K{done}/{total} {about()}"[:160], end="", flush=True)
         if done == total:
             print()
     elif done % PROGRESS_EVERY == 0 or done == total:
-        print(f"{done}/{total} {about}", flush=True)
+        print(f"{done}/{total} {about()}", flush=True)
 
 
 def _p95(values: Sequence[float]) -> float:

@@ -83,7 +83,8 @@ class Record:
 
 
 _CONDITION_FIELDS, _DECISION_FIELDS, _LATE_FIELDS, _REGRET_FIELDS = (
-    tuple(one.name for one in fields(of)) for of in (Condition, Decision, Late, Regret)
+    tuple("reason" if one.name == "why" else one.name for one in fields(of))
+    for of in (Condition, Decision, Late, Regret)
 )
 
 

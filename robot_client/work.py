@@ -25,11 +25,13 @@ TASK_ALLOWED = "MODULE:FUNCTION with a @task function of one number"
 class Work(Protocol):
     """The tasks of one run in their order, for one thread at a time.
 
-    `found` says in the summary what was got (None: nothing to say); `got` tells which answers count.
+    `found` says in the summary what was got (None: nothing to say); `got` tells which answers count;
+    `independent`: the tasks are the same whatever was answered.
     """
 
     function: Callable[..., Any]
     found: str | None
+    independent: bool
 
     def request(self) -> tuple[Any, ...]:
         """The arguments of the present task; asking twice changes nothing."""
@@ -56,15 +58,15 @@ class Plans:
 
         self.function: Callable[..., Any] = plan_path
         self.robot = robot
+        self.independent = jump
         self._wanted = wanted
-        self._jump = jump
 
     def request(self) -> tuple[Any, ...]:
         return self.robot.request()
 
     def advance(self, answer: Any) -> None:
         size = next(self._wanted) if self._wanted else None
-        if self._jump:
+        if self.independent:
             self.robot.jump(size)
         elif answer is None:
             self.robot.give_up_goal(size)
@@ -82,6 +84,7 @@ class Calls:
     """Calls of a `@task` function with whole numbers, one of `wanted` each."""
 
     found: str | None = None
+    independent = True
 
     def __init__(self, function: Callable[..., Any], wanted: Iterator[float]) -> None:
         self.function = function

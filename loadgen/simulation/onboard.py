@@ -10,7 +10,7 @@ from loadgen.simulation.clock import VirtualClock
 from loadgen.simulation.processor import Processor, Run
 from loadgen.simulation.truth import Truth
 from loadgen.testbed import ROBOT
-from robot_client.load import EVERY_S, FREE_MIN, MEMORY_S
+from robot_client.load import EVERY_S, FREE_MIN
 from robot_client.runner import ONBOARD, Condition, Execution
 
 
@@ -86,6 +86,5 @@ class _Load:
             took_s, left_s = others_s - self._others_s, self._processor.cpus * since_s - (own_s - self._own_s)
             self._own_s, self._others_s, self._read_at_s = own_s, others_s, self._clock.now_s()
             if left_s >= FREE_MIN * self._processor.cpus * since_s:
-                fresh = min(1.0, max(0.0, took_s / left_s))
-                self._share += min(1.0, since_s / MEMORY_S) * (fresh - self._share)
+                self._share = min(1.0, max(0.0, took_s / left_s))
         return self._share

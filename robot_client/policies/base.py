@@ -1,7 +1,7 @@
 """What a policy decides from, and what it decides."""
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -74,7 +74,7 @@ class Forecast:
 
 @dataclass(slots=True)
 class Decision:
-    """Run on `site`, or on all sites but those `spared` in parallel where `both`; the reason is for people.
+    """Run on `site`, or on all sites but those `spared` in parallel where `both`; `why` is for people.
 
     `second`: a site that starts too when no answer has come after `second_after_s`; the first good answer is
     used. At 0 s it is a shadow probe, whose time is learnt to the end; later it is a hedge, and whoever
@@ -83,11 +83,15 @@ class Decision:
 
     site: str
     both: bool
-    reason: str
+    why: str | Callable[[], str]  # called where somebody reads it: most decisions nobody asks about
     policy: str
     second: str | None = None
     second_after_s: float = 0.0
     spared: tuple[str, ...] = ()
+
+    @property
+    def reason(self) -> str:
+        return self.why if isinstance(self.why, str) else self.why()
 
 
 class Policy(Protocol):

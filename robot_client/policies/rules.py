@@ -1,5 +1,7 @@
 """Rules that compare what the sites would cost."""
 
+from collections.abc import Mapping
+from functools import partial
 from random import Random
 
 from robot_client.policies.base import Decision, Forecast, cheapest, costs_of, explain, home
@@ -21,9 +23,7 @@ class Paper:
         predicted = {site: outlook.predicted_s or 0.0 for site, outlook in forecast.sites.items()}
         # Eq. 1: the cloud only where it is strictly faster; a tie stays onboard.
         site = cheapest(predicted)
-        names = [site, *(name for name in predicted if name != site)]
-        reason = " against ".join(f"{name} {predicted[name] * 1e3:.1f} ms" for name in names)
-        return Decision(site, False, reason, "paper")
+        return Decision(site, False, partial(_compared, predicted, site), "paper")
 
 
 class Always:
@@ -47,7 +47,7 @@ class Greedy:
         if (warming := warm_up(forecast, self.name)) is not None:
             return warming
         site = self._choose(forecast, costs_of(forecast))
-        return Decision(site, False, explain(forecast, site), self.name)
+        return Decision(site, False, partial(explain, forecast, site), self.name)
 
     def _choose(self, forecast: Forecast, costs: dict[str, float]) -> str:  # noqa: ARG002 - leaves look at it
         return cheapest(costs)
@@ -108,6 +108,11 @@ class Thompson(Greedy):
                 for site, one in forecast.sites.items()
             }
         )
+
+
+def _compared(predicted: Mapping[str, float], site: str) -> str:
+    names = [site, *(name for name in predicted if name != site)]
+    return " against ".join(f"{name} {predicted[name] * 1e3:.1f} ms" for name in names)
 
 
 def warm_up(forecast: Forecast, policy: str) -> Decision | None:

@@ -40,7 +40,7 @@ class Probe:
             return decision
         stalest = max(ages, key=ages.__getitem__)
         return replace(
-            decision, second=stalest, second_after_s=0.0, reason=f"{decision.reason}; {stalest} is probed"
+            decision, second=stalest, second_after_s=0.0, why=f"{decision.reason}; {stalest} is probed"
         )
 
 
@@ -70,9 +70,7 @@ class Hedge:
         if after_s is None:
             return decision
         after_s = max(after_s, HEDGE_MIN_S)
-        return Decision(
-            decision.site, False, decision.reason, decision.policy, second, second_after_s=after_s
-        )
+        return Decision(decision.site, False, decision.why, decision.policy, second, second_after_s=after_s)
 
 
 class Breaker:
@@ -106,9 +104,7 @@ class Budget:
         fit = [site for site in forecast.sites if _fits(forecast, {site})] or [ONBOARD]
         decision = _among(fit, forecast, self._inner)
         if decision.both and not _fits(forecast, forecast.sites.keys() - decision.spared):
-            return replace(
-                decision, both=False, spared=(), reason=f"{decision.reason}; the caps leave one site"
-            )
+            return replace(decision, both=False, spared=(), why=f"{decision.reason}; the caps leave one site")
         if decision.second is not None and not _fits(forecast, {decision.site, decision.second}):
             return replace(decision, second=None)
         return decision

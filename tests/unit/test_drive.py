@@ -18,6 +18,7 @@ from common.maps import GridMap
 from common.planner import plan_path, warm
 from common.tasks import Task, task
 from robot_client import answers as answers_file
+from robot_client import drive as drive_module
 from robot_client import references as references_file
 from robot_client.answers import Answers
 from robot_client.config import RobotConfig
@@ -171,6 +172,24 @@ def test_closed_arrivals_wait_for_the_answer(tmp_path: Path) -> None:
     assert all(a["ended_s"] <= b["began_s"] for a, b in pairwise(lines))
     assert said[0] == "20 tasks answered"
     assert not any("due" in line for line in said)
+
+
+def test_tasks_that_depend_on_no_answer_are_made_before_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bounded number of them; those beyond are made one by one, when the task before has its answer."""
+    monkeypatch.setattr(drive_module, "MADE_FIRST_MAX", 3)
+    made: list[int] = []
+
+    def wanted() -> Iterator[float]:
+        for number in itertools.count():
+            made.append(number)
+            yield float(number)
+
+    seen: list[int] = []
+    script.act = lambda _: seen.append(len(made))
+    config, own = RobotConfig(task="m:f", sizes=("constant:0",), tasks=6), OwnRecord()
+    with offloader(OnboardRunner(), observers=[own]) as offload:
+        Drive(config, Calls(scripted, wanted()), offload, own, lambda _: None).run()
+    assert seen == [3, 3, 3, 4, 5, 6]
 
 
 def test_open_arrivals_keep_their_due_instants(tmp_path: Path) -> None:

@@ -91,18 +91,19 @@ def test_it_is_read_no_more_often_than_it_says(tmp_path: Path, times: Times) -> 
     assert one.share() > 0.0
 
 
-def test_the_share_moves_over_half_a_second(tmp_path: Path, times: Times) -> None:
-    """A quarter of a busy second moves it half the way; it never leaves 0 to 1."""
+def test_the_share_is_that_since_the_reading_before(tmp_path: Path, times: Times) -> None:
+    """What was long ago counts for nothing; it never leaves 0 to 1."""
     host = Host(tmp_path)
     one = host.load()
     one.share()
-    later(times, 0.25)
+    later(times, EVERY_S)
+    host.busy_s(0.25 * CPUS * EVERY_S)
+    assert one.share() == pytest.approx(0.25, abs=2 * TICK_S / EVERY_S)
+    later(times, EVERY_S)
     host.busy_s(100.0)
-    assert one.share() == pytest.approx(0.5)
-    for _ in range(20):
-        later(times, 0.5)
-        assert 0.0 <= one.share() <= 1.0
-    assert one.share() == pytest.approx(0.0, abs=1e-3)
+    assert one.share() == 1.0
+    later(times, EVERY_S)
+    assert one.share() == 0.0
 
 
 def test_where_nothing_is_left_the_last_share_stays(tmp_path: Path, times: Times) -> None:
