@@ -14,6 +14,7 @@ from benchmarks.measure import Bar, Table, each_of
 from benchmarks.robots import request_frames
 from benchmarks.servers import READY_S, cloud_server, serve
 from benchmarks.tasks import length, nothing
+from common.errors import describe
 from robot_client.offloader import Offloader
 from robot_client.runner import CLOUD
 
@@ -38,8 +39,11 @@ def _empty(stack: contextlib.ExitStack) -> Table:
     for module, (name, start) in peers.items():
         if find_spec(module) is None:
             missing.append(f"{name}: {module} is not installed")
-        else:
+            continue
+        try:
             cases[name] = start(stack)
+        except Exception as error:  # noqa: BLE001 - a peer that does not start must not take the others along
+            missing.append(f"{name}: it did not start: {describe(error)}")
     seconds = each_of(cases, CALLS, rounds=9)
     ours, raw = seconds["offboard"], seconds["raw ZMQ echo of the same bytes"]
     bars = [Bar("offboard over raw echo", ours / raw, 4.0)]

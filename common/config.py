@@ -5,11 +5,10 @@ What the settings are is the business of each process's own `config.py`.
 
 import argparse
 import dataclasses
-import difflib
+import functools
 import os
 import re
 import sys
-import tomllib
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
@@ -21,6 +20,7 @@ from common.errors import ConfigError, DataError, OffloadError
 C = TypeVar("C")
 
 REQUIRED: Any = dataclasses.MISSING
+COLUMNS = 80  # of help, where no terminal says
 INTERRUPTED_EXIT, BROKEN_PIPE_EXIT = 130, 141  # as a shell counts them: 128 + the signal
 
 
@@ -134,6 +134,8 @@ def unknown_key(path: Path, key: str, known: Sequence[str]) -> DataError:
 
 def unknown(what: str, name: str, known: Sequence[str]) -> str:
     """What to say of a name nobody knows: the nearest that is known, or all of them."""
+    import difflib  # what only a mistake needs is loaded where one was made
+
     near = difflib.get_close_matches(name, known, n=1)
     hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(sorted(known))}"
     return f"unknown {what} {name!r}; {hint}"
@@ -151,6 +153,8 @@ def line_of(lines: Sequence[str], table: str, number: int, key: str) -> int:
 
 def read_toml(path: Path) -> dict[str, Any]:
     """The file's tables, or DataError naming file and line."""
+    import tomllib
+
     try:
         return tomllib.loads(path.read_text())
     except FileNotFoundError:
@@ -162,8 +166,28 @@ def read_toml(path: Path) -> dict[str, Any]:
 class CommandParser(argparse.ArgumentParser):
     """argparse that says what is wrong in one line, exit code 2."""
 
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**({"formatter_class": _Help} | settings))
+
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+
+class _Help(argparse.HelpFormatter):
+    """As wide as the terminal, without shutil, which loads three compressors to tell it."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, width=_columns() - 2)
+
+
+def _columns() -> int:
+    told = os.environ.get("COLUMNS", "")
+    if told.isdecimal() and int(told) > 0:
+        return int(told)
+    try:
+        return os.get_terminal_size(1).columns or COLUMNS
+    except OSError:  # no terminal
+        return COLUMNS
 
 
 def run_command(prog: str, command: Callable[[], int]) -> int:
@@ -194,9 +218,14 @@ def _flag(field: dataclasses.Field[Any]) -> str:
     return field.metadata.get("name") or field.name.replace("_", "-")
 
 
+@functools.cache
+def _hints(cls: type) -> dict[str, Any]:
+    return typing.get_type_hints(cls)
+
+
 def _base_type(field: dataclasses.Field[Any], cls: type) -> tuple[type, bool]:
     """The field's plain type, and whether it takes many values (`tuple[T, ...]`)."""
-    hint = typing.get_type_hints(cls)[field.name]
+    hint = _hints(cls)[field.name]
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         hint = next(arg for arg in typing.get_args(hint) if arg is not type(None))
     if typing.get_origin(hint) is tuple:
