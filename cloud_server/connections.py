@@ -22,7 +22,8 @@ MESSAGES_UNREAD = 2  # of the largest, on one connection
 CURVE_BYTES = 33  # around a frame that is encrypted (RFC 26)
 SHORT_FRAME = 255  # bytes; a longer one has a longer length (RFC 23)
 RECEIVED = struct.Struct("@128xQ")  # tcpi_bytes_received of struct tcp_info, Linux 4.1 on
-STATM = Path("/proc/self/statm")
+STATM, STATM_BYTES_MAX = Path("/proc/self/statm"), 256
+PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 log = logging.getLogger("cloud_server")
 
@@ -136,5 +137,8 @@ def _connections(port: int) -> Iterator[tuple[int, Any, int]]:
 
 
 def _resident_bytes() -> int:
-    with STATM.open("rb") as file:
-        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    file = os.open(STATM, os.O_RDONLY)  # ten times a second: a Python file object would cost the most of it
+    try:
+        return int(os.read(file, STATM_BYTES_MAX).split()[1]) * PAGE_BYTES
+    finally:
+        os.close(file)

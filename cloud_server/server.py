@@ -6,6 +6,7 @@ It never computes and never waits for work; what runs the tasks is `executors`.
 import logging
 import os
 import time
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
@@ -87,6 +88,7 @@ class Server:
         self._drain_until: float | None = None
         self._on_ready = on_ready
         self._warming: Future[None] | None = None
+        self._dispatched: deque[Work] = deque()  # that this turn starts
         self._ready = self._was_ready = False
         self._started = self._last_turn = time.monotonic()
         self._last_task: float | None = None
@@ -145,6 +147,9 @@ class Server:
             for work in self._waiting.take(lambda work: work.expired(self._last_turn)):
                 self._refuse(work.peer, work.request, "expired", queue_s=now - work.arrived)
             self._dispatch()
+        # Last, and without the lock: a worker has the interpreter, and its reply the socket, at once.
+        while self._dispatched:
+            self._start(self._dispatched.popleft())
 
     def _tend_executor(self) -> None:
         """Start the executor; once it is warm the server is ready while any of its workers is up."""
@@ -268,7 +273,7 @@ class Server:
         return tuple(digest for digest in work.request.blobs if digest not in work.blobs)
 
     def _dispatch(self) -> None:
-        """Start waiting work while workers are free."""
+        """Choose waiting work while workers are free."""
         while self._ready and len(self._running) < self._executor.up:
             work = self._waiting.next()
             if work is None:
@@ -283,10 +288,10 @@ class Server:
                 self._waiting.done(work, 0.0)
                 self._refuse(work.peer, work.request, "expired", queue_s=work.queue_s)
                 continue
-            self._start(work)
+            self._running.add(work)
+            self._dispatched.append(work)
 
     def _start(self, work: Work) -> None:
-        self._running.add(work)
         request = work.request
         left_s = request.budget_s - work.queue_s
         future = self._executor.submit(
