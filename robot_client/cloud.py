@@ -359,7 +359,6 @@ class CloudRunner:
                 failure = CloudBroken(f"answer cannot be read: {error}")
         seconds = received - pending.published
         network_s = max(0.0, seconds - reply.queue_s - reply.run_s)
-        self._heartbeat.cross(received, network_s)
         execution = Execution(
             self.site,
             seconds,

@@ -14,7 +14,6 @@ SILENT_S = 0.25  # unanswered for longer than this, and longer than round trips 
 SLACK_S = 0.02  # beyond the usual round trip, if they vary no more: so much later an answer is late
 UNANSWERED_MAX = 16  # remembered; while so many are out they come SLOWER times as rarely
 SLOWER = 5
-SPARED = 2  # intervals at most without one while replies show that the site is there
 LEAST_OF = 2  # round trips: one stalled segment is no slow link, and one that is quick again is believed
 _SMOOTHING, _VARIATION = 1 / 8, 1 / 4  # of RFC 6298
 
@@ -39,10 +38,10 @@ class Heartbeat:
         self.due_s = float("inf")
         self._sent: dict[int, float] = {}
         self._oldest_s = float("inf")  # when the first that is unanswered was sent
-        self._heard_s = self._beat_s = -float("inf")
+        self._heard_s = -float("inf")
         self._recent: deque[float] = deque(maxlen=LEAST_OF)
         self._round_trip_s: float | None = None
-        self._trips, self._crossing = _Usual(), _Usual()  # of heartbeats and of tasks
+        self._smooth_s = self._varies_s = 0.0
         self._back_s = -float("inf")  # when the site was last heard again
         self._queue = 0
 
@@ -60,7 +59,7 @@ class Heartbeat:
         if len(self._sent) > UNANSWERED_MAX:
             del self._sent[next(iter(self._sent))]
             pause_s *= SLOWER
-        self.due_s, self._beat_s = now_s + pause_s, now_s
+        self.due_s = now_s + pause_s
         return self._next_id
 
     def answer(self, id: int, now_s: float, queue: int) -> None:
@@ -74,57 +73,39 @@ class Heartbeat:
         if self._silent(now_s):
             self._back_s = now_s
         self._oldest_s = next(iter(self._sent.values()), float("inf"))
-        self._trips.add(now_s - sent_s)  # whatever held it up: a link that is always slow is not silent
+        self._vary(now_s - sent_s)
         if sent_s < self._back_s:
             self.hurry(now_s)  # it was held up by what made the site silent, and says nothing of the link now
         else:
             self._recent.append(now_s - sent_s)
             self._round_trip_s = min(self._recent)
-        self._heard_s, self._queue = now_s, queue
+        self.hear(now_s, queue)
 
     def hear(self, now_s: float, queue: int) -> None:
-        """A reply shows that the site is there: the next heartbeat may wait."""
+        """Anything that the server said shows that it is there."""
         self._heard_s, self._queue = now_s, queue
-        if now_s < self.due_s < float("inf") and not self._sent:
-            self.due_s = min(now_s + self._every_s, self._beat_s + SPARED * self._every_s)
-
-    def cross(self, now_s: float, seconds: float) -> None:
-        """A task spent so long on the link, both ways together: where that is unusual, ask the link now."""
-        if self._crossing.known and abs(seconds - self._crossing.mean) > self._crossing.reach(SLACK_S):
-            self.hurry(now_s)
-        self._crossing.add(seconds)
 
     def condition(self, now_s: float) -> Condition:
         """A site whose answer is late is expected to be held up for as long again."""
         out_s = self._out_s(now_s)
-        trips = self._trips
-        late = trips.known and out_s > trips.mean + trips.reach(SLACK_S)
+        late = self._smooth_s > 0 and out_s > max(self._smooth_s + SLACK_S, self._limit_s)
         return Condition(self._round_trip_s, self._silent(now_s), self._queue, wait_s=out_s if late else 0.0)
 
     def _out_s(self, now_s: float) -> float:
         """For how long an answer has been waited for and nothing was heard; negative: none is."""
         return now_s - max(self._oldest_s, self._heard_s)
 
+    @property
+    def _limit_s(self) -> float:
+        return self._smooth_s + 4 * self._varies_s
+
     def _silent(self, now_s: float) -> bool:
-        return self._out_s(now_s) > max(SILENT_S, self._trips.mean + self._trips.reach())
+        return self._out_s(now_s) > max(SILENT_S, self._limit_s)
 
-
-class _Usual:
-    """The usual of some times and how far they vary, as RFC 6298 has them of round trips."""
-
-    __slots__ = ("_varies", "known", "mean")
-
-    def __init__(self) -> None:
-        self.known = False
-        self.mean = self._varies = 0.0
-
-    def add(self, seconds: float) -> None:
-        if not self.known:
-            self.known, self.mean, self._varies = True, seconds, seconds / 2
+    def _vary(self, round_trip_s: float) -> None:
+        """What is usual, whatever held it up: a link that is always slow is not silent."""
+        if not self._smooth_s:
+            self._smooth_s, self._varies_s = round_trip_s, round_trip_s / 2
             return
-        self._varies += _VARIATION * (abs(seconds - self.mean) - self._varies)
-        self.mean += _SMOOTHING * (seconds - self.mean)
-
-    def reach(self, least: float = 0.0) -> float:
-        """So far from the mean is unusual."""
-        return max(least, 4 * self._varies)
+        self._varies_s += _VARIATION * (abs(round_trip_s - self._smooth_s) - self._varies_s)
+        self._smooth_s += _SMOOTHING * (round_trip_s - self._smooth_s)

@@ -120,7 +120,6 @@ class SimulatedCloud:
     def _hear(self, pending: _Pending, reply: Reply, size: int) -> None:
         """The robot receives it."""
         self._heartbeat.hear(self._clock.now_s(), reply.queue)
-        self._beat_when_due()
         self._clock.after(self.sending_s, partial(self._take, pending, reply, size))
 
     def _take(self, pending: _Pending, reply: Reply, size: int) -> None:
@@ -140,9 +139,6 @@ class SimulatedCloud:
     def _end_well(self, pending: _Pending, reply: Reply, size: int) -> None:
         del self._pending[pending.call.id]
         seconds = self._clock.now_s() - pending.published_s
-        network_s = max(0.0, seconds - reply.queue_s - reply.run_s)
-        self._heartbeat.cross(self._clock.now_s(), network_s)
-        self._beat_when_due()
         pending.future.set_result(
             Execution(
                 CLOUD,
@@ -150,7 +146,7 @@ class SimulatedCloud:
                 self._truth.value(pending.call),
                 queue_s=reply.queue_s,
                 run_s=reply.run_s,
-                network_s=network_s,
+                network_s=max(0.0, seconds - reply.queue_s - reply.run_s),
                 cpu_s=reply.cpu_s,
                 bytes_out=pending.bytes_out,
                 bytes_in=size,
@@ -170,7 +166,7 @@ class SimulatedCloud:
 
     def _hurry(self) -> None:
         self._heartbeat.hurry(self._clock.now_s())
-        self._beat_when_due()
+        self._clock.at(self._heartbeat.due_s, partial(self._beat, self._heartbeat.due_s))
 
     def _end(
         self, pending: _Pending, failure: OffloadError, *, censored: bool = False, started: bool = True
@@ -201,17 +197,14 @@ class SimulatedCloud:
 
     def _start_beating(self) -> None:
         self._heartbeat.start(self._clock.now_s())
-        self._beat_when_due()
-
-    def _beat_when_due(self) -> None:
         self._clock.at(self._heartbeat.due_s, partial(self._beat, self._heartbeat.due_s))
 
     def _beat(self, due_s: float) -> None:
-        if self._heartbeat.due_s != due_s:  # it was put off, or another connection beats by now
+        if self._heartbeat.due_s != due_s:  # another connection beats by now
             return
         number = self._heartbeat.beat(self._clock.now_s())
         self.connection.say(BEAT_BYTES, BEAT, number, partial(self._beat_back, number))
-        self._beat_when_due()
+        self._clock.at(self._heartbeat.due_s, partial(self._beat, self._heartbeat.due_s))
 
     def _beat_back(self, number: int) -> None:
         queue = self._server.queue
