@@ -13,7 +13,7 @@ from common.wanted import always, call_while
 Blobs = Mapping[bytes, StoredBlob]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Outcome:
     """How a task went: ok, failed, or busy where it could not start; `run_s` is the time in the worker.
 

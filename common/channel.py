@@ -26,6 +26,8 @@ class Channel:
     def __init__(self, of: "zmq.Socket[bytes]", *watched: int) -> None:
         self.lock = threading.RLock()
         self._socket = of
+        self._frames: list[zmq.Frame] = []  # of a message whose reading was interrupted, as by Ctrl-C
+        self._read_out = False  # nothing was left to read; for what comes after that there is a signal
         self._waker, self._woken = socket.socketpair()
         self._waker.setblocking(False)
         self._woken.setblocking(False)
@@ -48,18 +50,23 @@ class Channel:
         """The next message; None where there is none. For the reader."""
         with self.lock:
             if not self._readable:
+                self._read_out = True
                 return None
-            frames: list[zmq.Frame] = []
+            self._read_out = False
+            frames = self._frames
             with contextlib.suppress(zmq.Again):
                 while not frames or frames[-1].more:
                     frames.append(self._socket.recv(zmq.DONTWAIT, copy=False))
+            self._frames = []
             return frames or None
 
     def wait(self, timeout_s: float) -> None:
         """Until there is something to read, or `wake` was called. For the reader."""
-        with self.lock:
-            if self._readable:
-                return
+        if not self._read_out:
+            with self.lock:
+                if self._readable:
+                    return
+        self._read_out = False
         ready = self._poll.poll(max(0.0, timeout_s) * 1e3)
         if any(descriptor == self._woken.fileno() for descriptor, _ in ready):
             self._woken.recv(WAKE_BYTES)

@@ -126,6 +126,10 @@ def kind_named(name: str) -> Kind:
         raise UnknownTask(f"no task named {name!r}; known: {', '.join(sorted(_kinds)) or 'none'}") from None
 
 
+def is_kind(name: str) -> bool:
+    return name in _kinds
+
+
 def kinds() -> tuple[Kind, ...]:
     """All kinds registered in this process."""
     return tuple(_kinds.values())

@@ -6,7 +6,7 @@ What the frames travel in is `common.wire`.
 import dataclasses
 import functools
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,6 +29,7 @@ BLOB_BYTES_MIN = 64 * 1024  # a larger argument is a blob
 VALUE_BYTES_MAX = 16 * 1024 * 1024  # msgpack part of a value; arrays do not count
 ARRAYS_MAX = 1000  # arrays sent beside one value
 BLOBS_MAX = 64  # blobs one value may refer to
+UNSCANNED_BYTES_MAX = 512  # of msgpack that cannot announce more than is harmless
 NESTING_MAX = 32
 DIMENSIONS_MAX = 8
 TYPES_MAX = 256  # dataclasses whose fields are remembered
@@ -46,13 +47,20 @@ class Body:
     blobs: dict[bytes, memoryview] = field(default_factory=dict)
 
 
-def encode(value: Any, types: Sequence[type] = (), *, blobs: bool = False) -> Body:
+def encode(
+    value: Any,
+    types: Sequence[type] = (),
+    *,
+    blobs: bool = False,
+    along: Callable[[memoryview], bool] = lambda _: False,
+) -> Body:
     """Encode None, bool, int, float, str, bytes, list, tuple, dict, arrays and dataclasses of `types`.
 
-    With `blobs`, every array or bytes over BLOB_BYTES_MIN is named by digest instead of sent along.
+    With `blobs`, every array or bytes over BLOB_BYTES_MIN is named by digest instead of sent along, unless
+    `along` says so of the array's bytes.
     Arrays are not copied: leave them alone until the frames are sent. BadValue names what cannot cross.
     """
-    encoder = _Encoder(types, blobs)
+    encoder = _Encoder(types, blobs, along)
     main = encoder.pack(value, 0)
     if len(main) > VALUE_BYTES_MAX:
         raise BadValue(
@@ -73,10 +81,12 @@ def unpack_bounded(data: Buffer, bytes_max: int) -> Any:
     if byte_length(data) > bytes_max:
         raise ProtocolError(f"msgpack of {byte_length(data)} bytes, at most {bytes_max} are allowed")
     try:
-        # Skipping proves that every announced item is there; unpacking alone allocates on announcement.
-        scan = msgpack.Unpacker(max_buffer_size=bytes_max, strict_map_key=False)
-        scan.feed(data)
-        scan.skip()
+        # Skipping proves that every announced item is there; unpacking alone allocates on announcement, for
+        # each byte of the data at most as many items as it has bytes.
+        if byte_length(data) > UNSCANNED_BYTES_MAX:
+            scan = msgpack.Unpacker(max_buffer_size=bytes_max, strict_map_key=False)
+            scan.feed(data)
+            scan.skip()
         return msgpack.unpackb(data, strict_map_key=False)
     except _UNPACK_ERRORS as error:
         raise ProtocolError(f"not msgpack: {type(error).__name__} {error}") from error
@@ -85,9 +95,10 @@ def unpack_bounded(data: Buffer, bytes_max: int) -> Any:
 class _Encoder:
     """Turns a value into what msgpack packs, collecting array frames and blobs on the way."""
 
-    def __init__(self, types: Sequence[type], use_blobs: bool) -> None:
+    def __init__(self, types: Sequence[type], use_blobs: bool, along: Callable[[memoryview], bool]) -> None:
         self.types = types
         self.use_blobs = use_blobs
+        self.along = along
         self.frames: list[Buffer] = []
         self.blobs: dict[bytes, memoryview] = {}
 
@@ -141,7 +152,7 @@ class _Encoder:
                 f"an array of {array.ndim} dimensions and dtype {array.dtype} cannot cross the wire"
             )
         raw = np.asarray(array, order="C").reshape(-1).view(np.uint8).data
-        if self.use_blobs and raw.nbytes > BLOB_BYTES_MIN:
+        if self.use_blobs and raw.nbytes > BLOB_BYTES_MIN and not self.along(raw):
             return self._blob(array_digest(array, raw), raw, array.dtype.str, array.shape)
         if len(self.frames) == ARRAYS_MAX:
             raise BadValue(f"value holds more than {ARRAYS_MAX} arrays")

@@ -8,7 +8,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, get_args
 
 import msgpack
 
@@ -76,7 +76,7 @@ class Hello:
     message_bytes_max: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Request:
     """Run a task: `body` is the encoded list of its arguments, `blobs` the digests that it refers to.
 
@@ -92,7 +92,7 @@ class Request:
     body: list[Buffer] = field(default_factory=list)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Reply:
     """How a request went; `body` is the encoded result, empty unless `status` is ok.
 
@@ -143,10 +143,11 @@ Message = Hello | Request | Reply | Ping | Pong | Cancel | Blob
 
 def pack(message: Message) -> list[Buffer]:
     """The frames of a message; buffers in it are not copied. BadValue where it breaks a bound."""
-    name, raw = type(message).__name__.lower(), _RAW.get(type(message))
-    fields = {f.name: getattr(message, f.name) for f in dataclasses.fields(message) if f.name != raw}
+    name, names = _FIELDS[type(message)]
+    fields = {field: getattr(message, field) for field in names}
     if isinstance(message, Reply):
-        fields["error"] = message.error[:ERROR_LENGTH_MAX].encode("utf-8", "replace").decode()
+        if message.error:
+            fields["error"] = message.error[:ERROR_LENGTH_MAX].encode("utf-8", "replace").decode()
         if message.cpu_s is None:
             del fields["cpu_s"]
     header: bytes = msgpack.packb([VERSION, name, fields])
@@ -300,7 +301,11 @@ def _frame_count(name: str, rest: list[Buffer], wanted: int) -> None:
         raise ProtocolError(f"{name} with {len(rest)} frames after the header, not {wanted}")
 
 
-_RAW: dict[type, str] = {Request: "body", Reply: "body", Blob: "data"}
+_RAW = ("body", "data")  # what follows the header in frames of its own
+_FIELDS: dict[type, tuple[str, list[str]]] = {
+    kind: (kind.__name__.lower(), [one.name for one in dataclasses.fields(kind) if one.name not in _RAW])
+    for kind in get_args(Message)
+}
 _READERS: dict[str, Callable[[_Fields, list[Buffer]], Message]] = {
     "hello": _hello,
     "request": _request,

@@ -86,3 +86,41 @@ def test_a_full_queue_is_an_error_and_no_wait(
     dealer.disconnect(address)
     with pytest.raises(zmq.Again):
         channel.send([b"nobody takes it"])
+
+
+class Interrupted:
+    """The socket, but Ctrl-C comes before the second frame is read."""
+
+    def __init__(self, socket: "zmq.Socket[bytes]") -> None:
+        self._socket = socket
+        self._left = 1
+
+    def getsockopt(self, option: int) -> int | bytes:
+        return self._socket.getsockopt(option)
+
+    def recv(self, flags: int, *, copy: bool) -> bytes | zmq.Frame:
+        if self._left == 0:
+            self._left = 100
+            raise KeyboardInterrupt
+        self._left -= 1
+        return self._socket.recv(flags, copy=copy)
+
+
+def test_a_message_whose_reading_is_interrupted_is_read_on(
+    pair: "tuple[zmq.Socket[bytes], Channel, zmq.Socket[bytes]]", monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever reads next gets all of its frames, and the next message after it."""
+    dealer, channel, router = pair
+    channel.send([b"hello"])
+    robot = router.recv_multipart()[0]
+    for first in (b"a", b"d"):
+        router.send_multipart([robot, first, b"b", b"c"])
+    channel.wait(LONG_S)
+    monkeypatch.setattr(channel, "_socket", Interrupted(dealer))
+    with pytest.raises(KeyboardInterrupt):
+        channel.receive()
+    for first in (b"a", b"d"):
+        channel.wait(LONG_S)
+        message = channel.receive()
+        assert message is not None
+        assert [frame.bytes for frame in message] == [first, b"b", b"c"]
