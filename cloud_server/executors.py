@@ -25,7 +25,7 @@ log = logging.getLogger("cloud_server")
 
 
 class Executor(Protocol):
-    """Runs tasks. Every method is called from the one thread that made the executor."""
+    """Runs tasks. `submit` is called in any thread, by one at a time; all else by the one that made it."""
 
     workers: int
 

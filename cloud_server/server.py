@@ -6,10 +6,10 @@ It never computes and never waits for work; what runs the tasks is `executors`.
 import logging
 import os
 import time
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import zmq
@@ -20,7 +20,7 @@ from cloud_server.metrics import Metrics, Status
 from cloud_server.quota import CUT_OFF_S, Quota, Verdict
 from cloud_server.robots import ZAP_DOMAIN, Robots
 from cloud_server.unsent import LARGE_BYTES, Unsent
-from cloud_server.waiting import CRASHES_MAX, Crashes, Waiting, Work, held_bytes
+from cloud_server.waiting import CRASHES_MAX, Crashes, Waiting, Work
 from common import VERSION, tasks
 from common.blobs import BlobStore, Buffer
 from common.channel import Channel
@@ -88,8 +88,7 @@ class Server:
         self._drain_until: float | None = None
         self._on_ready = on_ready
         self._warming: Future[None] | None = None
-        self._dispatched: deque[Work] = deque()  # that this turn starts
-        self._ready = self._was_ready = False
+        self._warm = False
         self._started = self._last_turn = time.monotonic()
         self._last_task: float | None = None
         self._last_warning = -float("inf")
@@ -103,6 +102,7 @@ class Server:
         self._backlog = Backlog(port, message_bytes_max, blob_bytes_max, metrics, encrypted=keys is not None)
         self._channel = Channel(self._socket)
         self._closed = False
+        self._chosen: list[Work] = []  # to be started by who chose it
         metrics.queue_depth.set_function(lambda: len(self._waiting))
         metrics.running.set_function(lambda: len(self._running))
         metrics.blob_bytes.set_function(lambda: self._blobs.byte_count)
@@ -146,25 +146,28 @@ class Server:
                     break
             for work in self._waiting.take(lambda work: work.expired(self._last_turn)):
                 self._refuse(work.peer, work.request, "expired", queue_s=now - work.arrived)
-            self._dispatch()
+            self._choose()
+            chosen, self._chosen = self._chosen, []
         # Last, and without the lock: a worker has the interpreter, and its reply the socket, at once.
-        while self._dispatched:
-            self._start(self._dispatched.popleft())
+        self._start(chosen)
 
     def _tend_executor(self) -> None:
-        """Start the executor; once it is warm the server is ready while any of its workers is up."""
+        """Start the executor, and see when it is warm."""
         if self._warming is None:
             self._warming = self._executor.warm(self._worker_changed)
             self._warming.add_done_callback(lambda _: self._channel.wake())
-        elif self._was_ready:
-            self._ready = self._executor.up > 0
-        elif self._warming.done():
+        elif not self._warm and self._warming.done():
             self._warmed(self._warming.exception())
+
+    @property
+    def _ready(self) -> bool:
+        """Once all workers are warm, while any of them is up."""
+        return self._warm and self._executor.up > 0
 
     def _warmed(self, error: BaseException | None) -> None:
         if error is not None:
             raise OffloadError(f"tasks could not be warmed up: {type(error).__name__}: {error}") from error
-        self._ready = self._was_ready = True
+        self._warm = True
         self._on_ready()
 
     def _worker_changed(self, died: str) -> None:
@@ -235,7 +238,7 @@ class Server:
     def _request(self, peer: bytes, request: Request) -> None:
         """Put the request in line, or say why not."""
         work = Work(peer, request, {}, time.monotonic(), self._robot_of(peer))
-        if request.kind not in (kind.name for kind in tasks.kinds()):
+        if not tasks.is_kind(request.kind):
             self._refuse(peer, request, "unknown_task", f"no task named {request.kind!r} on this server")
         elif self._crashes.too_many(peer, request.id):
             self._refuse(peer, request, "failed", f"its worker died {CRASHES_MAX} times; it is not run again")
@@ -247,7 +250,7 @@ class Server:
             self._refuse(peer, request, "busy", f"{len(self._waiting)} requests are waiting")
         elif missing := self._pin(work):
             self._refuse(peer, request, "need_blob", missing=missing)
-        elif held_bytes([*self._waiting, *self._running, work]) > self._held_bytes_max:
+        elif self._waiting.bytes_with(work) > self._held_bytes_max:
             self._refuse(peer, request, "busy", "waiting requests hold all the memory allowed")
         else:
             evicted = self._waiting.add(work)
@@ -255,7 +258,7 @@ class Server:
                 self._refuse(
                     evicted.peer, evicted.request, "busy", f"{len(self._waiting)} requests are waiting"
                 )
-            self._dispatch()
+            self._choose()
 
     @property
     def _held_bytes_max(self) -> int:
@@ -272,8 +275,8 @@ class Server:
                 work.blobs[digest] = blob
         return tuple(digest for digest in work.request.blobs if digest not in work.blobs)
 
-    def _dispatch(self) -> None:
-        """Choose waiting work while workers are free."""
+    def _choose(self) -> None:
+        """Waiting work for the workers that are free: it counts as running."""
         while self._ready and len(self._running) < self._executor.up:
             work = self._waiting.next()
             if work is None:
@@ -289,25 +292,39 @@ class Server:
                 self._refuse(work.peer, work.request, "expired", queue_s=work.queue_s)
                 continue
             self._running.add(work)
-            self._dispatched.append(work)
+            self._chosen.append(work)
 
-    def _start(self, work: Work) -> None:
-        request = work.request
-        left_s = request.budget_s - work.queue_s
-        future = self._executor.submit(
-            request.kind, request.body, work.blobs, lambda: work.wanted and self._knows(work.peer), left_s
-        )
-        future.add_done_callback(lambda done: self._finished(work, done))
+    def _start(self, chosen: list[Work]) -> None:
+        """Hand work to the executor. Any thread, without the lock: blobs may have to be written."""
+        while chosen:
+            work = chosen.pop(0)
+            request, left_s = work.request, work.request.budget_s - work.queue_s
+            future = self._executor.submit(
+                request.kind, request.body, work.blobs, partial(self._wanted, work), left_s
+            )
+            if future.done():  # refused: answered here, as calls would nest
+                chosen += self._answered(work, future)
+            else:
+                future.add_done_callback(partial(self._finished, work))
+
+    def _wanted(self, work: Work) -> bool:
+        return work.wanted and self._knows(work.peer)
 
     def _finished(self, work: Work, future: "Future[Outcome]") -> None:
-        """Called in a worker's thread: the reply need not wait for the loop."""
+        """Called in a worker's thread: neither the reply nor the next request waits for the loop."""
+        self._start(self._answered(work, future))
+
+    def _answered(self, work: Work, future: "Future[Outcome]") -> list[Work]:
+        """Answer it; the work to start in its place."""
         with self._channel.lock:
             if self._closed or future.cancelled():
-                return
+                return []
             self._answer(work, future.result())
-            loop_has_work = self._waiting or self._drain_until is not None
-        if loop_has_work:
+            self._choose()
+            chosen, self._chosen = self._chosen, []
+        if self._drain_until is not None:
             self._channel.wake()
+        return chosen
 
     def _answer(self, work: Work, outcome: Outcome) -> None:
         self._running.discard(work)
@@ -417,10 +434,11 @@ class Server:
         return len(waiting) + len(self._running)
 
     def _close(self) -> None:
+        with self._channel.lock:
+            self._closed = True
         self._executor.close()
         self._backlog.close()
         with self._channel.lock:
-            self._closed = True
             self._socket.close(linger=int(SEND_LAST_S * 1000))
         self._context.term()
         self._channel.close()

@@ -1,7 +1,7 @@
 """The bounded lines of accepted requests, one for each robot, and requests that are not let in again."""
 
-from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from common.blobs import StoredBlob
@@ -46,6 +46,11 @@ class Waiting:
         self._least_s = 0.0  # of the robot that was last chosen: who comes anew begins there
         self._usual_s = 0.0
         self._count = 0
+        self._held = _Held()
+
+    def bytes_with(self, work: Work) -> int:
+        """In memory for all requests that wait or run, once this one does."""
+        return self._held.byte_count + self._held.more(work)
 
     def closed_to(self, robot: bytes) -> bool:
         """Whether all is taken, and no other robot's line is longer than this one's would be."""
@@ -57,7 +62,9 @@ class Waiting:
         if self._count >= self.queue_max:
             line = self._longest()
             evicted = line.pop()
+            self._held.drop(evicted)
             self._count -= 1
+        self._held.add(work)
         self._had_s[work.robot] = max(self._had_s.get(work.robot, 0.0), self._least_s)
         self._lines.setdefault(work.robot, deque()).append(work)
         self._count += 1
@@ -85,6 +92,7 @@ class Waiting:
     def done(self, work: Work, run_s: float) -> None:
         """What `next` gave out has ended after `run_s` in a worker, 0 where it never began."""
         robot = work.robot
+        self._held.drop(work)
         self._had_s[robot] += run_s - work.charged_s
         if run_s > 0:
             self._usual_s += USUAL_RATE * (run_s - self._usual_s)
@@ -100,11 +108,15 @@ class Waiting:
 
     def take(self, matches: Callable[[Work], bool]) -> list[Work]:
         """Remove and return every waiting request that matches."""
+        if not self._count:
+            return []
         taken = [work for work in self if matches(work)]
         for robot in {work.robot for work in taken}:
             self._lines[robot] = deque(work for work in self._lines[robot] if not matches(work))
             if not self._lines[robot]:
                 del self._lines[robot]
+        for work in taken:
+            self._held.drop(work)
         self._count -= len(taken)
         return taken
 
@@ -113,6 +125,33 @@ class Waiting:
 
     def __iter__(self) -> Iterator[Work]:
         return (work for line in self._lines.values() for work in line)
+
+
+class _Held:
+    """Bytes that requests keep in memory: each body, and each pinned blob once."""
+
+    def __init__(self) -> None:
+        self.byte_count = 0
+        self._pins: Counter[int] = Counter()  # requests that pin the blob of this `id`
+
+    def add(self, work: Work) -> None:
+        self.byte_count += self.more(work)
+        self._pins.update(map(id, work.blobs.values()))
+
+    def drop(self, work: Work) -> None:
+        for blob in work.blobs.values():
+            self._pins[id(blob)] -= 1
+            if not self._pins[id(blob)]:
+                del self._pins[id(blob)]
+        self.byte_count -= self.more(work)
+
+    def more(self, work: Work) -> int:
+        """Bytes that are kept for this request alone."""
+        own = byte_count(work.request.body)
+        for blob in work.blobs.values():
+            if id(blob) not in self._pins:
+                own += blob.data.nbytes
+        return own
 
 
 class Crashes:
@@ -131,10 +170,3 @@ class Crashes:
 
     def __len__(self) -> int:
         return len(self._counts)
-
-
-def held_bytes(works: Iterable[Work]) -> int:
-    """Memory that these requests keep: each body, and each pinned blob once."""
-    works = list(works)
-    blobs = {id(blob): blob.data.nbytes for work in works for blob in work.blobs.values()}
-    return sum(byte_count(work.request.body) for work in works) + sum(blobs.values())
