@@ -8,6 +8,8 @@ from concurrent import futures
 from concurrent.futures import CancelledError, Future
 from typing import Any, Protocol
 
+from robot_client.turns import Answer
+
 
 class Clock(Protocol):
     """Seconds from any start, never backwards."""
@@ -30,4 +32,7 @@ class SystemClock:
             with contextlib.suppress(TimeoutError, CancelledError):
                 pending[0].exception(timeout_s)
             return
+        for one in pending:
+            if isinstance(one, Answer):
+                one.leave()
         futures.wait(pending, timeout_s, futures.FIRST_COMPLETED)

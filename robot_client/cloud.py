@@ -1,16 +1,17 @@
-"""The runner of a remote site: one DEALER socket, read by one I/O thread; whoever asks sends himself.
+"""The runner of a remote site: one DEALER socket; whoever asks sends himself, and reads if he is alone.
 
 Answers are matched by id; whatever arrives late is dropped. What a message looks like is `common.wire`.
 """
 
 import contextlib
 import logging
+import math
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -37,6 +38,8 @@ from common.keys import RobotKeys
 from common.tasks import Kind, Task, kinds
 from robot_client.heartbeat import Heartbeat
 from robot_client.runner import CLOUD, Condition, Execution, check_endpoint
+from robot_client.turns import Answer, Turns
+from robot_client.uploads import Uploads
 
 PENDING_MAX = 1024
 ATTEMPTS_MAX = 4  # sends of one request: the first, and one after each `need_blob`
@@ -48,8 +51,6 @@ RECONNECT_MS, RECONNECT_MAX_MS = 100, 1000
 # heartbeats would wait behind a large argument and break a slow link that works.
 UNACKNOWLEDGED_MS = 15_000
 KEEPALIVE_IDLE_S, KEEPALIVE_EVERY_S, KEEPALIVE_PROBES = 10, 5, 2
-UPLOADS_KEPT = 1024  # digests remembered of one connection
-PUSH_AFTER = 2  # tasks of a kind in a row, each with a blob that is new to the server: then they go unasked
 CLOSE_WAIT_S = 2.0
 REFUSED = "it does not know this robot's key"
 UNFIT = "the handshake failed: the connection broke, or keys do not fit the server's"
@@ -68,11 +69,12 @@ class _Pending:
     """A request in flight."""
 
     task: Task
-    request: wire.Request
-    blobs: dict[bytes, Any]
+    body: wire.Body
     published: float
     deadline: float
-    future: "Future[Execution]" = field(default_factory=Future)
+    future: "Future[Execution]"
+    along: bool  # whether large arguments are in the body
+    attempt: int = 1
     bytes_out: int = 0
     sent_as: int = 0  # number of the last message it was sent in
     asks: bool = False  # whether the server has a blob of it is not known
@@ -106,14 +108,13 @@ class CloudRunner:
         self._pending: dict[int, _Pending] = {}
         self._unwanted: deque[int] = deque()
         self._asked = False  # to find out whether the server is there
-        self._closing = False
-        self._wakes_s = 0.0  # when the I/O thread looks again, whatever happens
+        self._turns = Turns(self._tend, self._receive, expected=self._expected, wake=self._wake)
+        self._looks_s = -math.inf  # when whoever waits for messages looks again, whatever happens
         self._handshake_failure = ""  # the last one's, until one succeeds
         self._given_up = False  # by libzmq, after such a failure
-        self._hello_due = float("inf")
+        self._hello_due = math.inf
         self._messages = 0
-        self._uploads: dict[bytes, int] = {}  # number of the message that last carried the blob
-        self._in_vain: Counter[str] = Counter()  # tasks of a kind in a row with new blobs
+        self._uploads = Uploads()
         self._context = zmq.Context()
         try:
             self._socket, self._monitor = _connect(self._context, endpoint, keys)
@@ -144,7 +145,8 @@ class CloudRunner:
     def submit(self, task: Task, budget_s: float) -> "Future[Execution]":
         published = time.perf_counter()
         try:
-            body = wire.encode(list(task.args), task.kind.types, blobs=True)
+            along = self._uploads.along(task.kind.name, self._message_bytes_max)
+            body = wire.encode(list(task.args), task.kind.types, blobs=True, along=along)
         except BadValue as error:
             return self._refused(BadValue(f"task {task.kind.name}: {error}"))
         largest = max([wire.byte_count(body.frames), *(raw.nbytes for raw in body.blobs.values())])
@@ -153,32 +155,30 @@ class CloudRunner:
             return self._refused(CloudBroken(failure))
         if len(self._pending) >= PENDING_MAX:
             return self._refused(CloudBusy(f"{PENDING_MAX} tasks are in flight"))
-        request = wire.Request(task.id, task.kind.name, budget_s, 1, tuple(body.blobs), body.frames)
-        pending = _Pending(task, request, body.blobs, published, published + budget_s)
+        pending = _Pending(task, body, published, published + budget_s, Answer(self._turns), along.used)
         with self._channel.lock:
-            if self._closing:
+            if self._turns.closed:
                 pending.future.cancel()
                 return pending.future
             self._pending[task.id] = pending
             self._send_first(pending)
-            if pending.deadline < self._wakes_s:
+            if pending.deadline < self._looks_s:
                 self._channel.wake()
         return pending.future
 
     def cancel(self, task: Task) -> None:
         self._unwanted.append(task.id)
-        self._channel.wake()
+        self._turns.call()
 
     def hurry(self) -> None:
         self._asked = True
-        self._channel.wake()
+        self._turns.call()
 
     def condition(self) -> Condition:
         return self._heartbeat.condition(time.perf_counter())
 
     def close(self) -> None:
-        self._closing = True
-        self._channel.wake()
+        self._turns.close()
         self._thread.join(CLOSE_WAIT_S)
 
     def _refused(self, failure: OffloadError) -> "Future[Execution]":
@@ -186,34 +186,42 @@ class CloudRunner:
         future.set_result(Execution(self.site, 0.0, failure=failure, started=False))
         return future
 
-    # What follows runs in the I/O thread only, but for sending a request.
+    def _expected(self) -> int:
+        return len(self._pending) + self._heartbeat.unanswered
+
+    def _wake(self) -> None:
+        self._channel.wake()
 
     def _run(self) -> None:
         try:
-            self._loop()
+            self._turns.run(IDLE_WAIT_S)
         finally:
             self._shut_down()
 
-    def _loop(self) -> None:
-        while not self._closing:
-            self._channel.wait(self._wait_s())
-            with self._channel.lock:
-                self._receive_all()
-                self._watch_connection()
-                while self._unwanted:
-                    self._give_up(self._unwanted.popleft())
-                self._expire()
-                self._beat()
+    # What follows runs in the thread whose turn it is, but for sending a request.
 
-    def _wait_s(self) -> float:
-        now_s = time.perf_counter()
+    def _tend(self) -> None:
+        """What is due."""
         with self._channel.lock:
+            self._watch_connection()
+            while self._unwanted:
+                self._give_up(self._unwanted.popleft())
+            self._expire()
+            self._beat()
+
+    def _receive(self, wait_s: float) -> None:
+        with self._channel.lock:
+            now_s = time.perf_counter()
             due = [pending.deadline for pending in self._pending.values()]
-            self._wakes_s = min([now_s + IDLE_WAIT_S, self._hello_due, self._heartbeat.due_s, *due])
-            return self._wakes_s - now_s
+            self._looks_s = min([now_s + wait_s, self._hello_due, self._heartbeat.due_s, *due])
+        self._channel.wait(self._looks_s - now_s)
+        with self._channel.lock:
+            self._looks_s = -math.inf
+            while frames := self._channel.receive():
+                self._read(frames, time.perf_counter())
 
     def _watch_connection(self) -> None:
-        while int(self._monitor.EVENTS) & zmq.POLLIN:
+        while int(self._monitor.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
             event = zmq.utils.monitor.recv_monitor_message(self._monitor)["event"]
             if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
                 self._handshake_failure, self._given_up = "", False
@@ -224,7 +232,7 @@ class CloudRunner:
                     log.warning("%s: %s: %s; asking again", self.site, self._endpoint, failure)
                 self._handshake_failure = failure
             elif event == zmq.EVENT_DISCONNECTED:
-                self._hello_due = float("inf")
+                self._hello_due = math.inf
                 self._heartbeat.stop()
                 if self._absent is None:
                     log.warning("%s: connection to %s lost", self.site, self._endpoint)
@@ -233,7 +241,7 @@ class CloudRunner:
                     self._absent += f": {self._handshake_failure}"
                 if self._given_up:
                     self._hello_due = time.perf_counter() + HELLO_EVERY_S
-                self._uploads.clear()
+                self._uploads.forget()
                 for request_id in list(self._pending):
                     self._finish(request_id, CloudBroken("the connection was lost"))
 
@@ -246,7 +254,7 @@ class CloudRunner:
         self._send(wire.Hello(known, SOFTWARE, MESSAGE_BYTES_MAX))
 
     def _connect_again(self) -> None:
-        self._hello_due, self._given_up = float("inf"), False
+        self._hello_due, self._given_up = math.inf, False
         with contextlib.suppress(zmq.ZMQError):  # there is no connection to end
             self._socket.disconnect(self._endpoint)
         self._socket.connect(self._endpoint)
@@ -268,19 +276,24 @@ class CloudRunner:
 
     def _send_first(self, pending: _Pending) -> None:
         """Blobs that the server may have are only named, unless those of this kind are always new."""
-        unknown = [digest for digest in pending.blobs if digest not in self._uploads]
-        if unknown and self._in_vain[pending.request.kind] >= PUSH_AFTER:
+        body, kind = pending.body, pending.task.kind.name
+        unknown = self._uploads.unknown(body)
+        if unknown and self._uploads.often_new(kind):
             self._upload(pending, unknown)
         elif unknown:
             pending.asks = True
-        elif pending.blobs:
-            self._in_vain[pending.request.kind] = 0
-        self._send_request(pending, pending.request)
+        elif body.blobs and not pending.along:
+            self._uploads.found(kind, new=False)
+        self._send_request(pending)
 
-    def _send_request(self, pending: _Pending, request: wire.Request) -> None:
+    def _send_request(self, pending: _Pending) -> None:
         left_s = pending.deadline - time.perf_counter()
         if left_s > 0:
-            sent = self._send(replace(request, budget_s=left_s))
+            task, body = pending.task, pending.body
+            request = wire.Request(
+                task.id, task.kind.name, left_s, pending.attempt, tuple(body.blobs), body.frames
+            )
+            sent = self._send(request)
             pending.bytes_out += sent
             pending.sent_as = self._messages
             if not sent:
@@ -296,21 +309,19 @@ class CloudRunner:
         self._messages += 1
         return wire.byte_count(frames)
 
-    def _receive_all(self) -> None:
-        while frames := self._channel.receive():
-            received = time.perf_counter()
-            buffers = [frame.buffer for frame in frames]
-            try:
-                self._take(wire.unpack(buffers), received, wire.byte_count(buffers))
-            except wire.VersionMismatch as error:
-                self._absent, self._hello_due = str(error), float("inf")
-                log.warning("%s: %s: tasks stay onboard", self.site, error)
-            except ProtocolError as error:
-                log.warning("%s: message dropped: %s", self.site, error)
+    def _read(self, frames: Iterable[zmq.Frame], received: float) -> None:
+        buffers = [frame.buffer for frame in frames]
+        try:
+            self._take(wire.unpack(buffers), received, wire.byte_count(buffers))
+        except wire.VersionMismatch as error:
+            self._absent, self._hello_due = str(error), math.inf
+            log.warning("%s: %s: tasks stay onboard", self.site, error)
+        except ProtocolError as error:
+            log.warning("%s: message dropped: %s", self.site, error)
 
     def _take(self, message: wire.Message, received: float, bytes_in: int) -> None:
         if isinstance(message, wire.Hello):
-            self._hello_due = float("inf")
+            self._hello_due = math.inf
             self._remote, self._message_bytes_max = message.tasks, message.message_bytes_max
             if self._absent is not None:
                 log.info("%s: %s is up", self.site, self._endpoint)
@@ -329,29 +340,27 @@ class CloudRunner:
                 self._finish_reply(self._pending[message.id], message, received, bytes_in)
 
     def _send_blobs(self, pending: _Pending, missing: Iterable[bytes]) -> None:
-        request = replace(pending.request, attempt=pending.request.attempt + 1)
-        if request.attempt > ATTEMPTS_MAX or not pending.blobs.keys() >= set(missing):
+        pending.attempt += 1
+        if pending.attempt > ATTEMPTS_MAX or not pending.body.blobs.keys() >= set(missing):
             self._finish(pending.task.id, CloudBroken("the server keeps losing the blobs"), started=False)
             return
-        pending.request = request
         if pending.asks:
-            self._in_vain[request.kind] += 1
+            self._uploads.found(pending.task.kind.name, new=True)
             pending.asks = False
         # Another task may have brought one since this one was sent; messages keep their order.
-        self._upload(pending, [one for one in missing if self._uploads.get(one, 0) <= pending.sent_as])
-        self._send_request(pending, request)
+        sent_as = pending.sent_as
+        self._upload(pending, [one for one in missing if not self._uploads.carried_after(one, sent_as)])
+        self._send_request(pending)
 
     def _upload(self, pending: _Pending, digests: Iterable[bytes]) -> None:
         for digest in digests:
-            pending.bytes_out += self._send(wire.Blob(pending.blobs[digest]))
-            self._uploads[digest] = self._messages
-            if len(self._uploads) > UPLOADS_KEPT:
-                del self._uploads[next(iter(self._uploads))]
+            pending.bytes_out += self._send(wire.Blob(pending.body.blobs[digest]))
+            self._uploads.sent(digest, self._messages)
 
     def _finish_reply(self, pending: _Pending, reply: wire.Reply, received: float, bytes_in: int) -> None:
         value, failure = None, _failure(reply)
         if pending.asks and reply.status in ("ok", "failed"):
-            self._in_vain[pending.request.kind] = 0
+            self._uploads.found(pending.task.kind.name, new=False)
         if failure is None:
             try:
                 value = wire.decode(reply.body, pending.task.kind.types, {})
@@ -403,8 +412,8 @@ class CloudRunner:
 
     def _shut_down(self) -> None:
         self._absent = "closed"
-        with self._channel.lock:
-            self._closing = True
+        self._turns.close()
+        with self._turns.taken, self._channel.lock:
             for request_id in list(self._pending):
                 self._finish(request_id, CloudBroken("closed while the task was in flight"))
             self._socket.disable_monitor()

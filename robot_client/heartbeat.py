@@ -45,6 +45,11 @@ class Heartbeat:
         self._back_s = -float("inf")  # when the site was last heard again
         self._queue = 0
 
+    @property
+    def unanswered(self) -> int:
+        """How many are, of those remembered."""
+        return len(self._sent)
+
     def hurry(self, now_s: float) -> None:
         """A task is late: ask now whether the server is there, unless it was asked already."""
         if self._oldest_s > now_s and self.due_s < float("inf"):

@@ -13,13 +13,15 @@ from cloud_server.executors import Threads
 from cloud_server.metrics import Metrics
 from cloud_server.server import Server
 from common.tasks import Task, kind_of, task
-from robot_client.cloud import PUSH_AFTER, CloudRunner
+from robot_client.cloud import CloudRunner
 from robot_client.runner import Execution
+from robot_client.uploads import ALONG_BYTES_MAX, ALONG_SHARE, NEW_AFTER
 
 pytestmark = pytest.mark.integration
 
 WAIT_S = 8.0
 NUMBERS = 50_000
+MESSAGE_BYTES_MAX = 2**24
 
 
 @task("both_sums", size=lambda *arrays: len(arrays))
@@ -32,7 +34,7 @@ class Served:
 
     def __init__(self) -> None:
         self.metrics = Metrics()
-        bounds = {"queue_max": 8, "blob_bytes_max": 2**24, "message_bytes_max": 2**24}
+        bounds = {"queue_max": 8, "blob_bytes_max": 2**24, "message_bytes_max": MESSAGE_BYTES_MAX}
         bounds |= {"robot_bytes_a_s": 2**30, "drain_s": 1}
         self.server = Server("tcp://127.0.0.1:0", Threads(1), self.metrics, **bounds)  # type: ignore[arg-type]
 
@@ -40,6 +42,10 @@ class Served:
     def asked(self) -> int:
         labels = {"kind": "both_sums", "status": "need_blob"}
         return int(self.metrics.registry.get_sample_value("offboard_requests_total", labels) or 0)
+
+    @property
+    def kept_bytes(self) -> float:
+        return self.metrics.registry.get_sample_value("offboard_blob_bytes") or 0.0
 
 
 @pytest.fixture
@@ -71,12 +77,33 @@ def new(n: int) -> np.ndarray[Any, Any]:
     return np.full(NUMBERS, float(n))
 
 
-def test_blobs_that_are_always_new_go_unasked(served: Served) -> None:
-    """After PUSH_AFTER tasks whose blob the server did not have, none waits for it to ask."""
+def test_arguments_that_are_always_new_go_along(served: Served) -> None:
+    """After NEW_AFTER tasks whose blob the server did not have, none is named, asked for or kept."""
     with joined(served) as runner:
-        for n in range(PUSH_AFTER + 3):
+        for n in range(NEW_AFTER + 3):
             run(runner, new(n))
-    assert served.asked == PUSH_AFTER
+    assert served.asked == NEW_AFTER
+    assert served.kept_bytes == NEW_AFTER * new(0).nbytes
+
+
+def test_what_went_along_is_kept_once_it_comes_again(served: Served) -> None:
+    """The second time it is uploaded, unasked; from the third on it is only named."""
+    with joined(served) as runner:
+        sent = [run(runner, new(n)).bytes_out for n in (*range(NEW_AFTER + 1), NEW_AFTER, NEW_AFTER)]
+    assert served.asked == NEW_AFTER
+    assert sent[-2] > new(0).nbytes
+    assert sent[-1] < 1000
+
+
+def test_no_more_goes_along_than_fits(served: Served) -> None:
+    """Of one task; the rest are blobs, in messages of their own."""
+    most = int(ALONG_SHARE * MESSAGE_BYTES_MAX)
+    assert most <= ALONG_BYTES_MAX
+    with joined(served) as runner:
+        for n in range(NEW_AFTER):
+            run(runner, new(n))
+        run(runner, *(np.full(most // 2 // 8, float(n)) for n in range(10, 12)), new(12))
+    assert served.kept_bytes == (NEW_AFTER + 1) * new(0).nbytes
 
 
 def test_a_blob_that_is_used_again_is_asked_for_first(served: Served) -> None:
@@ -90,18 +117,18 @@ def test_a_blob_that_is_used_again_is_asked_for_first(served: Served) -> None:
 def test_what_another_robot_has_sent_is_not_sent_again(served: Served) -> None:
     """A robot that is new asks first, and that the server had it lets it ask again."""
     with joined(served) as runner:
-        for n in range(PUSH_AFTER + 1):
+        for n in range(NEW_AFTER):
             run(runner, new(n))
     with joined(served) as other:
-        for n in range(PUSH_AFTER + 1):
+        for n in range(NEW_AFTER):
             assert run(other, new(n)).bytes_out < NUMBERS
-    assert served.asked == PUSH_AFTER
+    assert served.asked == NEW_AFTER
 
 
 def test_of_two_blobs_the_known_one_is_not_sent_again(served: Served) -> None:
     """A map that stays and an image that changes: only the image goes along."""
     grid = new(-1)
     with joined(served) as runner:
-        sent = [run(runner, grid, new(n)).bytes_out for n in range(PUSH_AFTER + 3)]
-    assert served.asked == PUSH_AFTER
+        sent = [run(runner, grid, new(n)).bytes_out for n in range(NEW_AFTER + 3)]
+    assert served.asked == NEW_AFTER
     assert all(grid.nbytes < each < 1.1 * grid.nbytes for each in sent[1:])
