@@ -1,13 +1,16 @@
 """Where tasks run: threads of this process, or worker processes. Both speak `concurrent.futures`."""
 
+import contextlib
 import logging
 import math
 import tempfile
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
+from functools import partial
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Protocol
 
 from cloud_server.outcome import Blobs, Outcome, run_task, warm_kinds
@@ -21,11 +24,13 @@ __all__ = ["EXECUTORS", "Executor", "Outcome", "Processes", "Threads"]
 MEMORY_BYTES_MAX = 2 << 30  # of one worker process
 SPARES = 1  # worker processes beyond those that run tasks: a start takes longer than a crash may cost
 
+Done = Callable[["Future[Outcome]"], None]
+
 log = logging.getLogger("cloud_server")
 
 
 class Executor(Protocol):
-    """Runs tasks. `submit` is called in any thread, by one at a time; all else by the one that made it."""
+    """Runs tasks. `submit` and `run` are called in any thread; all else by the one that made it."""
 
     workers: int
 
@@ -47,12 +52,25 @@ class Executor(Protocol):
         blobs: Blobs,
         wanted: Callable[[], bool] = always,
         budget_s: float = math.inf,
+        done: Done = lambda _: None,
     ) -> "Future[Outcome]":
         """Run a task now; called only while fewer than `up` run. The future never holds an exception.
 
         A task that looks may end early once it is not `wanted`. A worker process is killed when its task
-        is still not done a little after its budget.
+        is still not done a little after its budget. `done` is the future's callback, and there before a
+        worker can have ended the task: in its thread, or in this one where no worker can take it.
         """
+
+    def run(
+        self,
+        kind: str,
+        frames: Sequence[Buffer],
+        blobs: Blobs,
+        wanted: Callable[[], bool],
+        *,
+        meanwhile: Callable[[], None],
+    ) -> Outcome | None:
+        """Run a task in this thread while another one does `meanwhile`; None: tasks do not run here."""
 
     def close(self) -> None:
         """Stop; tasks still running are abandoned. Safe to call twice."""
@@ -66,10 +84,14 @@ class Threads:
 
     def __init__(self, workers: int) -> None:
         self.workers = self.up = workers
-        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="task")
+        self._calls: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        for n in range(workers + 1):  # one may do what is to be done meanwhile
+            threading.Thread(target=self._work, name=f"task-{n}", daemon=True).start()
 
     def warm(self, changed: Callable[[str], None] = lambda _: None) -> "Future[None]":  # noqa: ARG002
-        return self._pool.submit(warm_kinds)
+        warmed: Future[None] = Future()
+        self._calls.put(partial(_warm, warmed))
+        return warmed
 
     def submit(
         self,
@@ -78,11 +100,44 @@ class Threads:
         blobs: Blobs,
         wanted: Callable[[], bool] = always,
         budget_s: float = math.inf,  # noqa: ARG002 - a thread cannot be killed
+        done: Done = lambda _: None,
     ) -> "Future[Outcome]":
-        return self._pool.submit(run_task, kind, frames, blobs, wanted)
+        outcome: Future[Outcome] = Future()
+        outcome.add_done_callback(done)
+        self._calls.put(lambda: outcome.set_result(run_task(kind, frames, blobs, wanted)))
+        return outcome
+
+    def run(
+        self,
+        kind: str,
+        frames: Sequence[Buffer],
+        blobs: Blobs,
+        wanted: Callable[[], bool],
+        *,
+        meanwhile: Callable[[], None],
+    ) -> Outcome | None:
+        self._calls.put(meanwhile)
+        return run_task(kind, frames, blobs, wanted)
 
     def close(self) -> None:
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        with contextlib.suppress(Empty):
+            while True:
+                self._calls.get_nowait()
+        for _ in range(self.workers + 1):
+            self._calls.put(None)
+
+    def _work(self) -> None:
+        while (call := self._calls.get()) is not None:
+            call()
+
+
+def _warm(warmed: "Future[None]") -> None:
+    try:
+        warm_kinds()
+    except BaseException as error:  # noqa: BLE001 - a task's own code
+        warmed.set_exception(error)
+    else:
+        warmed.set_result(None)
 
 
 class Processes:
@@ -127,9 +182,11 @@ class Processes:
         blobs: Blobs,
         wanted: Callable[[], bool] = always,
         budget_s: float = math.inf,
+        done: Done = lambda _: None,
     ) -> "Future[Outcome]":
         call = Call(kind, frames, tuple(blobs), wanted, budget_s)
         call.answer.add_done_callback(lambda _: self._spool.unpin(blobs))
+        call.answer.add_done_callback(done)
         try:
             self._spool.pin(blobs)
         except OSError as error:
@@ -141,6 +198,9 @@ class Processes:
                 return call.answer
         call.answer.set_result(Outcome("busy", "a worker died, and the next one is not there yet"))
         return call.answer
+
+    def run(self, *_: object, meanwhile: Callable[[], None]) -> None:  # noqa: ARG002
+        return None
 
     def close(self) -> None:
         workers, self._workers = self._workers, []

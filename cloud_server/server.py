@@ -1,14 +1,17 @@
 """The ROUTER loop: takes requests from robots and hands them to the executor, whose threads send the replies.
 
-It never computes and never waits for work; what runs the tasks is `executors`.
+It never waits for work; what runs the tasks is `executors`. Where tasks run in threads, the thread that has
+read a request runs it, and another one reads on: leader and followers (Schmidt et al. 2000).
 """
 
 import logging
 import os
+import threading
 import time
 from collections.abc import Callable
+from concurrent import futures
 from concurrent.futures import Future
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -102,6 +105,7 @@ class Server:
         self._backlog = Backlog(port, message_bytes_max, blob_bytes_max, metrics, encrypted=keys is not None)
         self._channel = Channel(self._socket)
         self._closed = False
+        self._ended: Future[None] = Future()  # when the last one has led
         self._chosen: list[Work] = []  # to be started by who chose it
         metrics.queue_depth.set_function(lambda: len(self._waiting))
         metrics.running.set_function(lambda: len(self._running))
@@ -111,9 +115,8 @@ class Server:
         """Serve until drained; True when everything that was accepted has been answered."""
         try:
             self._turn()
-            while not self._over():
-                self._channel.wait(POLL_S)
-                self._turn()
+            threading.Thread(target=self._lead, name="loop", daemon=True).start()
+            self._ended.result()
             with self._channel.lock:
                 return self._give_up_rest() == 0
         finally:
@@ -137,7 +140,35 @@ class Server:
             last_task_age_s=None if self._last_task is None else now - self._last_task,
         )
 
-    def _turn(self) -> None:
+    def _lead(self) -> None:
+        """Read, until there is a request to run here: another thread goes on then."""
+        try:
+            while not self._over():
+                self._channel.wait(POLL_S)
+                chosen = self._turn()
+                if chosen and self._run(chosen):
+                    return
+            self._ended.set_result(None)
+        except BaseException as error:  # noqa: BLE001 - whoever called `run` gets it
+            self._ended.set_exception(error)
+
+    def _run(self, chosen: list[Work]) -> bool:
+        """Start this work, one of it in this thread where it may; whether another one leads since then."""
+        *others, here = chosen
+        self._start(others)
+        request, wanted = here.request, partial(self._wanted, here)
+        outcome = self._executor.run(request.kind, request.body, here.blobs, wanted, meanwhile=self._lead)
+        if outcome is None:
+            self._start([here])
+            return False
+        try:
+            self._start(self._answered(here, outcome))
+        except Exception:  # as in the callback of a future: whoever leads goes on
+            log.exception("task %d of kind %s could not be answered", request.id, request.kind)
+        return True
+
+    def _turn(self) -> list[Work]:
+        """Read what is there; the work to start."""
         with self._channel.lock:
             now = self._last_turn = time.monotonic()
             self._tend_executor()
@@ -148,8 +179,7 @@ class Server:
                 self._refuse(work.peer, work.request, "expired", queue_s=now - work.arrived)
             self._choose()
             chosen, self._chosen = self._chosen, []
-        # Last, and without the lock: a worker has the interpreter, and its reply the socket, at once.
-        self._start(chosen)
+        return chosen
 
     def _tend_executor(self) -> None:
         """Start the executor, and see when it is warm."""
@@ -296,30 +326,31 @@ class Server:
 
     def _start(self, chosen: list[Work]) -> None:
         """Hand work to the executor. Any thread, without the lock: blobs may have to be written."""
+        starter = _Starter(chosen, threading.get_ident())
         while chosen:
             work = chosen.pop(0)
             request, left_s = work.request, work.request.budget_s - work.queue_s
-            future = self._executor.submit(
-                request.kind, request.body, work.blobs, partial(self._wanted, work), left_s
-            )
-            if future.done():  # refused: answered here, as calls would nest
-                chosen += self._answered(work, future)
-            else:
-                future.add_done_callback(partial(self._finished, work))
+            wanted, done = partial(self._wanted, work), partial(self._finished, work, starter)
+            self._executor.submit(request.kind, request.body, work.blobs, wanted, left_s, done)
+        starter.ended = True
 
     def _wanted(self, work: Work) -> bool:
         return work.wanted and self._knows(work.peer)
 
-    def _finished(self, work: Work, future: "Future[Outcome]") -> None:
+    def _finished(self, work: Work, starter: "_Starter", future: "Future[Outcome]") -> None:
         """Called in a worker's thread: neither the reply nor the next request waits for the loop."""
-        self._start(self._answered(work, future))
+        chosen = self._answered(work, future.result())
+        if starter.thread == threading.get_ident() and not starter.ended:
+            starter.chosen += chosen  # refused at once: calls would nest
+        else:
+            self._start(chosen)
 
-    def _answered(self, work: Work, future: "Future[Outcome]") -> list[Work]:
+    def _answered(self, work: Work, outcome: Outcome) -> list[Work]:
         """Answer it; the work to start in its place."""
         with self._channel.lock:
-            if self._closed or future.cancelled():
+            if self._closed:
                 return []
-            self._answer(work, future.result())
+            self._answer(work, outcome)
             self._choose()
             chosen, self._chosen = self._chosen, []
         if self._drain_until is not None:
@@ -420,6 +451,8 @@ class Server:
             log.warning("dropped a message: %s (more within %g s are only counted)", error, LOG_PAUSE_S)
 
     def _over(self) -> bool:
+        if self._closed:
+            return True
         if self._drain_until is None:
             return False
         idle = not self._waiting and not self._running
@@ -436,12 +469,23 @@ class Server:
     def _close(self) -> None:
         with self._channel.lock:
             self._closed = True
+        self._channel.wake()
+        futures.wait([self._ended], SEND_LAST_S)
         self._executor.close()
         self._backlog.close()
         with self._channel.lock:
             self._socket.close(linger=int(SEND_LAST_S * 1000))
         self._context.term()
         self._channel.close()
+
+
+@dataclass(slots=True)
+class _Starter:
+    """A call of `_start` that may be under way."""
+
+    chosen: list[Work]
+    thread: int
+    ended: bool = False
 
 
 def _bind(

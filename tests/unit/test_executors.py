@@ -6,10 +6,12 @@ import os
 import select
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import wait
+from concurrent.futures import Future, wait
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -324,3 +326,43 @@ def test_workers_die_with_the_server(module: str, tmp_path: Path) -> None:
     for fd in exits:
         os.close(fd)
     assert gone == [True] * (2 + SPARES)
+
+
+def test_threads_run_a_task_here_while_another_one_goes_on(
+    make: Callable[..., Executor], tmp_path: Path
+) -> None:
+    """Even where all workers are busy: the task waits for what is done meanwhile."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    executor, threads = make("threads"), list[int]()
+
+    def meanwhile() -> None:
+        threads.append(threading.get_ident())
+        pipe.write_text("done")
+
+    outcome = executor.run(
+        "exec_wait_for_file", encode([str(pipe)]).frames, {}, lambda: True, meanwhile=meanwhile
+    )
+    assert outcome is not None
+    assert value(outcome) == "done"
+    assert threads != [threading.get_ident()]
+
+
+def test_worker_processes_run_no_task_here(make: Callable[..., Executor]) -> None:
+    """And then nothing is done meanwhile."""
+    done = list[int]()
+    executor = make("processes")
+    assert (
+        executor.run("exec_exit", encode([]).frames, {}, lambda: True, meanwhile=lambda: done.append(1))
+        is None
+    )
+    assert done == []
+
+
+def test_done_is_called_once_for_every_task(executor: Executor) -> None:
+    """With the future that `submit` returned."""
+    done: SimpleQueue[Future[Outcome]] = SimpleQueue()
+    returned = executor.submit("exec_echo", encode(["text"]).frames, {}, done=done.put)
+    assert done.get(timeout=WAIT_S) is returned
+    assert value(returned.result(WAIT_S)) == "text"
+    assert done.empty()
