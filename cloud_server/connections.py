@@ -10,6 +10,7 @@ import os
 import socket
 import struct
 import threading
+import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,9 +54,10 @@ class Backlog:
         self._around = CURVE_BYTES if encrypted else 0
         self._read: dict[int, int] = {}
         self._seen: dict[int, _Seen] = {}
-        self._closed = threading.Event()
+        self._closed = False
         if STATM.exists():
-            self._lowest = _resident_bytes()
+            self._statm = os.open(STATM, os.O_RDONLY)
+            self._lowest = self._resident_bytes()
             threading.Thread(target=self._run, name="backlog", daemon=True).start()
         else:
             log.warning("%s is not there: what robots send ahead is not bounded by bytes", STATM)
@@ -65,7 +67,7 @@ class Backlog:
         self._read[file] = self._read.get(file, 0) + sum(self._on_the_wire(size) for size in sizes)
 
     def close(self) -> None:
-        self._closed.set()
+        self._closed = True
 
     def _on_the_wire(self, size: int) -> int:
         size += self._around
@@ -73,13 +75,18 @@ class Backlog:
 
     def _run(self) -> None:
         pause_s = LOOK_S
-        while not self._closed.wait(pause_s):
-            now = _resident_bytes()
+        while not self._closed:
+            time.sleep(pause_s)  # ten times a second: an event that could be waited for costs more
+            now = self._resident_bytes()
             grows = now - self._lowest >= self._message_bytes_max // 2
             self._lowest = now if grows else min(self._lowest, now)
             pause_s = LOOK_AGAIN_S if grows else LOOK_S
             if grows:
                 self.look()
+        os.close(self._statm)
+
+    def _resident_bytes(self) -> int:
+        return int(os.pread(self._statm, STATM_BYTES_MAX, 0).split()[1]) * PAGE_BYTES
 
     def look(self) -> None:
         """Measure every connection, and end those that are too far ahead."""
@@ -134,11 +141,3 @@ def _connections(port: int) -> Iterator[tuple[int, Any, int]]:
                     info = held.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, RECEIVED.size)
                     if len(info) == RECEIVED.size:
                         yield int(path.name), held.getpeername(), RECEIVED.unpack(info)[0]
-
-
-def _resident_bytes() -> int:
-    file = os.open(STATM, os.O_RDONLY)  # ten times a second: a Python file object would cost the most of it
-    try:
-        return int(os.read(file, STATM_BYTES_MAX).split()[1]) * PAGE_BYTES
-    finally:
-        os.close(file)

@@ -180,6 +180,10 @@ class _Help(argparse.HelpFormatter):
         super().__init__(prog, width=_columns() - 2)
 
 
+class RawHelp(_Help, argparse.RawDescriptionHelpFormatter):
+    """The same, where the description has its own lines."""
+
+
 def _columns() -> int:
     told = os.environ.get("COLUMNS", "")
     if told.isdecimal() and int(told) > 0:

@@ -2,13 +2,12 @@
 
 import os
 import sys
-from argparse import RawDescriptionHelpFormatter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from common.config import CommandParser, add_flags, check, resolve, run_command, setting
+from common.config import CommandParser, RawHelp, add_flags, check, resolve, run_command, setting
 from robot_client import policies, predictors
 
 C = TypeVar("C")
@@ -23,7 +22,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="loadgen",
         usage="loadgen COMMAND ... (loadgen COMMAND --help says more)",
         description="The test bench of Offboard.\n\ncommands:\n" + listing,
-        formatter_class=RawDescriptionHelpFormatter,
+        formatter_class=RawHelp,
     )
     parser.add_argument("command", choices=tuple(COMMANDS), metavar="COMMAND", help="one of the above")
     command = parser.parse_args(arguments[:1]).command

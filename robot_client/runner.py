@@ -1,12 +1,15 @@
 """The seam to the outside: a runner runs one task on one site and says how it went."""
 
 import re
-from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from common.errors import ConfigError, OffloadError
-from common.tasks import Kind, Task
+
+if TYPE_CHECKING:  # --help needs the names of the sites alone
+    from concurrent.futures import Future
+
+    from common.tasks import Kind, Task
 
 ONBOARD = "onboard"
 CLOUD = "cloud"
@@ -91,14 +94,14 @@ class Runner(Protocol):
     @property
     def site(self) -> str: ...
 
-    def unavailable(self, kind: Kind) -> str | None:
+    def unavailable(self, kind: "Kind") -> str | None:
         """Why a task of this kind cannot be sent now, or None when it can. Must not block."""
 
-    def submit(self, task: Task, budget_s: float) -> "Future[Execution]":
+    def submit(self, task: "Task", budget_s: float) -> "Future[Execution]":
         """Start the task. The future always gets an Execution, never an exception; a remote runner
         gives the task up after `budget_s` seconds."""
 
-    def cancel(self, task: Task) -> None:
+    def cancel(self, task: "Task") -> None:
         """The answer is no longer wanted: where it can still be stopped, its future ends now, censored."""
 
     def hurry(self) -> None:

@@ -1,6 +1,5 @@
 """When tasks come and how big they are: pure, from specs and a seed; the one file read is a CSV of sizes."""
 
-import csv
 import itertools
 import math
 import re
@@ -12,6 +11,8 @@ from typing import TYPE_CHECKING
 from common.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
+    import csv
+
     import numpy as np
 
 CLOSED, CONSTANT, POISSON, BURSTS = "closed", "constant", "poisson", "bursts"
@@ -119,6 +120,8 @@ def _draws(phase: Phase, random: "np.random.Generator") -> Iterator[float]:
 
 def _read_column(path: Path) -> list[float]:
     """The `size` column; DataError names file and line where a row has none."""
+    import csv  # where a file is read: not for --help
+
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = csv.DictReader(file)

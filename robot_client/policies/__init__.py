@@ -4,15 +4,15 @@ A policy is named by its rule, with any wrappers before it: `hedge:probe:greedy`
 What the decision leads to is in `offloader`.
 """
 
-from collections.abc import Callable
+import importlib
 from dataclasses import dataclass
 from random import Random
+from typing import TYPE_CHECKING, Any
 
 from common.errors import ConfigError
-from robot_client.policies.base import PINNED, Decision, Forecast, Outlook, Policy
-from robot_client.policies.rules import Always, Epsilon, Greedy, Hysteresis, LinUcb, Paper, Thompson
-from robot_client.policies.wrappers import Breaker, Budget, Hedge, Probe
-from robot_client.runner import CLOUD, ONBOARD
+
+if TYPE_CHECKING:
+    from robot_client.policies.base import PINNED, Decision, Forecast, Outlook, Policy
 
 __all__ = [
     "DEFAULT",
@@ -34,39 +34,44 @@ DEFAULT = "hedge:probe:greedy"
 
 @dataclass(frozen=True, slots=True)
 class _Rule:
-    """How a rule is made, and the predictor that it is meant with."""
+    """The predictor that a rule is meant with; how it is made is in `rules`."""
 
-    make: Callable[[Random], Policy]
     predictor: str = "least-squares"
     weighs_cost: bool = True  # else no objective changes what it does
 
 
+# Names only, so that --help, which lists them, need not load what they stand for.
 _RULES: dict[str, _Rule] = {
-    "paper": _Rule(lambda _: Paper(), weighs_cost=False),
-    ONBOARD: _Rule(lambda _: Always(ONBOARD), weighs_cost=False),
-    CLOUD: _Rule(lambda _: Always(CLOUD), weighs_cost=False),
-    "greedy": _Rule(lambda _: Greedy(), "work:average"),
-    "hysteresis": _Rule(lambda _: Hysteresis()),
-    "epsilon": _Rule(Epsilon),
-    "linucb": _Rule(lambda _: LinUcb(), "bayesian-least-squares"),
-    "thompson": _Rule(Thompson, "bayesian-least-squares"),
+    "paper": _Rule(weighs_cost=False),
+    "onboard": _Rule(weighs_cost=False),
+    "cloud": _Rule(weighs_cost=False),
+    "greedy": _Rule("work:average"),
+    "hysteresis": _Rule(),
+    "epsilon": _Rule(),
+    "linucb": _Rule("bayesian-least-squares"),
+    "thompson": _Rule("bayesian-least-squares"),
 }
-_WRAPPERS: dict[str, Callable[[Policy], Policy]] = {
-    "probe": Probe,
-    "hedge": Hedge,
-    "breaker": Breaker,
-    "budget": Budget,
-}
+_WRAPPERS = ("probe", "hedge", "breaker", "budget")
 HELP = f"{', '.join(_RULES)}; any of {', '.join(_WRAPPERS)} go around it: {DEFAULT}"
 
 
-def make(name: str, seed: int = 0) -> Policy:
+def __getattr__(name: str) -> Any:
+    """What a policy is written with; loaded where it is first asked for."""
+    if name not in __all__:
+        raise AttributeError(name)
+    return getattr(importlib.import_module("robot_client.policies.base"), name)
+
+
+def make(name: str, seed: int = 0) -> "Policy":
     """The policy of this name; the same seed draws the same."""
+    from robot_client.policies.rules import RULES
+    from robot_client.policies.wrappers import WRAPPERS
+
     check_name(name)
     *wrappers, rule = name.split(":")
-    policy = _RULES[rule].make(Random(seed))
+    policy = RULES[rule](Random(seed))
     for wrapper in reversed(wrappers):
-        policy = _WRAPPERS[wrapper](policy)
+        policy = WRAPPERS[wrapper](policy)
     return policy
 
 

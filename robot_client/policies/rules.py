@@ -1,10 +1,11 @@
 """Rules that compare what the sites would cost."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from random import Random
 
-from robot_client.policies.base import Decision, Forecast, cheapest, costs_of, explain, home
+from robot_client.policies.base import Decision, Forecast, Policy, cheapest, costs_of, explain, home
+from robot_client.runner import CLOUD, ONBOARD
 
 WARM_UP = 6  # observations of each site before anything is compared
 MARGIN = 0.1
@@ -124,3 +125,15 @@ def warm_up(forecast: Forecast, policy: str) -> Decision | None:
     reason = f"warm-up: too little is known of {' and '.join(sorted(cold))}"
     silent = tuple(site for site in forecast.sites if site not in heard)
     return Decision(home(forecast.only(heard)), True, reason, policy, spared=silent)
+
+
+RULES: dict[str, Callable[[Random], Policy]] = {
+    "paper": lambda _: Paper(),
+    ONBOARD: lambda _: Always(ONBOARD),
+    CLOUD: lambda _: Always(CLOUD),
+    "greedy": lambda _: Greedy(),
+    "hysteresis": lambda _: Hysteresis(),
+    "epsilon": Epsilon,
+    "linucb": lambda _: LinUcb(),
+    "thompson": Thompson,
+}

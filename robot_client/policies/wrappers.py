@@ -1,7 +1,7 @@
 """Wrappers: policies around a policy."""
 
 import math
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import replace
 
 from robot_client.policies.base import Decision, Forecast, Policy, cheapest
@@ -133,3 +133,11 @@ def _broken(failures: int, age: int) -> bool:
         return False
     doublings = min(failures - BREAK_AFTER, BROKEN_MAX.bit_length())
     return age < min(BROKEN_MAX, BROKEN_FOR << doublings)
+
+
+WRAPPERS: dict[str, Callable[[Policy], Policy]] = {
+    "probe": Probe,
+    "hedge": Hedge,
+    "breaker": Breaker,
+    "budget": Budget,
+}

@@ -10,7 +10,7 @@ import pytest
 
 from common.errors import ConfigError
 from robot_client import policies
-from robot_client.policies import Decision, Forecast, Outlook, Policy
+from robot_client.policies import Decision, Forecast, Outlook, Policy, rules, wrappers
 from robot_client.policies.rules import EPSILON, WARM_UP
 from robot_client.policies.wrappers import BREAK_AFTER, BROKEN_FOR, BROKEN_MAX, PROBE_EVERY
 from robot_client.runner import CLOUD, ONBOARD
@@ -20,6 +20,12 @@ from tests.policy_checks import EDGE, SILENT
 WRAPPERS = ("probe", "hedge", "breaker", "budget")
 WRAPPINGS = [":".join(some) for count in range(5) for some in permutations(WRAPPERS, count)]
 DRAWN = 4_000  # of chance
+
+
+def test_names_and_what_they_stand_for_agree() -> None:
+    """What `--help` lists is what can be made."""
+    assert tuple(rules.RULES) == policies.names()
+    assert tuple(wrappers.WRAPPERS) == policies._WRAPPERS == WRAPPERS
 
 
 @pytest.mark.parametrize("rule", policies.names())

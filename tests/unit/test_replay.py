@@ -13,7 +13,7 @@ from loadgen.evaluate import TableConfig
 from loadgen.replay import ReplayConfig, replay, run_replay
 from loadgen.rows import read
 from robot_client import policies
-from robot_client.policies import Decision, Forecast, Outlook
+from robot_client.policies import Decision, Forecast, Outlook, rules
 from robot_client.runner import Execution
 from robot_client.trace import Record, Trace
 from tests.unit.test_evaluate import THOUSAND, TWELVE, csv_of
@@ -85,7 +85,8 @@ def test_a_task_on_both_sites_takes_as_long_as_the_first_answer(
         def decide(self, forecast: Forecast) -> Decision:  # noqa: ARG002 - whatever it is
             return Decision("onboard", True, "", "twice")
 
-    monkeypatch.setitem(policies._RULES, "twice", policies._Rule(lambda _: Twice()))
+    monkeypatch.setitem(policies._RULES, "twice", policies._Rule())
+    monkeypatch.setitem(rules.RULES, "twice", lambda _: Twice())
     rows = read(dataset(tmp_path, TWELVE))
     played = replay(rows, "twice", predictor="least-squares", window=3, feedback="chosen")
     assert played.both.all()
