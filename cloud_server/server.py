@@ -1,28 +1,25 @@
 """The ROUTER loop: takes requests from robots and hands them to the executor, whose threads send the replies.
 
-It never waits for work; what runs the tasks is `executors`. Where tasks run in threads, the thread that has
-read a request runs it, and another one reads on: leader and followers (Schmidt et al. 2000).
+It never waits for work; who reads and who runs tasks is `crew`, what runs them `executors`.
 """
 
 import logging
 import os
-import threading
 import time
 from collections.abc import Callable
-from concurrent import futures
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 
 import zmq
 
 from cloud_server.connections import Backlog, end, other_end
+from cloud_server.crew import Crew
 from cloud_server.executors import Executor, Outcome
 from cloud_server.metrics import Metrics, Status
+from cloud_server.outbox import Outbox
 from cloud_server.quota import CUT_OFF_S, Quota, Verdict
 from cloud_server.robots import ZAP_DOMAIN, Robots
-from cloud_server.unsent import LARGE_BYTES, Unsent
 from cloud_server.waiting import CRASHES_MAX, Crashes, Waiting, Work
 from common import VERSION, tasks
 from common.blobs import BlobStore, Buffer
@@ -40,7 +37,6 @@ from common.wire import (
     Request,
     VersionMismatch,
     byte_count,
-    pack,
     unpack,
 )
 
@@ -86,7 +82,6 @@ class Server:
         self._blobs = BlobStore(blob_bytes_max)
         self._message_bytes_max = message_bytes_max
         self._quota = Quota(robot_bytes_a_s, message_bytes_max)
-        self._unsent = Unsent(message_bytes_max)
         self._drain_s = drain_s
         self._drain_until: float | None = None
         self._on_ready = on_ready
@@ -104,8 +99,11 @@ class Server:
         port = int(self.endpoint.rpartition(":")[2])
         self._backlog = Backlog(port, message_bytes_max, blob_bytes_max, metrics, encrypted=keys is not None)
         self._channel = Channel(self._socket)
+        self._outbox = Outbox(self._channel, metrics, message_bytes_max, self._knows)
+        self._crew = Crew(
+            executor, turn=self._turn, answered=self._answered, wanted=self._wanted, over=self._over
+        )
         self._closed = False
-        self._ended: Future[None] = Future()  # when the last one has led
         self._chosen: list[Work] = []  # to be started by who chose it
         metrics.queue_depth.set_function(lambda: len(self._waiting))
         metrics.running.set_function(lambda: len(self._running))
@@ -114,9 +112,9 @@ class Server:
     def run(self) -> bool:
         """Serve until drained; True when everything that was accepted has been answered."""
         try:
-            self._turn()
-            threading.Thread(target=self._lead, name="loop", daemon=True).start()
-            self._ended.result()
+            with self._channel.lock:
+                self._tend_executor()
+            self._crew.run()
             with self._channel.lock:
                 return self._give_up_rest() == 0
         finally:
@@ -140,35 +138,9 @@ class Server:
             last_task_age_s=None if self._last_task is None else now - self._last_task,
         )
 
-    def _lead(self) -> None:
-        """Read, until there is a request to run here: another thread goes on then."""
-        try:
-            while not self._over():
-                self._channel.wait(POLL_S)
-                chosen = self._turn()
-                if chosen and self._run(chosen):
-                    return
-            self._ended.set_result(None)
-        except BaseException as error:  # noqa: BLE001 - whoever called `run` gets it
-            self._ended.set_exception(error)
-
-    def _run(self, chosen: list[Work]) -> bool:
-        """Start this work, one of it in this thread where it may; whether another one leads since then."""
-        *others, here = chosen
-        self._start(others)
-        request, wanted = here.request, partial(self._wanted, here)
-        outcome = self._executor.run(request.kind, request.body, here.blobs, wanted, meanwhile=self._lead)
-        if outcome is None:
-            self._start([here])
-            return False
-        try:
-            self._start(self._answered(here, outcome))
-        except Exception:  # as in the callback of a future: whoever leads goes on
-            log.exception("task %d of kind %s could not be answered", request.id, request.kind)
-        return True
-
     def _turn(self) -> list[Work]:
-        """Read what is there; the work to start."""
+        """Wait for messages and take them; the work to start."""
+        self._channel.wait(POLL_S)
         with self._channel.lock:
             now = self._last_turn = time.monotonic()
             self._tend_executor()
@@ -232,7 +204,7 @@ class Server:
             self._take(peer.bytes, unpack(frames), verdict)
         except VersionMismatch as error:
             self._drop("version", error)
-            self._send(peer.bytes, self._hello())
+            self._outbox.send(peer.bytes, self._hello())
         except ProtocolError as error:
             self._drop("malformed", error)
         return True
@@ -255,11 +227,11 @@ class Server:
             case Blob(data):
                 self._blobs.add(data, self._robot_of(peer))
             case Ping(id):
-                self._send(peer, Pong(id, len(self._waiting)))
+                self._outbox.send(peer, Pong(id, len(self._waiting)))
             case Hello():
                 # Robots ask again until they are answered, and send no task before that.
                 if self._ready and self._drain_until is None:
-                    self._send(peer, self._hello())
+                    self._outbox.send(peer, self._hello())
             case Cancel(id):
                 self._cancel(peer, id)
             case _:
@@ -324,26 +296,8 @@ class Server:
             self._running.add(work)
             self._chosen.append(work)
 
-    def _start(self, chosen: list[Work]) -> None:
-        """Hand work to the executor. Any thread, without the lock: blobs may have to be written."""
-        starter = _Starter(chosen, threading.get_ident())
-        while chosen:
-            work = chosen.pop(0)
-            request, left_s = work.request, work.request.budget_s - work.queue_s
-            wanted, done = partial(self._wanted, work), partial(self._finished, work, starter)
-            self._executor.submit(request.kind, request.body, work.blobs, wanted, left_s, done)
-        starter.ended = True
-
     def _wanted(self, work: Work) -> bool:
         return work.wanted and self._knows(work.peer)
-
-    def _finished(self, work: Work, starter: "_Starter", future: "Future[Outcome]") -> None:
-        """Called in a worker's thread: neither the reply nor the next request waits for the loop."""
-        chosen = self._answered(work, future.result())
-        if starter.thread == threading.get_ident() and not starter.ended:
-            starter.chosen += chosen  # refused at once: calls would nest
-        else:
-            self._start(chosen)
 
     def _answered(self, work: Work, outcome: Outcome) -> list[Work]:
         """Answer it; the work to start in its place."""
@@ -369,7 +323,7 @@ class Server:
             error = f"BadValue: the result takes {size} bytes, at most {self._message_bytes_max} are allowed"
             outcome = replace(outcome, status="failed", error=error, frames=[], server_fault=True)
         if work.wanted:
-            self._send(
+            self._outbox.send(
                 work.peer,
                 Reply(
                     request.id,
@@ -406,7 +360,7 @@ class Server:
     ) -> None:
         self._count(request, status)
         depth = len(self._waiting)
-        self._send(
+        self._outbox.send(
             peer, Reply(request.id, status, error, queue_s=queue_s, queue_depth=depth, missing=missing)
         )
 
@@ -418,28 +372,6 @@ class Server:
     def _hello(self) -> Hello:
         known = {kind.name: kind.source_hash for kind in tasks.kinds()}
         return Hello(known, VERSION, self._message_bytes_max)
-
-    def _send(self, peer: bytes, message: Message) -> None:
-        """Send or drop, never wait: the robot may be gone, not reading, or not one of ours any more."""
-        if not self._knows(peer):
-            self.metrics.dropped.labels("unknown robot").inc()
-            return
-        frames = pack(message)
-        size = byte_count(frames)
-        if size > LARGE_BYTES:
-            if not self._unsent.has_room(peer, size):
-                self.metrics.dropped.labels("not reading").inc()
-                return
-            frames = self._unsent.tracked(peer, frames, size)
-        try:
-            self._channel.send([peer, *frames])
-            self.metrics.bytes_out.inc(size)
-        except zmq.Again:
-            self.metrics.dropped.labels("not reading").inc()
-        except zmq.ZMQError as error:
-            if error.errno != zmq.EHOSTUNREACH:
-                raise
-            self.metrics.dropped.labels("gone").inc()
 
     def _knows(self, peer: bytes) -> bool:
         return self._robots is None or self._robots.knows(peer)
@@ -470,22 +402,13 @@ class Server:
         with self._channel.lock:
             self._closed = True
         self._channel.wake()
-        futures.wait([self._ended], SEND_LAST_S)
+        self._crew.leave(SEND_LAST_S)
         self._executor.close()
         self._backlog.close()
         with self._channel.lock:
             self._socket.close(linger=int(SEND_LAST_S * 1000))
         self._context.term()
         self._channel.close()
-
-
-@dataclass(slots=True)
-class _Starter:
-    """A call of `_start` that may be under way."""
-
-    chosen: list[Work]
-    thread: int
-    ended: bool = False
 
 
 def _bind(

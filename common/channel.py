@@ -15,6 +15,9 @@ import zmq
 
 COPIED_BYTES_MAX = 4096  # of a frame that is copied into the message
 WAKE_BYTES = 4096  # taken at once of the pair by which the reader is woken
+# As whole numbers: pyzmq's flags make a new object at each `|` and `&`, which takes longer than the call.
+_NOW, _MORE = int(zmq.DONTWAIT), int(zmq.DONTWAIT | zmq.SNDMORE)
+_POLLIN = int(zmq.POLLIN)
 
 
 class Channel:
@@ -40,23 +43,23 @@ class Channel:
         with self.lock:
             *first, last = frames
             for frame in first:
-                self._send(frame, zmq.DONTWAIT | zmq.SNDMORE)
-            self._send(last, zmq.DONTWAIT)
+                self._send(frame, _MORE)
+            self._send(last, _NOW)
             # The signal is given once, for all that happened before: sending may have taken it.
-            if self._readable:
+            if readable(self._socket):
                 self.wake()
 
     def receive(self) -> "list[zmq.Frame] | None":
         """The next message; None where there is none. For the reader."""
         with self.lock:
-            if not self._readable:
+            if not readable(self._socket):
                 self._read_out = True
                 return None
             self._read_out = False
             frames = self._frames
             with contextlib.suppress(zmq.Again):
                 while not frames or frames[-1].more:
-                    frames.append(self._socket.recv(zmq.DONTWAIT, copy=False))
+                    frames.append(self._socket.recv(_NOW, copy=False))
             self._frames = []
             return frames or None
 
@@ -64,7 +67,7 @@ class Channel:
         """Until there is something to read, or `wake` was called. For the reader."""
         if not self._read_out:
             with self.lock:
-                if self._readable:
+                if readable(self._socket):
                     return
         self._read_out = False
         ready = self._poll.poll(max(0.0, timeout_s) * 1e3)
@@ -86,6 +89,7 @@ class Channel:
         copied = isinstance(frame, bytes) and len(frame) <= COPIED_BYTES_MAX
         self._socket.send(frame, flags, copy=copied)
 
-    @property
-    def _readable(self) -> bool:
-        return bool(int(self._socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
+
+def readable(of: "zmq.Socket[bytes]") -> bool:
+    """Whether there is a message."""
+    return bool(int(of.getsockopt(zmq.EVENTS)) & _POLLIN)

@@ -20,7 +20,7 @@ import zmq.utils.monitor
 
 from common import VERSION as SOFTWARE
 from common import wire
-from common.channel import Channel
+from common.channel import Channel, readable
 from common.errors import (
     BadValue,
     CloudBroken,
@@ -221,7 +221,7 @@ class CloudRunner:
                 self._read(frames, time.perf_counter())
 
     def _watch_connection(self) -> None:
-        while int(self._monitor.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+        while readable(self._monitor):
             event = zmq.utils.monitor.recv_monitor_message(self._monitor)["event"]
             if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
                 self._handshake_failure, self._given_up = "", False

@@ -20,6 +20,7 @@ OWNERS = {
         "common/channel.py",
         "common/keys.py",
         "robot_client/cloud.py",
+        "cloud_server/outbox.py",
         "cloud_server/robots.py",
         "cloud_server/server.py",
         "cloud_server/unsent.py",
