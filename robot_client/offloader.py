@@ -23,7 +23,7 @@ from robot_client.allowance import Allowance
 from robot_client.batch import Batch, Placed, arguments
 from robot_client.clock import Clock, SystemClock
 from robot_client.energy import Energy
-from robot_client.memory import KindMemory
+from robot_client.memory import LOADED, KindMemory
 from robot_client.objectives import Objective
 from robot_client.onboard import OnboardRunner
 from robot_client.policies import PINNED, Decision, Forecast, Outlook, Policy
@@ -368,7 +368,7 @@ class Offloader:
         here, flights = memory.site(site), self._flights[site]
         condition = UNMEASURED
         if here.conditional:
-            condition = self._runners[site].condition()
+            condition = self._measured(site)
             if flights:
                 condition = self._behind_own(site, condition)
         return here.outlook(amount, condition, in_flight=len(flights), timeout_s=timeout_s)
@@ -423,8 +423,15 @@ class Offloader:
     def _apart_from(self, own: int, memory: KindMemory, site: str) -> Condition:
         if not memory.site(site).conditional:
             return UNMEASURED
-        condition = self._runners[site].condition()
+        condition = self._measured(site)
         return replace(condition, queue=max(0, condition.queue - own))
+
+    def _measured(self, site: str) -> Condition:
+        """Of a server too the load of the robot, where that is what its times tell of."""
+        condition = self._runners[site].condition()
+        if site != ONBOARD and (load := self._runners[ONBOARD].condition().load) > LOADED:
+            return replace(condition, load=load)
+        return condition
 
     def _check_where(self, kind: Kind, where: str) -> None:
         if where != BOTH and where not in self._runners:

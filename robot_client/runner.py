@@ -74,8 +74,9 @@ class Condition:
     """What is measured of a site beside the times of its tasks: the features of a prediction.
 
     `round_trip_s` is that of its heartbeats (None: it has none); `silent`: they go unanswered; `queue`: tasks
-    that wait there, as it last said; `load`: the share of the robot's own CPU that others take, 0 to 1;
-    `wait_s`: how long the robot's own tasks, or a link that is held up, will still keep it from beginning.
+    that wait there, as it last said; `load`: the share of the robot's own CPU that others take, 0 to 1, of a
+    server only while it is so large that the server's times tell of it; `wait_s`: how long the robot's own
+    tasks, or a link that is held up, will still keep it from beginning.
     """
 
     round_trip_s: float | None = None

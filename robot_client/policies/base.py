@@ -134,7 +134,7 @@ def explain(forecast: Forecast, site: str) -> str:
             parts.append(f"{name} {_times(one)}")
             if one.age:
                 stale += f"; {name} last tried {one.age} tasks ago"
-        measured += _measured(one.condition, "" if len(sites) == 2 else f" {name}")
+        measured += _measured(name, one.condition, "" if len(sites) == 2 else f" {name}")
     return f"{' against '.join(parts)}; {measured}{stale}"
 
 
@@ -148,11 +148,11 @@ def _times(one: Outlook) -> str:
     return f"{one.predicted_s * 1e3:.3g} ms [{one.low_s * 1e3:.3g}, {one.high_s * 1e3:.3g}]"
 
 
-def _measured(condition: Condition, of: str) -> str:
+def _measured(site: str, condition: Condition, of: str) -> str:
     said = ""
     if condition.round_trip_s is not None:
         said = f", queue{of} {condition.queue}, rtt{of} {condition.round_trip_s * 1e3:.3g} ms"
-    if condition.load >= 0.005:
+    if site == ONBOARD and condition.load >= 0.005:
         said += f", load{of} {condition.load:.0%}"
     if condition.wait_s:
         said += f", wait{of} {condition.wait_s * 1e3:.3g} ms"

@@ -167,3 +167,21 @@ def test_bytes_and_joules_are_those_that_were_usual() -> None:
     learn(one, Execution(ONBOARD, 0.5, cpu_s=0.4))
     assert outlook(one, ONBOARD).joules == pytest.approx(0.4 * Energy().compute_w)
     assert math.isfinite(outlook(one, ONBOARD).cost or 0.0)
+
+
+def test_what_a_server_takes_while_the_robot_is_loaded_is_learnt_apart() -> None:
+    """What is expected of it after that is what it was before; and while it lasts, what it was meanwhile."""
+    one, loaded = known(), Condition(load=0.6)
+    for _ in range(30):
+        learn(one, Execution(CLOUD, 0.5), condition=loaded)
+    assert outlook(one, condition=loaded).predicted_s == pytest.approx(0.5, rel=0.05)
+    assert outlook(one).predicted_s == pytest.approx(0.2)
+
+
+def test_a_server_that_is_first_used_by_a_loaded_robot_gets_known() -> None:
+    """Else the warm-up would not end while the load lasts."""
+    one = memory()
+    for _ in range(20):
+        learn(one, Execution(CLOUD, 0.2), condition=Condition(load=0.6))
+    assert len(one.site(CLOUD).predictor) >= 10
+    assert outlook(one).predicted_s == pytest.approx(0.2)
