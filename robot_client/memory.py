@@ -22,9 +22,9 @@ from robot_client.shared_work import SharedWork
 
 AMOUNT_RATE = 0.1  # of the bytes and CPU seconds that a task usually takes
 OBSERVATIONS_MAX = 200  # of a site, kept for `store`
-LOADED = 0.3  # of the robot's own CPU taken by others: from there on a server's times tell of the robot
-LOADED_FROM = 10  # times of a server: the first ones are all learnt as one
-LOADED_MIN = 3  # times of a server while the robot is loaded, before such are expected
+LOADED = 0.3  # of the robot's own CPU taken by others: from there on all times tell of that
+LOADED_FROM = 10  # times of a site: the first ones are all learnt as one
+LOADED_MIN = 3  # times while the robot is loaded, before such are expected
 
 log = logging.getLogger(__name__)
 
@@ -77,8 +77,7 @@ class KindMemory:
 
     def site(self, name: str) -> "SiteMemory":
         if name not in self.sites:
-            loaded = None if name == ONBOARD else self._make()
-            self.sites[name] = SiteMemory(name, self._make(), self._objective, self._energy, loaded)
+            self.sites[name] = SiteMemory(name, self._make, self._objective, self._energy)
         return self.sites[name]
 
     def amount(self, size: float) -> float | None:
@@ -119,23 +118,23 @@ class KindMemory:
 class SiteMemory:
     """Of one kind on one site.
 
-    What a server takes while the robot is LOADED is learnt apart, by `loaded`: the robot is slow to send and
-    to hear then, and the server as quick as before once that is over.
+    What it takes while the robot is LOADED is learnt apart: the robot is slow to run, to send and to hear
+    then, by more than a gain on the load tells, and everything is as quick as before once that is over.
     """
 
     def __init__(
         self,
         site: str,
-        predictor: Predictor,
+        make: Callable[[], Predictor],
         objective: Objective,
         energy: Energy,
-        loaded: Predictor | None = None,
     ) -> None:
-        self.predictor = predictor
+        predictor = self.predictor = make()
         self.age = 0
         self.observations: deque[Observation] = deque(maxlen=OBSERVATIONS_MAX)
         self._conditional = predictor if isinstance(predictor, Conditional) else None
         self.conditional = self._conditional is not None
+        loaded = make() if self.conditional else None
         self._loaded = loaded if isinstance(loaded, Conditional) else None
         self._site = site
         self._failures = 0
@@ -153,7 +152,7 @@ class SiteMemory:
         if amount is not None:
             if self._conditional is not None:
                 model = self._conditional
-                if self._loaded is not None and condition.load and len(self._loaded) >= LOADED_MIN:
+                if self._loaded is not None and condition.load > LOADED and len(self._loaded) >= LOADED_MIN:
                     model = self._loaded
                 found = model.predict(amount, self.age + 1, self._seen(condition))
             else:
@@ -248,7 +247,8 @@ class SiteMemory:
         self._use(one.bytes, one.cpu_s)
         if one.predicted_s is not None:
             self._conformal.learn(one.predicted_s, one.seconds + one.waited_s)
-        if self._loaded is not None and one.condition.load and len(self.predictor) >= LOADED_FROM:
+        loaded = one.condition.load > LOADED and len(self.predictor) >= LOADED_FROM
+        if self._loaded is not None and loaded:
             self._loaded.learn(one.amount, one.seconds, self._seen(one.condition))
         elif self._conditional is not None:
             self._conditional.learn(one.amount, one.seconds, self._seen(one.condition))
@@ -256,8 +256,8 @@ class SiteMemory:
             self.predictor.learn(one.amount, one.seconds)
 
     def _seen(self, condition: Condition) -> Condition:
-        """By the predictors: what the robot's load does to a server's times they are two for."""
-        return replace(condition, load=0.0) if self._loaded is not None and condition.load else condition
+        """By the predictors: no server is slower for the robot's load."""
+        return replace(condition, load=0.0) if condition.load and self._site != ONBOARD else condition
 
     def _use(self, moved: float, cpu_s: float | None) -> None:
         self._bytes.add(moved)
