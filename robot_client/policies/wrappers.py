@@ -4,10 +4,11 @@ import math
 from collections.abc import Callable, Collection
 from dataclasses import replace
 
-from robot_client.policies.base import Decision, Forecast, Policy, cheapest
+from robot_client.policies.base import Decision, Forecast, Outlook, Policy, cheapest
 from robot_client.runner import ONBOARD
 
 PROBE_EVERY = 20  # tasks without news of a site
+SLOWER_MAX = 4.0  # times as slow as the chosen site: so much more seldom onboard is tried, at most
 RESERVED = 1  # second runs that are left for hedges
 HEDGE_MIN_S = 1e-3  # a wait of 0 is a probe
 BREAK_AFTER = 3  # failures in a row
@@ -18,7 +19,8 @@ class Probe:
     """Runs a task in the shadow on a site that nothing was heard of for PROBE_EVERY tasks.
 
     The first answer is used, and both times are learnt: nobody waits for what is only tried. A site whose
-    heartbeats go unanswered is not tried: the first one that is answered says more.
+    heartbeats go unanswered is not tried: the first one that is answered says more. Onboard, where a run
+    takes the time of the tasks beside it, is tried the more seldom the slower it is expected to be.
     """
 
     def __init__(self, inner: Policy) -> None:
@@ -32,7 +34,7 @@ class Probe:
             site: one.age
             for site, one in forecast.sites.items()
             if site != decision.site
-            and one.age >= PROBE_EVERY
+            and one.age >= _probe_after(site, one, forecast.sites[decision.site])
             and not one.in_flight
             and not one.condition.silent
         }
@@ -126,6 +128,13 @@ def _fits(forecast: Forecast, sites: Collection[str]) -> bool:
         math.fsum(one.bytes for one in taken) <= forecast.bytes_left
         and math.fsum(one.joules for one in taken) <= forecast.joules_left
     )
+
+
+def _probe_after(site: str, one: Outlook, chosen: Outlook) -> float:
+    """Tasks without news of this site."""
+    if site != ONBOARD or not one.predicted_s or not chosen.predicted_s:
+        return PROBE_EVERY
+    return PROBE_EVERY * min(max(1.0, one.predicted_s / chosen.predicted_s), SLOWER_MAX)
 
 
 def _broken(failures: int, age: int) -> bool:

@@ -12,7 +12,7 @@ from common.errors import ConfigError
 from robot_client import policies
 from robot_client.policies import Decision, Forecast, Outlook, Policy, rules, wrappers
 from robot_client.policies.rules import EPSILON, WARM_UP
-from robot_client.policies.wrappers import BREAK_AFTER, BROKEN_FOR, BROKEN_MAX, PROBE_EVERY
+from robot_client.policies.wrappers import BREAK_AFTER, BROKEN_FOR, BROKEN_MAX, PROBE_EVERY, SLOWER_MAX
 from robot_client.runner import CLOUD, ONBOARD
 from tests import policy_checks
 from tests.policy_checks import EDGE, SILENT
@@ -153,6 +153,14 @@ def test_a_site_without_news_is_probed_at_once(age: int, probed: bool) -> None:
         0,
     )
     assert ("cloud is probed" in decision.reason) == probed
+
+
+@pytest.mark.parametrize(("onboard_s", "after"), [(0.11, 1.1), (0.3, 3.0), (2.0, SLOWER_MAX)])
+def test_a_slow_robot_is_probed_more_seldom(onboard_s: float, after: float) -> None:
+    """By as much as it is slower than the chosen site, up to SLOWER_MAX: a probe takes the time of its tasks."""
+    for age, probed in ((PROBE_EVERY * after - 1, False), (PROBE_EVERY * after + 1, True)):
+        sites = {ONBOARD: known(onboard_s, age=age), CLOUD: known(0.1)}
+        assert (decide("probe:greedy", sites).second == ONBOARD) == probed
 
 
 def test_a_probe_leaves_a_second_run_to_hedges() -> None:
