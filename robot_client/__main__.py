@@ -1,7 +1,6 @@
 """`robot-client`: a simulated robot that plans on a real map, or calls of a task; where its policy says."""
 
 import gc
-import logging
 import os
 import signal
 import sys
@@ -19,8 +18,6 @@ from robot_client.runner import CLOUD, ONBOARD, PORT_MAX
 if TYPE_CHECKING:
     from robot_client.lines import Lines
     from robot_client.trace import Record
-
-log = logging.getLogger("robot_client")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -46,8 +43,10 @@ def _run(argv: Sequence[str]) -> int:
         environ=os.environ,
         prefix="ROBOT",
     )
+    import logging  # not for --help
+
     logging.basicConfig(level=config.log.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    log.info("config %s", as_dict(config))
+    logging.getLogger("robot_client").info("config %s", as_dict(config))
     signal.signal(signal.SIGTERM, _interrupt)
     return _drive(config)
 
@@ -128,8 +127,12 @@ def _drive(config: RobotConfig) -> int:
 
 
 def _say_absent(doing: str, absent: Mapping[str, str]) -> None:
+    import logging
+
     for site, why in absent.items():
-        log.warning("%s without %s: %s; tasks run %s", doing, site, why, ONBOARD)
+        logging.getLogger("robot_client").warning(
+            "%s without %s: %s; tasks run %s", doing, site, why, ONBOARD
+        )
 
 
 def _metrics(config: RobotConfig) -> "list[Callable[[Record], None]]":

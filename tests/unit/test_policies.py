@@ -157,7 +157,7 @@ def test_a_site_without_news_is_probed_at_once(age: int, probed: bool) -> None:
 
 @pytest.mark.parametrize(("onboard_s", "after"), [(0.11, 1.1), (0.3, 3.0), (2.0, SLOWER_MAX)])
 def test_a_slow_robot_is_probed_more_seldom(onboard_s: float, after: float) -> None:
-    """By as much as it is slower than the chosen site, up to SLOWER_MAX: a probe takes the time of its tasks."""
+    """By as much as it is slower than the chosen site, up to SLOWER_MAX: a probe takes its tasks' time."""
     for age, probed in ((PROBE_EVERY * after - 1, False), (PROBE_EVERY * after + 1, True)):
         sites = {ONBOARD: known(onboard_s, age=age), CLOUD: known(0.1)}
         assert (decide("probe:greedy", sites).second == ONBOARD) == probed
