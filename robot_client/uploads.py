@@ -70,6 +70,7 @@ class Along:
         sample = b"%d:%b" % (raw.nbytes, raw[::every].tobytes())
         new = sample not in self._samples
         self._samples[sample] = None
+        self._samples.move_to_end(sample)
         if len(self._samples) > KEPT:
             self._samples.popitem(last=False)
         if not new or self._bytes + raw.nbytes > self._bytes_max:
