@@ -25,7 +25,7 @@ from robot_client.config import RobotConfig
 from robot_client.drive import MADE_MAX, WAYS, Drive, OwnRecord, made_ahead
 from robot_client.offloader import BOTH, Offloader
 from robot_client.onboard import OnboardRunner
-from robot_client.policies import Paper
+from robot_client.policies.rules import Paper
 from robot_client.predictors import LEAST_SQUARES, make
 from robot_client.references import References, orders
 from robot_client.robot import SimulatedRobot
