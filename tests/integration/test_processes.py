@@ -57,9 +57,9 @@ echo = socketserver.ThreadingTCPServer(address(flags.listen), Echo)
 threading.Thread(target=echo.serve_forever, daemon=True).start()
 http.server.ThreadingHTTPServer(address(flags.http), Ready).serve_forever()
 """
-# Prints the median round trip to the cloud in ms, or computes for ever.
+# Prints the shortest round trip to the cloud in ms, or computes for ever.
 ROBOT = """
-import socket, statistics, sys, time
+import socket, sys, time
 if "--busy" in sys.argv:
     while True: pass
 host, port = next(arg for arg in sys.argv if arg.startswith("--cloud=")).removeprefix("--cloud=tcp://").split(":")
@@ -69,7 +69,7 @@ def trip():
     link.sendall(b"ping")
     assert link.recv(4) == b"ping"
     return time.perf_counter() - start
-print(1e3 * statistics.median(trip() for _ in range(9)))
+print(1e3 * min(trip() for _ in range(15)))
 """
 # A testbed in a process of its own: two parts and a held, busy robot, until it is ended.
 HOST = """
@@ -150,7 +150,7 @@ def bed(delay_ms: float) -> dict[str, Setup]:
 
 
 def robot_ms(testbed: LocalTestbed) -> float:
-    """The median round trip a robot measures."""
+    """The shortest round trip a robot measures: what else the machine does only adds to it."""
     testbed.start("robot")
     assert testbed.wait("robot", WAIT_S) == 0
     return float(testbed.child("robot").tail())
@@ -205,7 +205,7 @@ def test_a_paused_part_hangs_until_resumed(tmp_path: Path, commands: Any) -> Non
 
 
 def test_the_robot_is_held_from_its_start(tmp_path: Path, commands: Any) -> None:
-    """The robot's CPU time is its share of the time since it was started, +-15 %."""
+    """Since its start a busy robot has no more than its share, and that where the machine is free."""
     robot = {"robot": Setup({"busy": True}, cpus=0.25)}
     with LocalTestbed(tmp_path / "out", robot, commands=commands) as testbed:
         testbed.start("robot")
@@ -214,9 +214,14 @@ def test_the_robot_is_held_from_its_start(tmp_path: Path, commands: Any) -> None
         quota = testbed.quota("robot")
         assert quota is not None
         assert quota.cpus == 0.25
-        time.sleep(1.5)
-        used_s = time.clock_gettime((~child.process.pid << 3) | 2)
-        assert used_s / (time.monotonic() - start_s) == pytest.approx(0.25, rel=0.15)
+        shares, before = [], (start_s, 0.0)
+        for _ in range(6):
+            time.sleep(0.5)
+            now = time.monotonic(), time.clock_gettime((~child.process.pid << 3) | 2)
+            shares.append((now[1] - before[1]) / (now[0] - before[0]))
+            before = now
+        assert before[1] / (before[0] - start_s) < 0.25 * 1.15
+        assert max(shares) > 0.25 * 0.85, "what else the machine does only takes from it"
 
 
 def test_a_part_that_dies_at_start_says_why(tmp_path: Path, commands: Any) -> None:
