@@ -34,7 +34,9 @@ class Scale:
         self._mean = 0.0
 
     def add(self, error: float) -> None:
-        error = min(abs(error), GROWTH * self.clip)
+        error, most = abs(error), GROWTH * self.clip
+        if error > most:
+            error = most
         self.count += 1
         rate = 1 / self.count if self.count * SCALE_RATE < 1 else SCALE_RATE
         self._mean += rate * (error - self._mean)
@@ -164,11 +166,12 @@ class Kalman:
         return self._count >= self.window
 
     def __len__(self) -> int:
-        return min(self._count, self.window)
+        return self._count
 
     def learn(self, size: float, seconds: float) -> None:
         check_observation(size, seconds)
-        self._count = min(self._count + 1, self.window)
+        if self._count < self.window:
+            self._count += 1
         if self._scale.count == 0 and self._count == 1:
             self._origin, self._level = size, seconds
             self._noise = (0.3 * seconds) ** 2
@@ -184,8 +187,10 @@ class Kalman:
         self._scale.add(error)
         if self._watch(error, deviation):
             self._p00 += error * error
-        else:
-            error = max(-clip, min(clip, error))
+        elif error > clip:
+            error = clip
+        elif error < -clip:
+            error = -clip
         self._step(x, error)
 
     def expect(self, size: float) -> float:

@@ -1,4 +1,4 @@
-"""Dynamic model averaging: several predictors of one site, each believed as far as it was right of late."""
+"""Dynamic model averaging: two predictors of one site, each believed as far as it was right of late."""
 
 import math
 from collections.abc import Sequence
@@ -19,12 +19,12 @@ EXCESS_MAX = 8.0  # clips that count of it, at most: hedges bound what is waited
 
 
 class Average(Conditional):
-    """Least squares and Kalman filter, each with the measured features (unless `blind`) and without.
+    """Least squares on what is seen and a Kalman filter on what is left without the measured features.
 
     The mean of their predictions, weighted by how small their errors were of late: Raftery, Karny and
     Ettler, Online Prediction Under Model Uncertainty Via Dynamic Model Averaging (2010), with clipped
-    absolute errors in place of densities: an outlier is no model's fault. The models with features share
-    one set of gains. The spread is the running error of the average itself.
+    absolute errors in place of densities: an outlier is no model's fault. The spread is the running error of
+    the average itself. `blind`: the features are not looked at.
 
     The first START observations are held to a line that bears outliers; what was clipped off any counts in
     the mean, as times do that nobody can foretell.
@@ -37,25 +37,25 @@ class Average(Conditional):
 
     def _forget(self) -> None:
         """Begin anew, with what `_first` holds not yet learnt."""
-        window, seed = self._window, self._seed
-        self._plain = _models(window, seed)
-        self._measured = () if self._blind else _models(window, seed)
-        count = len(self._plain) + len(self._measured)
-        self._errors = [0.0] * count
-        self._weights = [1 / count] * count
+        self._seen = ClippedLeastSquares(self._window, self._seed)
+        self._left = Kalman(self._window, self._seed)
+        self._seen_error = self._left_error = 0.0
+        self._share = 0.5  # of `_left` in the mean
         self._gains = Gains()
         self._scale = Scale()
         self._excess = 0.0
 
     @property
     def full(self) -> bool:
-        return self._plain[0].full
+        return self._seen.full
 
     def __len__(self) -> int:
-        return len(self._plain[0])
+        return len(self._seen)
 
     def learn(self, size: float, seconds: float, condition: Condition = UNMEASURED) -> None:
         check_observation(size, seconds)
+        if self._blind:
+            condition = UNMEASURED
         if len(self._first) == START:
             self._learn(size, seconds, condition)
             return
@@ -68,15 +68,12 @@ class Average(Conditional):
 
     def _learn(self, size: float, seconds: float, condition: Condition) -> None:
         if len(self):
-            self._judge(self._each(size, condition), seconds)
-        for plain in self._plain:
-            plain.learn(size, seconds)
-        if self._measured:
-            rest = max(0.0, seconds - (condition.round_trip_s or 0.0))
+            self._judge(*self._each(size, condition), seconds)
+        self._seen.learn(size, seconds)
+        rest = max(0.0, seconds - (condition.round_trip_s or 0.0))
+        if (condition.queue or condition.load) and len(self._left):
             self._learn_gains(size, rest, condition)
-            rest /= self._gains.crowding(condition)
-            for measured in self._measured:
-                measured.learn(size, rest)
+        self._left.learn(size, rest / self._gains.crowding(condition))
 
     def predict(
         self,
@@ -84,59 +81,45 @@ class Average(Conditional):
         ahead: int = 1,  # noqa: ARG002
         condition: Condition = UNMEASURED,
     ) -> Prediction | None:
-        if not len(self):
+        if not self._first:
             return None
+        seen, left = self._each(size, UNMEASURED if self._blind else condition)
         return Prediction(
-            self._mean(self._each(size, condition)) + self._excess,
+            seen + self._share * (left - seen) + self._excess,
             self._scale.deviation if self._scale.count > 1 else None,
         )
 
-    def _each(self, size: float, condition: Condition) -> list[float]:
-        """Of every model: those without features first."""
-        found = [plain.expect(size) for plain in self._plain]
-        if self._measured:
-            trip_s, crowding = condition.round_trip_s or 0.0, self._gains.crowding(condition)
-            for one in self._measured:
-                rest = one.expect(size)
-                found.append(trip_s + crowding * rest if rest > 0 else trip_s)
-        return [seconds if seconds > 0 else 0.0 for seconds in found]
+    def _each(self, size: float, condition: Condition) -> tuple[float, float]:
+        """What each of the two expects."""
+        seen, rest = self._seen.expect(size), self._left.expect(size)
+        left = condition.round_trip_s or 0.0
+        if rest > 0:
+            left += self._gains.crowding(condition) * rest
+        return (seen if seen > 0 else 0.0), left
 
-    def _mean(self, predicted: list[float]) -> float:
-        first = predicted[0]  # exact where all agree
-        return first + sum(
-            [weight * (one - first) for weight, one in zip(self._weights, predicted, strict=True)]
-        )
-
-    def _judge(self, predicted: list[float], seconds: float) -> None:
+    def _judge(self, seen: float, left: float, seconds: float) -> None:
         """How far each was off; the weights that follow."""
-        unit = self._scale.deviation
-        error, clip = seconds - self._mean(predicted), self._scale.clip
+        scale = self._scale
+        unit, clip = scale.deviation, scale.clip
+        error = seconds - seen - self._share * (left - seen)
         self._exceed(error - clip, clip)
-        self._scale.add(error)
-        unit = unit or self._scale.deviation
+        scale.add(error)
+        unit = unit or scale.deviation
         if not unit:
             return
         fresh = 1 - MEMORY
-        self._errors = [
-            MEMORY * before + fresh * min(abs(seconds - one) / unit, ERROR_MAX)
-            for before, one in zip(self._errors, predicted, strict=True)
-        ]
-        least = min(self._errors)
-        weights = [math.exp(SHARPNESS * (least - error)) for error in self._errors]
-        total = sum(weights)
-        self._weights = [weight / total for weight in weights]
+        self._seen_error = MEMORY * self._seen_error + fresh * min(abs(seconds - seen) / unit, ERROR_MAX)
+        self._left_error = MEMORY * self._left_error + fresh * min(abs(seconds - left) / unit, ERROR_MAX)
+        self._share = 1 / (1 + math.exp(SHARPNESS * (self._left_error - self._seen_error)))
 
     def _exceed(self, beyond_s: float, clip: float) -> None:
         """What was clipped at `clip` was so much more."""
-        excess = min(max(0.0, beyond_s), EXCESS_MAX * clip)
+        excess = min(beyond_s, EXCESS_MAX * clip) if beyond_s > 0 else 0.0
         self._excess += EXCESS_RATE * (excess - self._excess)
 
     def _learn_gains(self, size: float, rest: float, condition: Condition) -> None:
-        """From the error of the models that use them."""
-        if not (condition.queue or condition.load) or not len(self._measured[0]):
-            return
-        expected = sum(max(0.0, one.expect(size)) for one in self._measured) / len(self._measured)
-        expected *= self._gains.crowding(condition)
+        """From the error of the model that uses them."""
+        expected = self._left.expect(size) * self._gains.crowding(condition)
         if expected > 0:
             self._gains.learn(rest / expected, condition)
 
@@ -155,10 +138,6 @@ def _reach(first: Sequence[tuple[float, float, Condition]]) -> list[tuple[float,
             reach = CLIP * expected.spread_s
             found.append((max(0.0, expected.seconds - reach), max(0.0, expected.seconds + reach)))
     return found
-
-
-def _models(window: int, seed: int) -> tuple[ClippedLeastSquares | Kalman, ...]:
-    return ClippedLeastSquares(window, seed), Kalman(window, seed)
 
 
 def blind_average(window: int, seed: int = 0) -> Average:

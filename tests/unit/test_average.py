@@ -1,10 +1,10 @@
-"""The average of several predictors."""
+"""The average of two predictors."""
 
 from random import Random
 
 import pytest
 
-from robot_client.predictors.average import Average, blind_average
+from robot_client.predictors.average import START, Average, blind_average
 from robot_client.runner import UNMEASURED, Condition
 
 
@@ -26,10 +26,11 @@ class Says:
         return self.seconds
 
 
-def of(*seconds: float) -> Average:
-    one = Average(50, blind=True)
-    one._plain = tuple(Says(each) for each in seconds)  # type: ignore[assignment]
-    one._errors, one._weights = [0.0] * len(seconds), [1 / len(seconds)] * len(seconds)
+def of(seen: float, left: float) -> Average:
+    """Past its start, with models that say these."""
+    one = blind_average(50)
+    one._first = [(2.0, 1.0, UNMEASURED)] * START
+    one._seen, one._left = Says(seen), Says(left)  # type: ignore[assignment]
     return one
 
 
@@ -94,7 +95,7 @@ def test_an_outlier_does_not_sway() -> None:
 def test_where_all_agree_the_prediction_is_theirs() -> None:
     """To the bit, also of a time that no sum of binary fractions is."""
     for seconds in (0.1, 0.3, 1e-9):
-        assert predicted(of(seconds, seconds, seconds)) == seconds
+        assert predicted(of(seconds, seconds)) == seconds
 
 
 def test_no_time_is_below_zero() -> None:
@@ -113,7 +114,7 @@ def test_the_spread_is_the_average_error(make: object) -> None:
 
 
 def test_a_link_that_changes_is_believed_after_it_has_told() -> None:
-    """Where the round trip explains the times the measured models win: a change is followed at once."""
+    """Where the round trip explains the times the measured model wins: a change is followed at once."""
     one, rng = Average(50), Random(4)
     for n in range(200):
         trip_s = 0.02 if n // 20 % 2 else 0.2
@@ -123,7 +124,7 @@ def test_a_link_that_changes_is_believed_after_it_has_told() -> None:
 
 
 def test_a_feature_that_lies_is_not_believed() -> None:
-    """Where round trips are measured at random the blind models win: predictions stay near the truth."""
+    """Where round trips are measured at random the blind model wins: predictions stay near the truth."""
     one, rng = Average(50), Random(5)
     off = []
     for n in range(300):
@@ -133,4 +134,4 @@ def test_a_feature_that_lies_is_not_believed() -> None:
             assert found is not None
             off.append(abs(found.seconds - 0.1 * size))
         one.learn(size, 0.1 * size, condition)
-    assert sum(off) / len(off) < 0.03, "the measured ones alone err by a quarter second"
+    assert sum(off) / len(off) < 0.03, "the measured one alone errs by a quarter second"
