@@ -7,8 +7,9 @@ does meets all of them alike. `--simulate` starts nothing, and gives a table ove
 import itertools
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -16,12 +17,13 @@ import numpy as np
 from common.config import check, setting
 from common.errors import ConfigError
 from loadgen.bootstrap import BOUNDS, Blocks, Picks
+from loadgen.host import NOTED_PERCENT
 from loadgen.intervals import interval_columns, interval_figures
 from loadgen.outcome import Answered, Outcome
 from loadgen.play import TESTBEDS
 from loadgen.recovery import median_recovery
 from loadgen.render import FORMATS, Heading, Table, render
-from loadgen.resume import play_once
+from loadgen.resume import PLAYS_MAX, play_once
 from loadgen.rows import Column
 from loadgen.scenario import Scenario, find_scenario, read_scenario
 from loadgen.score import quantile
@@ -60,6 +62,14 @@ class CompareConfig:
     )
     from_task: int = setting(0, "only tasks from this one on, such as those after warm-up", minimum=0)
     format: str = setting("md", "output format", choices=FORMATS)
+    stolen_max: float | None = setting(
+        None,
+        f"a run of whose CPU time the host took more than so many percent is played again, {PLAYS_MAX} times"
+        " at most; without, the table says how much it was",
+        minimum=0,
+        maximum=100,
+        metavar="PERCENT",
+    )
     simulate: bool = setting(False, "play in simulation: virtual time, modelled sites, nothing is started")
     jobs: int | None = setting(
         None, "with --simulate: so many processes; without, one a CPU", minimum=1, maximum=JOBS_MAX
@@ -75,6 +85,8 @@ class CompareConfig:
             raise ConfigError(f"--jobs: {self.jobs} needs --simulate: real runs follow each other")
         if self.simulate and self.testbed != "local":
             raise ConfigError(f"--testbed: {self.testbed} is not allowed beside --simulate")
+        if self.simulate and self.stolen_max is not None:
+            raise ConfigError(f"--stolen-max: {self.stolen_max:g} is not allowed beside --simulate")
 
     @property
     def where(self) -> str:
@@ -154,6 +166,7 @@ def run_compare(names: Sequence[str], config: CompareConfig) -> int:
 def compare(scenario: Scenario, config: CompareConfig) -> Table:
     """Play the scenario once for each seed and policy, and sum up."""
     runs: dict[str, list[Outcome]] = {policy: [] for policy in config.policies}
+    stolen: dict[str, float] = {}
     for n in range(config.seeds):
         seed = scenario.seed + n
         for policy in turned(config.policies, n):
@@ -161,9 +174,22 @@ def compare(scenario: Scenario, config: CompareConfig) -> Table:
             print(f"{scenario.name}, seed {seed}, policy {policy}", file=sys.stderr, flush=True)
             chosen, predictor = split_strategy(policy)
             changed = scenario.changed(seed=seed, policy=chosen, predictor=predictor)
-            played = play_once(changed, out, config.testbed)
-            runs[policy].append(played.outcome.between(config.from_task))
-    return table(scenario, config, runs)
+            played = play_once(changed, out, config.testbed, config.stolen_max)
+            runs[policy].append(played.outcome.of(scenario.compared()).between(config.from_task))
+            if played.stolen_percent is not None:
+                stolen[out.name] = played.stolen_percent
+    return replace(table(scenario, config, runs), notes=_host_notes(stolen))
+
+
+def _host_notes(stolen: Mapping[str, float]) -> tuple[str, ...]:
+    """What the host took of the runs, percent by name, where that is too much to tell policies apart."""
+    worst = max(stolen, key=stolen.__getitem__, default=None)
+    if worst is None or stolen[worst] < NOTED_PERCENT:
+        return ()
+    return (
+        f"The host of this machine took {median(stolen.values()):.0f} % of the CPU time that the median run"
+        f" asked for, {stolen[worst]:.0f} % of {worst}: such times tell of the host too (--stolen-max).",
+    )
 
 
 def split_strategy(name: str) -> tuple[str, str | None]:

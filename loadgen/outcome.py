@@ -5,7 +5,7 @@ The robot wrote the files (docs/formats.md); what must hold of the figures is th
 
 import json
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -106,6 +106,11 @@ class Outcome:
         kept = [one for one in self.answered if first <= one.i < last]
         references = [one for one in self.references if first <= one.i < last]
         return replace(self, asked=asked, answered=kept, references=references)
+
+    def of(self, robots: Collection[str]) -> "Outcome":
+        """What these robots did."""
+        asked = {robot: tasks for robot, tasks in self.asked.items() if robot in robots}
+        return replace(self, asked=asked, answered=[one for one in self.answered if one.robot in robots])
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ Which machines these are is the testbed's business, what the tasks are the robot
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from common.errors import OffloadError
 from loadgen.check import Verdict
 from loadgen.digest import digests
 from loadgen.evaluate import TableConfig, table_text
+from loadgen.host import NOTED_PERCENT, Stolen
 from loadgen.outcome import FIGURES, Answered, Outcome, read_answered, read_readings, read_references
 from loadgen.player import EVENTS, READINGS, TRACE, Files, Player, make_room, setups
 from loadgen.processes import LocalTestbed
@@ -45,12 +46,16 @@ TESTBEDS: dict[str, Callable[[Path, Mapping[str, Setup]], Testbed]] = {"local": 
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """A run that came to its end: its outcome, the verdict of every check, each robot's exit code."""
+    """A run that came to its end: its outcome, the verdict of every check, each robot's exit code.
+
+    `stolen_percent`: of the CPU time that the run asked for, what the host took (None: not known).
+    """
 
     scenario: Scenario
     outcome: Outcome
     verdicts: Sequence[Verdict]
     exit_codes: Mapping[str, int]
+    stolen_percent: float | None = None
 
     def check_robots(self) -> None:
         """OffloadError where a robot ended badly of itself."""
@@ -84,12 +89,16 @@ def play(scenario: Scenario, out: Path, testbed: str = "local", *, quiet: bool =
         many = "the robot" if workload.robots == 1 else f"{workload.robots} robots"
         tasks = f"{workload.tasks} {'plans' if workload.map else 'tasks'}"
         say(f"starting {many}, held to {scenario.robot.cpus:g} CPU: {tasks}")
+        stolen = Stolen()
         exit_codes = Player(scenario, bed, say).play()
-    played = judge(scenario, out, exit_codes)
+        stolen_percent = stolen.percent()
+    played = replace(judge(scenario, out, exit_codes), stolen_percent=stolen_percent)
     about = {"testbed": testbed, "started_at": started_at.isoformat(timespec="seconds"), **played_from}
     write_summary(out, played, about)
     for verdict in played.verdicts:
         say(str(verdict))
+    if stolen_percent is not None and stolen_percent >= NOTED_PERCENT:
+        say(f"the host of this machine took {stolen_percent:.0f} % of the CPU time that the run asked for")
     for path in (out / TRACE, alone_path(out / TRACE), out / SUMMARY):
         if path.exists():
             say(f"written: {path}")
@@ -140,6 +149,7 @@ def write_summary(out: Path, played: Played, about: Mapping[str, Any]) -> None:
         "software": VERSION,
         **about,
         "exit_codes": dict(played.exit_codes),
+        "stolen_percent": played.stolen_percent,
         "figures": figures(played.outcome, scenario),
         "checks": [verdict.as_dict() for verdict in played.verdicts],
     }

@@ -142,6 +142,14 @@ class Scenario:
         """The parts that are robots."""
         return self.workload.parts()[2:]
 
+    def compared(self) -> tuple[str, ...]:
+        """Robots whose times tell of their policy: the first, and all that are never paused.
+
+        The others come and go to make load; a task that they were paused in takes as long as the pause.
+        """
+        paused = {event.value for event in self.timeline() if event.action == "pause"}
+        return tuple(robot for robot in self.robots() if robot == ROBOT or robot not in paused)
+
     def changed(
         self,
         *,

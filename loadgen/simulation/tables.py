@@ -61,7 +61,8 @@ def _table(scenario: Scenario, config: CompareConfig, batch: Batch) -> Table:
     }
     seeds = [scenario.changed(seed=scenario.seed + n) for n in range(config.seeds)]
     played = batch.play(seeds, strategies)
-    runs = {name: [run.between(config.from_task) for run in played[name]] for name in played}
+    compared = scenario.compared()
+    runs = {name: [run.of(compared).between(config.from_task) for run in played[name]] for name in played}
     return table(scenario, config, runs, batch.map)
 
 

@@ -1,6 +1,7 @@
 """Figures of a played scenario, worked out by hand, and the verdicts over them."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
@@ -69,6 +70,14 @@ def test_a_part_of_a_run_counts_its_own_tasks(run: Outcome) -> None:
     assert [one.i for one in part.answered] == [4, 5, 6, 7]
     assert [one.i for one in part.references] == [5, 7]
     assert FIGURES["lost"].compute(run.between(8)) == 1
+
+
+def test_robots_that_are_not_looked_at_count_nowhere(run: Outcome) -> None:
+    """Neither their tasks nor what was asked of them."""
+    other = replace(answered(0, 2.7), robot="robot-2")
+    both = replace(run, asked={**run.asked, "robot-2": 5}, answered=[*run.answered, other])
+    assert both.of(("robot",)) == run
+    assert both.of(("robot", "robot-2")) == both
 
 
 @pytest.mark.parametrize("figure", ["mean_ms", "cloud_percent", "time_over_oracle", "memory_growth_percent"])

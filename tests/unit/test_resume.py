@@ -31,7 +31,8 @@ def finished(tmp_path: Path) -> Path:
     """The folder of a run that came to its end, by the code that writes one."""
     (tmp_path / "answers.jsonl").write_text("".join(map(answer, range(TASKS))))
     about = {"testbed": "local", **digests(SCENARIO)}
-    write_summary(tmp_path, judge(SCENARIO, tmp_path, {"robot": 0}), about)
+    played = replace(judge(SCENARIO, tmp_path, {"robot": 0}), stolen_percent=12.0)
+    write_summary(tmp_path, played, about)
     return tmp_path
 
 
@@ -48,6 +49,16 @@ def test_a_finished_run_is_taken_and_judged_from_its_files(finished: Path) -> No
     assert [one.response_s for one in played.outcome.answered] == [0.5] * TASKS
     assert [one.wrong for one in played.outcome.answered] == [None] * TASKS
     assert said == [f"taken from before: {finished}"]
+
+
+def test_a_run_that_the_host_disturbed_is_played_again(finished: Path) -> None:
+    """It took 12 %: with 12 allowed the run is taken, and says so again; with 11 not, and that is said."""
+    said: list[str] = []
+    played = played_before(SCENARIO, finished, "local", said.append, stolen_max=12.0)
+    assert played is not None
+    assert played.stolen_percent == 12.0
+    assert played_before(SCENARIO, finished, "local", said.append, stolen_max=11.0) is None
+    assert said[1] == f"played again in {finished}: the host took 12 % of the CPU time that it asked for"
 
 
 @pytest.mark.parametrize(

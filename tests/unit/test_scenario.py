@@ -1,6 +1,7 @@
 """Scenario files: events, checks and chaos as data, and one line for whatever cannot be."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -126,3 +127,11 @@ def test_a_scenario_is_found_by_name_or_file() -> None:
         DataError, match=r"scenario 'clam' is neither a file nor one of bandwidth, burst, calm"
     ):
         find_scenario("clam")
+
+
+def test_robots_that_are_paused_only_make_load() -> None:
+    """A task that one of them was paused in took as long as the pause, whatever its policy."""
+    scenario = read_scenario(find_scenario("cloud-busy"))
+    assert len(scenario.robots()) == 4
+    assert scenario.compared() == ("robot",)
+    assert replace(scenario, events=()).compared() == scenario.robots()
