@@ -13,6 +13,7 @@ from pathlib import Path
 from common.cpu import READ_BYTES_MAX, QuotaGroup, parse_usage, quota_group
 
 EVERY_S = 0.5  # read no more often: a reading costs more than a decision
+HURRIED_S = 0.05  # but so often where it may just have changed; what a shorter time tells is ticks
 QUOTA_EVERY = 8  # readings: how often the quota is looked up again
 FREE_MIN = 0.1  # of the CPU: where this process leaves less to others, what they take says nothing
 PROCESSES_MAX = 64  # of a group whose CPU time is the sum of theirs
@@ -36,11 +37,14 @@ class Load:
         self._others_s = self._own_s = 0.0
         self._share = 0.0
 
-    def share(self) -> float:
-        """From 0 to 1: what others took of the CPU that this process left; 0 where that cannot be told."""
+    def share(self, every_s: float = EVERY_S) -> float:
+        """From 0 to 1: what others took of the CPU that this process left; 0 where that cannot be told.
+
+        It is of the time since the last reading, which is at least `every_s` ago.
+        """
         now_s = time.monotonic()
         since_s = now_s - self._read_at_s
-        if since_s >= EVERY_S:
+        if since_s >= every_s:
             with contextlib.suppress(OSError, ValueError, IndexError):
                 self._read(now_s, since_s)
         return self._share
@@ -101,6 +105,7 @@ class LoadWatch:
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="load", daemon=True)
         self._starting = threading.Lock()
+        self._reading = threading.Lock()
 
     def latest(self) -> float:
         """The share that was read last."""
@@ -110,13 +115,23 @@ class LoadWatch:
                     self._thread.start()
         return self._share
 
+    def hurry(self) -> None:
+        """Read it now, in the caller's thread, unless it is being read or has just been."""
+        if self._thread.ident is not None and self._reading.acquire(blocking=False):
+            try:
+                self._share = self._load.share(HURRIED_S)
+            finally:
+                self._reading.release()
+
     def close(self) -> None:
         self._closed.set()
 
     def _run(self) -> None:
-        self._share = self._load.share()
-        while not self._closed.wait(EVERY_S):
-            self._share = self._load.share()
+        while True:
+            with self._reading:
+                self._share = self._load.share(HURRIED_S)
+            if self._closed.wait(EVERY_S):
+                return
 
 
 def _read(path: str | Path) -> bytes:

@@ -429,7 +429,7 @@ class Offloader:
     def _measured(self, site: str) -> Condition:
         """Of a server too the load of the robot, where that is what its times tell of."""
         condition = self._runners[site].condition()
-        if site != ONBOARD and (load := self._runners[ONBOARD].condition().load) > LOADED:
+        if site != ONBOARD and (load := self._load(site)):
             return replace(condition, load=load)
         return condition
 
@@ -521,13 +521,32 @@ class Offloader:
         )
         silent = not execution.ok and memory.conditional and self._held_up(site)
         amount = asked.amount if work is None else work
-        memory.learn(
-            amount, execution, asked.forecast.sites.get(site), silent=silent, size=asked.task.size, work=work
-        )
+        outlook = asked.forecast.sites.get(site)
+        if memory.conditional and outlook is not None:
+            outlook = self._in_hindsight(outlook, execution)
+        memory.learn(amount, execution, outlook, silent=silent, size=asked.task.size, work=work)
         if execution.ok and decision.second is not None and decision.second_after_s == 0:
             asked.seconds[site] = execution.seconds
             if len(asked.seconds) == 2:
                 self._regret.learn(asked.seconds[decision.site], asked.seconds[decision.second])
+
+    def _in_hindsight(self, outlook: Outlook, execution: Execution) -> Outlook:
+        """With the robot's load as it is now, where the time tells that this may have changed meanwhile."""
+        if not execution.ok or outlook.low_s is None or outlook.high_s is None:
+            return outlook
+        before = outlook.condition
+        later = execution.seconds > outlook.high_s and before.load <= LOADED
+        sooner = execution.seconds < outlook.low_s and before.load > LOADED
+        if not (later or sooner):
+            return outlook
+        self._runners[ONBOARD].hurry()
+        load = self._load(execution.site)
+        return outlook if load == before.load else replace(outlook, condition=replace(before, load=load))
+
+    def _load(self, site: str) -> float:
+        """Of the robot; of a server only where its times tell of that."""
+        load = self._runners[ONBOARD].condition().load
+        return load if site == ONBOARD or load > LOADED else 0.0
 
     def _memory(self, kind: Kind) -> KindMemory:
         if kind.name not in self._memories:

@@ -49,6 +49,7 @@ class OnboardRunner:
         self._closed = False
         self._lock = threading.Lock()
         self._load = LoadWatch(Load(SELF))
+        self._condition = Condition()
 
     def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - onboard always exists
         return None
@@ -79,10 +80,13 @@ class OnboardRunner:
         run.future.set_result(Execution(ONBOARD, seconds, failure=failure, censored=True, started=started))
 
     def hurry(self) -> None:
-        pass
+        self._load.hurry()
 
     def condition(self) -> Condition:
-        return Condition(load=self._load.latest())
+        found, load = self._condition, self._load.latest()
+        if found.load != load:
+            found = self._condition = Condition(load=load)
+        return found
 
     def close(self) -> None:
         with self._lock:

@@ -106,10 +106,10 @@ class Runner(Protocol):
         """The answer is no longer wanted: where it can still be stopped, its future ends now, censored."""
 
     def hurry(self) -> None:
-        """An answer is later than expected: find out soon whether the site is there. Must not block."""
+        """An answer is later than expected: find out soon how the site is. Must not block."""
 
     def condition(self) -> Condition:
-        """What is measured now. Must not block; it is asked once a task."""
+        """What is measured now. Must not block; it is asked for every task, and again after a late one."""
 
     def close(self) -> None:
         """Stop; tasks in flight are given up. Safe to call twice."""

@@ -10,7 +10,7 @@ from loadgen.simulation.clock import VirtualClock
 from loadgen.simulation.processor import Processor, Run
 from loadgen.simulation.truth import Truth
 from loadgen.testbed import ROBOT
-from robot_client.load import EVERY_S, FREE_MIN
+from robot_client.load import EVERY_S, FREE_MIN, HURRIED_S
 from robot_client.runner import ONBOARD, Condition, Execution
 
 
@@ -46,7 +46,7 @@ class SimulatedOnboard:
             future.set_result(Execution(ONBOARD, seconds, failure=failure, censored=True, started=started))
 
     def hurry(self) -> None:
-        pass
+        self._load.share(HURRIED_S)
 
     def condition(self) -> Condition:
         return Condition(load=self._load.share())
@@ -78,9 +78,9 @@ class _Load:
         self._processor = processor
         self._read_at_s = self._own_s = self._others_s = self._share = 0.0
 
-    def share(self) -> float:
+    def share(self, every_s: float = EVERY_S) -> float:
         since_s = self._clock.now_s() - self._read_at_s
-        if since_s >= EVERY_S:
+        if since_s >= every_s:
             self._processor.settle()
             own_s, others_s = self._processor.own_s, self._processor.others_s
             took_s, left_s = others_s - self._others_s, self._processor.cpus * since_s - (own_s - self._own_s)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from robot_client import load
-from robot_client.load import EVERY_S, TICK_S, Load, LoadWatch
+from robot_client.load import EVERY_S, HURRIED_S, TICK_S, Load, LoadWatch
 from tests.unit.test_cpu import Machine
 
 CPUS = os.cpu_count() or 1
@@ -43,6 +43,18 @@ class Host:
 
     def load(self) -> Load:
         return Load(self.root / "self", self.root)
+
+
+class Counted(Load):
+    """Notes who reads it, and says how often that was."""
+
+    def __init__(self, proc: Path) -> None:
+        super().__init__(proc)
+        self.read_by: list[threading.Thread] = []
+
+    def share(self, every_s: float = EVERY_S) -> float:  # noqa: ARG002
+        self.read_by.append(threading.current_thread())
+        return float(len(self.read_by))
 
 
 def later(times: Times, seconds: float, own_s: float = 0.0) -> None:
@@ -182,20 +194,43 @@ def test_a_group_that_counts_nothing_is_the_sum_of_its_processes(machine: Machin
 
 def test_a_watch_reads_in_a_thread_of_its_own() -> None:
     """Whoever looks at it only takes what was read; nothing is read before the first look, or once closed."""
-    read_by: list[threading.Thread] = []
-
-    class Counted(Load):
-        def share(self) -> float:
-            read_by.append(threading.current_thread())
-            return float(len(read_by))
-
-    watch = LoadWatch(Counted(Path("/proc/self")))
-    assert read_by == []
+    counted = Counted(Path("/proc/self"))
+    watch = LoadWatch(counted)
+    assert counted.read_by == []
     until = time.monotonic() + 10
     while watch.latest() < 2:
         assert time.monotonic() < until
         time.sleep(0.01)
-    assert threading.current_thread() not in read_by
+    assert threading.current_thread() not in counted.read_by
     watch.close()
-    read_by[0].join(10)
-    assert not read_by[0].is_alive()
+    counted.read_by[0].join(10)
+    assert not counted.read_by[0].is_alive()
+
+
+def test_who_hurries_reads_at_once_and_not_too_often(tmp_path: Path, times: Times) -> None:
+    """A load that has just begun is seen before the next reading is due; a shorter time tells nothing."""
+    host = Host(tmp_path)
+    host.busy_s(50.0)
+    one = host.load()
+    one.share()
+    later(times, 2 * HURRIED_S)
+    host.busy_s(50.0 + 2 * HURRIED_S * CPUS)
+    assert one.share() == 0.0, "the next reading is not due"
+    assert one.share(HURRIED_S) == pytest.approx(1.0, abs=TICK_S / HURRIED_S)
+    later(times, HURRIED_S / 2)
+    assert one.share(HURRIED_S) == pytest.approx(1.0, abs=TICK_S / HURRIED_S), "it has just been read"
+
+
+def test_a_watch_that_is_hurried_reads_in_the_callers_thread() -> None:
+    """Once it was looked at: before, nobody wants to know."""
+    counted = Counted(Path("/proc/self"))
+    watch = LoadWatch(counted)
+    watch.hurry()
+    assert counted.read_by == []
+    until = time.monotonic() + 10
+    while not watch.latest():
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    watch.hurry()
+    assert threading.current_thread() in counted.read_by
+    watch.close()

@@ -1,8 +1,9 @@
 """What the offloader does with good, late, failing and missing sites."""
 
 import asyncio
+import itertools
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -22,7 +23,7 @@ from robot_client import policies, predictors
 from robot_client.allowance import DUPLICATES, Allowance
 from robot_client.offloader import Offloader
 from robot_client.onboard import OnboardRunner
-from robot_client.runner import CLOUD, ONBOARD, Execution, Runner
+from robot_client.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution, Runner
 from tests.fakes import ScriptedRunner
 
 
@@ -314,6 +315,34 @@ def test_an_observer_that_fails_costs_no_answer(make: Make, caplog: pytest.LogCa
         assert offload(add_one, 1) == 2
     assert len(seen) == 1
     assert "failed on task 0" in caplog.text
+
+
+def test_late_tasks_are_learnt_with_the_load_that_made_them_late() -> None:
+    """A load that began after they were sent is looked for, and the quiet times stay what they were."""
+
+    class Loaded(ScriptedRunner):
+        def hurry(self) -> None:
+            super().hurry()
+            self.measured = Condition(load=1.0)
+
+    home = Loaded(ONBOARD, lambda one: Execution(ONBOARD, 0.05, one.args))
+    cloud = cloud_answers()
+    takes: Iterator[float] = itertools.cycle([0.009, 0.01, 0.011])
+    cloud.script = lambda one: Execution(CLOUD, next(takes), one.args)
+    with Offloader(
+        [home, cloud], policy=policies.make(CLOUD), predictor=lambda: predictors.make("average", 50)
+    ) as offload:
+        for _ in range(60):
+            offload(add_one, 2)
+        for seconds in [0.1] * 6:
+            home.measured = UNMEASURED  # as it was read before
+            takes = iter([seconds])
+            offload(add_one, 2)
+        hurried, home.measured, takes = home.hurried, UNMEASURED, iter([0.01])
+        offload(add_one, 2)
+        assert hurried >= 6
+        assert offload.last is not None
+        assert offload.last.sites[CLOUD].predicted_s == pytest.approx(0.01, rel=0.2)
 
 
 def test_a_call_after_close_is_one_clear_error(make: Make) -> None:
