@@ -55,6 +55,8 @@ class Allowance:
     def begin(self, now_s: float) -> None:
         """A task begins."""
         self._second.fill(1.0)
+        if not self.capped:
+            return
         since_s = 0.0 if self._at_s is None else max(0.0, now_s - self._at_s)
         self._at_s = now_s
         for bucket in (self._bytes, self._joules):

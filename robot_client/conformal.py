@@ -60,20 +60,26 @@ class Conformal:
                 return None
             return max(0.0, predicted_s - NORMAL_90 * spread_s), predicted_s + NORMAL_90 * spread_s
         unit, (low, high) = self._unit(predicted_s), self._interval()
-        low_s, high_s = predicted_s + unit * low, predicted_s + unit * high
-        return max(0.0, min(low_s, predicted_s)), max(high_s, predicted_s, 0.0)
+        low_s = predicted_s + unit * low if low < 0 else predicted_s
+        high_s = predicted_s + unit * high if high > 0 else predicted_s
+        return (low_s if low_s > 0 else 0.0), (high_s if high_s > 0 else 0.0)
 
     def overdue(self, predicted_s: float, worth_s: float) -> float | None:
         """The time from which on a task so predicted is expected to need more than `worth_s` still.
 
         None while too few errors are known.
         """
-        if len(self._sorted) < SCORES_MIN:
+        ordered, count = self._sorted, len(self._sorted)
+        if count < SCORES_MIN:
             return None
-        if self._tail is None:
-            self._tail = _tail(self._sorted)
-        unit, tail = self._unit(predicted_s), self._tail
-        score = tail.slowest if unit * tail.beyond > worth_s else tail.never
+        unit, last = self._unit(predicted_s), ordered[-1]
+        first = count - round(TAIL * count)
+        score = last + BEYOND * (last - ordered[count // 2])  # who is later than that may never come
+        if unit * (last - ordered[first]) > worth_s:  # else none of them was so much longer than another
+            if self._tail is None:
+                self._tail = _tail(ordered[first:])
+            if unit * self._tail.beyond > worth_s:
+                score = self._tail.slowest
         return max(0.0, predicted_s + unit * score)
 
     def share_above(self, predicted_s: float, limit_s: float) -> float | None:
@@ -94,7 +100,7 @@ class Conformal:
         return max(0.0, predicted_s + self._unit(predicted_s) * self._sorted[rank])
 
     def _unit(self, predicted_s: float) -> float:
-        return 0.5 * (max(0.0, predicted_s) + self._usual_s) or 1.0
+        return 0.5 * ((predicted_s if predicted_s > 0 else 0.0) + self._usual_s) or 1.0
 
     def _add(self, score: float) -> None:
         ordered = self._sorted
@@ -111,25 +117,23 @@ class Conformal:
 
 
 class _Tail(NamedTuple):
-    """The largest errors: the `slowest` one, beyond which the others were so much longer in the mean as
-    beyond no other; who is later than `never` may never come."""
+    """Of the largest errors the one beyond which the others were so much longer in the mean as beyond no
+    other."""
 
     slowest: float
     beyond: float
-    never: float
 
 
-def _tail(ordered: list[float]) -> _Tail:
-    count = len(ordered)
-    largest = ordered[count - max(2, round(TAIL * count)) :]
-    slowest = total = last = largest.pop()
+def _tail(largest: list[float]) -> _Tail:
+    """Of at least two errors in order."""
+    slowest = total = largest.pop()
     beyond = -math.inf
     for n, score in enumerate(reversed(largest), 1):
         longer = total / n - score
         if longer >= beyond:
             slowest, beyond = score, longer
         total += score
-    return _Tail(slowest, beyond, last + BEYOND * (last - ordered[count // 2]))
+    return _Tail(slowest, beyond)
 
 
 def _shortest(ordered: list[float], share: float) -> tuple[float, float]:

@@ -44,6 +44,7 @@ class Heartbeat:
         self._smooth_s = self._varies_s = 0.0
         self._back_s = -float("inf")  # when the site was last heard again
         self._queue = 0
+        self._usual = Condition()  # while no answer is waited for
 
     @property
     def unanswered(self) -> int:
@@ -89,9 +90,13 @@ class Heartbeat:
     def hear(self, now_s: float, queue: int) -> None:
         """Anything that the server said shows that it is there."""
         self._heard_s, self._queue = now_s, queue
+        if self._usual.queue != queue or self._usual.round_trip_s != self._round_trip_s:
+            self._usual = Condition(self._round_trip_s, queue=queue)
 
     def condition(self, now_s: float) -> Condition:
         """A site whose answer is late is expected to be held up for as long again."""
+        if self._oldest_s > now_s:
+            return self._usual
         out_s = self._out_s(now_s)
         late = self._smooth_s > 0 and out_s > max(self._smooth_s + SLACK_S, self._limit_s)
         return Condition(self._round_trip_s, self._silent(now_s), self._queue, wait_s=out_s if late else 0.0)

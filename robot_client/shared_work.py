@@ -40,11 +40,13 @@ class SharedWork:
         most = ODD * sorted([work for _, work in near])[len(near) // 2]
         sx = sxx = sw = sxw = 0.0
         for one, work in near:
-            x, w = one - size, min(work, most)
+            x = one - size
+            if work > most:
+                work = most
             sx += x
             sxx += x * x
-            sw += w
-            sxw += x * w
+            sw += work
+            sxw += x * work
         spread = len(near) * sxx - sx * sx
         if spread <= ROUNDING * len(near) * sxx:
             return sw / len(near)

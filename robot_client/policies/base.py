@@ -102,7 +102,10 @@ class Policy(Protocol):
 
 def cheapest(costs: Mapping[str, float]) -> str:
     """The site of the least cost; a tie stays onboard."""
-    return min(costs, key=lambda site: (costs[site], site != ONBOARD))
+    least = min(costs.values())
+    if costs.get(ONBOARD) == least:
+        return ONBOARD
+    return next(site for site, cost in costs.items() if cost == least)
 
 
 def cost_of(outlook: Outlook) -> float:

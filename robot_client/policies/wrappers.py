@@ -33,7 +33,8 @@ class Probe:
         ages = {
             site: one.age
             for site, one in forecast.sites.items()
-            if site != decision.site
+            if one.age >= PROBE_EVERY
+            and site != decision.site
             and one.age >= _probe_after(site, one, forecast.sites[decision.site])
             and not one.in_flight
             and not one.condition.silent
