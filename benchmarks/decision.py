@@ -97,6 +97,7 @@ def _decisions() -> Table:
             offload, kept = _offloader(policy, window)
             cases[f"{policy}, N = {window}"] = lambda count, offload=offload: _ask(offload, count)
             if window == WINDOW:
+                cases[f"{policy}: predict, decide and learn"] = _thinks(offload)
                 cases[f"{policy}: the rule alone"] = lambda count, kept=kept: _decide(kept, count)
     seconds = each_of(cases, CALLS)
     empty, run = seconds["an empty call"], seconds[RUN]
@@ -104,6 +105,8 @@ def _decisions() -> Table:
     bars = []
     for policy, limit in (("paper", 25.0), (policies.DEFAULT, 80.0)):
         few, usual, many = (seconds[f"{policy}, N = {window}"] for window in (10, WINDOW, 1_000))
+        thought = seconds[f"{policy}: predict, decide and learn"]
+        bars.append(Bar(f"{policy}: predict, decide and learn", thought * 1e6, limit, " us"))
         bars.append(Bar(f"{policy}, a task without its run", (usual - run) * 1e6, limit, " us"))
         bars.append(Bar(f"{policy}, N = 10 and N = 1,000 apart", abs(many / few - 1), 0.2))
     return Table("Deciding", ("what", "us", "empty calls"), rows, bars)
@@ -126,6 +129,27 @@ def _runs(count: int) -> None:
 def _ask(offload: Offloader, count: int) -> None:
     for size in SIZES[:count]:
         offload(counted, size)
+
+
+def _thinks(offload: Offloader) -> Callable[[int], None]:
+    """What is between a task and where it runs, and its time and the next task: no future, no record."""
+    kind = kind_of(counted)
+    tasks = [Task(kind, (size,), size) for size in SIZES]
+    ran = {
+        site: [
+            Execution(site, seconds * size * noise, size) for size, noise in zip(SIZES, NOISE, strict=True)
+        ]
+        for site, seconds in SECONDS.items()
+    }
+
+    def think(count: int) -> None:
+        for n, one in enumerate(tasks[:count]):
+            asked = offload._ask(one, "", {}, None, 2.0, None)
+            decision = asked.decision
+            sites = [decision.site, decision.second] if decision.second_after_s == 0 else [decision.site]
+            offload._learn(asked, [ran[site][n] for site in sites if site])
+
+    return think
 
 
 def _decide(kept: Kept, count: int) -> None:
@@ -170,7 +194,7 @@ def _predictors() -> Table:
             sizes[n % WINDOW], seconds[n % WINDOW] = size, 0.04 * size
             LinearRegression().fit(sizes[:, np.newaxis], seconds).predict([[size]])
 
-    found = each_of({"least squares": ours(least), "average of four": ours(average), "river": river}, CALLS)
+    found = each_of({"least squares": ours(least), "average of two": ours(average), "river": river}, CALLS)
     found |= each_of({"numpy.polyfit": polyfit, "scikit-learn": sklearn}, CALLS // 10)
     base = found["least squares"]
     rows = [[name, f"{each * 1e6:.2f}", f"{each / base:.1f}"] for name, each in found.items()]
