@@ -93,10 +93,10 @@ def test_an_empty_task_takes_the_links_round_trip(up: Compose) -> None:
 
 
 def test_the_quota_slows_long_plans_by_its_share(up: Compose) -> None:
-    """A long plan takes its unthrottled time over the share of CPU, +-15 %: median of so many pairs.
+    """A long plan takes its CPU time over the share of CPU, -15 % in the median, +15 % at best.
 
-    Each pair runs in one process, with the quota off and on by turns, so that the noise of the machine
-    is in both.
+    Each pair runs in one process, with the quota off and on by turns. What else the machine does makes the
+    CPU time itself longer, by cold caches, and waits come on top: they are no matter of the quota.
     """
     up.exit_code("robot")
     held_us = int(ROBOT_CPUS * PERIOD_US)
@@ -111,10 +111,15 @@ def test_the_quota_slows_long_plans_by_its_share(up: Compose) -> None:
                 assert pair[-1]["quota_us"] == [quota_us, PERIOD_US]
             pairs.append(pair)
     assert statistics.median(held["cpu_s"] for _, held in pairs) >= 10 * held_us / 1e6, "too short"
-    ratio = statistics.median(held["seconds"] / free["seconds"] for free, held in pairs)
+    free, held = ([pair[i]["seconds"] / pair[i]["cpu_s"] for pair in pairs] for i in (0, 1))
     free_ms, held_ms = (statistics.median(pair[i]["seconds"] for pair in pairs) * 1e3 for i in (0, 1))
-    print(f"long plan: {free_ms:.1f} ms free, {held_ms:.1f} ms at {ROBOT_CPUS} CPU, ratio {ratio:.2f}")
-    assert ratio == pytest.approx(1 / ROBOT_CPUS, rel=SHARE_TOLERANCE)
+    usual = statistics.median(held)
+    print(
+        f"long plan: {free_ms:.1f} ms free; {held_ms:.1f} at {ROBOT_CPUS} CPU, {usual:.2f} times its CPU time"
+    )
+    assert min(free) < 1 / ROBOT_CPUS / 2, "without the quota nothing holds it"
+    assert usual > (1 - SHARE_TOLERANCE) / ROBOT_CPUS
+    assert min(held) < (1 + SHARE_TOLERANCE) / ROBOT_CPUS, "what else the machine does only adds to it"
 
 
 def test_the_cloud_has_its_own_quota(up: Compose) -> None:
