@@ -15,16 +15,16 @@ from robot_client.conformal import Conformal
 from robot_client.energy import Energy
 from robot_client.objectives import Expected, Objective
 from robot_client.policies.base import Outlook
-from robot_client.predictors import Predictor
+from robot_client.predictors import Prediction, Predictor
 from robot_client.predictors.features import Conditional
 from robot_client.runner import ONBOARD, UNMEASURED, Condition, Execution
 from robot_client.shared_work import SharedWork
+from robot_client.under_load import UnderLoad
 
 AMOUNT_RATE = 0.1  # of the bytes and CPU seconds that a task usually takes
 OBSERVATIONS_MAX = 200  # of a site, kept for `store`
 LOADED = 0.3  # of the robot's own CPU taken by others: from there on all times tell of that
 LOADED_FROM = 10  # times of a site: the first ones are all learnt as one
-LOADED_MIN = 3  # times while the robot is loaded, before such are expected
 
 log = logging.getLogger(__name__)
 
@@ -119,7 +119,8 @@ class SiteMemory:
     """Of one kind on one site.
 
     What it takes while the robot is LOADED is learnt apart: the robot is slow to run, to send and to hear
-    then, by more than a gain on the load tells, and everything is as quick as before once that is over.
+    then, by more than a gain on the load tells, and everything is as quick as before once that is over. A
+    server's round trip tells of the robot then, and is taken to be what it was before.
     """
 
     def __init__(
@@ -134,9 +135,9 @@ class SiteMemory:
         self.observations: deque[Observation] = deque(maxlen=OBSERVATIONS_MAX)
         self._conditional = predictor if isinstance(predictor, Conditional) else None
         self.conditional = self._conditional is not None
-        loaded = make() if self.conditional else None
-        self._loaded = loaded if isinstance(loaded, Conditional) else None
+        self._under_load = UnderLoad(onboard=site == ONBOARD)
         self._site = site
+        self._round_trip_s: float | None = None  # the last one without load
         self._failures = 0
         self._conformal = Conformal()
         self._objective = objective
@@ -151,10 +152,7 @@ class SiteMemory:
         predictor, found = self.predictor, None
         if amount is not None:
             if self._conditional is not None:
-                model = self._conditional
-                if self._loaded is not None and condition.load > LOADED and len(self._loaded) >= LOADED_MIN:
-                    model = self._loaded
-                found = model.predict(amount, self.age + 1, self._seen(condition))
+                found = self._foresee(self._conditional, amount, condition)
             else:
                 found = predictor.predict(amount, self.age + 1)
         if found is None:
@@ -183,6 +181,16 @@ class SiteMemory:
             condition,
             self._conformal,
         )
+
+    def _foresee(self, model: Conditional, amount: float, condition: Condition) -> Prediction | None:
+        if condition.load <= LOADED:
+            self._round_trip_s = condition.round_trip_s
+        elif self._under_load.known:
+            found = model.predict(amount, self.age + 1, self._quiet(condition))
+            if found is None:
+                return None
+            return found._replace(seconds=self._under_load.expect(found.seconds))
+        return model.predict(amount, self.age + 1, self._seen(condition))
 
     def learn(
         self,
@@ -217,7 +225,8 @@ class SiteMemory:
         if self.conditional and (amount is None or not tells):
             self._use(moved, cpu_s)
             return
-        waited_s = (execution.queue_s or 0.0) if self.conditional and self._site == ONBOARD else 0.0
+        behind = self.conditional and self._site == ONBOARD and outlook is not None and outlook.in_flight > 0
+        waited_s = (execution.queue_s or 0.0) if behind else 0.0
         held_up = condition.silent or (self._site != ONBOARD and condition.wait_s > 0)
         interval = execution.ok and not held_up
         self._take(
@@ -247,13 +256,18 @@ class SiteMemory:
         self._use(one.bytes, one.cpu_s)
         if one.predicted_s is not None:
             self._conformal.learn(one.predicted_s, one.seconds + one.waited_s)
-        loaded = one.condition.load > LOADED and len(self.predictor) >= LOADED_FROM
-        if self._loaded is not None and loaded:
-            self._loaded.learn(one.amount, one.seconds, self._seen(one.condition))
-        elif self._conditional is not None:
-            self._conditional.learn(one.amount, one.seconds, self._seen(one.condition))
-        else:
+        if self._conditional is None:
             self.predictor.learn(one.amount, one.seconds)
+        elif one.condition.load > LOADED and len(self.predictor) >= LOADED_FROM:
+            found = self._conditional.predict(one.amount, condition=self._quiet(one.condition))
+            if found is not None:
+                self._under_load.learn(found.seconds, one.seconds)
+        else:
+            self._conditional.learn(one.amount, one.seconds, self._seen(one.condition))
+
+    def _quiet(self, condition: Condition) -> Condition:
+        """What it would be without the load."""
+        return replace(condition, load=0.0, round_trip_s=self._round_trip_s or condition.round_trip_s)
 
     def _seen(self, condition: Condition) -> Condition:
         """By the predictors: no server is slower for the robot's load."""

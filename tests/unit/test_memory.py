@@ -30,15 +30,22 @@ def memory(predictor: str = predictors.AVERAGE, *, shared_work: bool = False) ->
     )
 
 
-def outlook(of: KindMemory, site: str = CLOUD, condition: Condition = UNMEASURED) -> Outlook:
-    return of.site(site).outlook(1.0, condition, in_flight=0, timeout_s=2.0)
+def outlook(
+    of: KindMemory, site: str = CLOUD, condition: Condition = UNMEASURED, *, in_flight: int = 0
+) -> Outlook:
+    return of.site(site).outlook(1.0, condition, in_flight=in_flight, timeout_s=2.0)
 
 
 def learn(
-    of: KindMemory, execution: Execution, *, silent: bool = False, condition: Condition = UNMEASURED
+    of: KindMemory,
+    execution: Execution,
+    *,
+    silent: bool = False,
+    condition: Condition = UNMEASURED,
+    in_flight: int = 0,
 ) -> None:
     site = of.site(execution.site)
-    expected = outlook(of, execution.site, condition)
+    expected = outlook(of, execution.site, condition, in_flight=in_flight)
     of.pass_by()
     site.learn(1.0, execution, expected, silent=silent, size=1.0)
 
@@ -131,9 +138,17 @@ def test_own_waiting_is_added_and_not_learnt() -> None:
     """Time in the robot's own queue is told by what is under way: learnt is the run alone."""
     one = memory()
     for _ in range(10):
-        learn(one, Execution(ONBOARD, 0.7, queue_s=0.5))
+        learn(one, Execution(ONBOARD, 0.7, queue_s=0.5), in_flight=1)
     assert outlook(one, ONBOARD).predicted_s == pytest.approx(0.2)
     assert outlook(one, ONBOARD, Condition(wait_s=0.3)).predicted_s == pytest.approx(0.5)
+
+
+def test_time_until_a_run_begins_with_nothing_before_it_is_learnt() -> None:
+    """The robot's CPU was not to be had: that is what a run onboard takes."""
+    one = memory()
+    for _ in range(10):
+        learn(one, Execution(ONBOARD, 0.7, queue_s=0.5))
+    assert outlook(one, ONBOARD).predicted_s == pytest.approx(0.7)
 
 
 def test_work_is_told_by_results_and_shared() -> None:
@@ -176,6 +191,19 @@ def test_what_a_server_takes_while_the_robot_is_loaded_is_learnt_apart() -> None
         learn(one, Execution(CLOUD, 0.5), condition=loaded)
     assert outlook(one, condition=loaded).predicted_s == pytest.approx(0.5, rel=0.05)
     assert outlook(one).predicted_s == pytest.approx(0.2)
+
+
+def test_a_round_trip_that_a_loaded_robot_measured_is_not_the_servers() -> None:
+    """It is taken to be as before: else what the load adds would be counted twice."""
+    one, quiet = memory(), Condition(round_trip_s=0.03)
+    for _ in range(20):
+        learn(one, Execution(CLOUD, 0.05), condition=quiet)
+    for _ in range(5):
+        learn(one, Execution(CLOUD, 0.15), condition=Condition(round_trip_s=0.2, load=0.8))
+    for measured_s in (0.03, 0.1, 0.4):
+        found = outlook(one, condition=Condition(round_trip_s=measured_s, load=0.8))
+        assert found.predicted_s == pytest.approx(0.15, rel=0.05)
+    assert outlook(one, condition=quiet).predicted_s == pytest.approx(0.05, rel=0.05)
 
 
 def test_a_server_that_is_first_used_by_a_loaded_robot_gets_known() -> None:
