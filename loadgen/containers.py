@@ -20,6 +20,7 @@ from common.errors import ConfigError, MissingExtra, OffloadError
 from loadgen import inside
 from loadgen.images import build_images, check_compose
 from loadgen.inside import FAR, NEAR, kind_of
+from loadgen.meter import Meter
 from loadgen.output import Output
 from loadgen.owner import is_gone, owner, started
 from loadgen.part import KILL_S, POLL_S, TERMINATE_S, USAGE_EXIT, leave, uninterrupted
@@ -81,6 +82,7 @@ class DockerTestbed:
         self._containers: dict[str, Any] = {}
         self._outputs: dict[str, Output] = {}
         self._hogs: dict[str, list[str]] = {}  # what was executed, by its id
+        self._meters: dict[str, Meter] = {}
         self._relay: RelayClient | None = None
         self._terminate_before: Any = None
 
@@ -202,12 +204,14 @@ class DockerTestbed:
 
     @_renamed()
     def usage(self, part: str) -> Usage:
-        code, said = self._containers[part].exec_run(["sh", "-c", inside.MEASURE])
-        if code != 0:
-            raise OffloadError(
-                f"{part}: what it uses cannot be read: {said.decode(errors='replace').strip()}"
-            )
-        return inside.measured(said)
+        meter = self._meters.pop(part, None) or Meter(self._client.api, self._containers[part].id)
+        try:
+            used = meter.read()
+        except OSError as error:
+            meter.close()
+            raise OffloadError(f"{part}: what it uses cannot be read: {error}") from error
+        self._meters[part] = meter
+        return used
 
     def close(self) -> None:
         """Stop and remove all, last started first. Ctrl-C does not interrupt it; it takes a bounded time."""
@@ -219,8 +223,14 @@ class DockerTestbed:
             for output in self._outputs.values():
                 last.callback(output.finish)
             last.callback(_remove, client, f"{RUN}={self.run}")
+            for part in tuple(self._meters):
+                last.callback(self._close_meter, part)
             for part in self._outputs:
                 last.callback(self._stop_at_last, part)
+
+    def _close_meter(self, part: str) -> None:
+        if part in self._meters:
+            self._meters.pop(part).close()
 
     def _stop_at_last(self, part: str) -> None:
         with contextlib.suppress(OffloadError):  # then it is removed as it is
@@ -238,7 +248,10 @@ class DockerTestbed:
             self._outputs[name] = Output(name, said, log, again=again)
             self._outputs[name].start()
             self._hogs[name] = []  # they ended with it
+            self._close_meter(name)
             container.start()
+            with contextlib.suppress(APIError):  # it has ended by now
+                self._meters[name] = Meter(self._client.api, container.id)
         if kind_of(name).http is not None:
             self._wait_ready(name)
 

@@ -17,18 +17,21 @@ from loadgen.testbed import CLOUD, ROBOT, WAN, Usage
 
 NEAR, FAR = "near", "far"
 RESULTS, INPUTS, COMPILED = Path("/out"), Path("/in"), Path("/var/cache/offboard")
-# Pages in memory and open handles of session 1, which is the part and its workers: what is executed in the
-# container beside them has sessions of its own, and process 1 is Docker's init.
+# For each line, pages in memory and open handles of session 1, which is the part and its workers: what is
+# executed in the container beside them has sessions of its own, and process 1 is Docker's init. It starts no
+# process, as that would cost the part's CPU quota.
 MEASURE = """
-pages=0 handles=0
-for process in /proc/[0-9]*; do
-  read -r line < $process/stat || continue
-  set -- ${line##*) }
-  [ "$4" = 1 ] && [ $process != /proc/1 ] && read -r _ resident _ < $process/statm || continue
-  set -- $process/fd/*
-  pages=$((pages + resident)) handles=$((handles + $#))
-done 2>/dev/null
-echo $pages $handles
+while read -r _; do
+  pages=0 handles=0
+  for process in /proc/[0-9]*; do
+    read -r line < $process/stat || continue
+    set -- ${line##*) }
+    [ "$4" = 1 ] && [ $process != /proc/1 ] && read -r _ resident _ < $process/statm || continue
+    set -- $process/fd/*
+    pages=$((pages + resident)) handles=$((handles + $#))
+  done 2>/dev/null
+  echo $pages $handles
+done
 """
 
 

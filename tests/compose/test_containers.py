@@ -20,7 +20,8 @@ from tests.testbeds import CONTRACT, Bench, setups, start
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600), pytest.mark.usefixtures("engine")]
 
 END_S = 60.0
-HOG = "while"  # stands in the command of no part
+HOG = "/tmp/hog-"  # stands in no other command
+READINGS = 10
 # A testbed in a process of its own, until it is ended.
 HOST = """
 import signal, sys, time
@@ -130,6 +131,21 @@ def test_a_container_is_its_callers(bench: Bench) -> None:
     assert docker("exec", name(bed, "cloud"), "id", "-u") == str(os.getuid())
     limits = docker("inspect", "-f", "{{.HostConfig.CpuPeriod}} {{.HostConfig.NanoCpus}}", name(bed, "cloud"))
     assert limits == "10000 0"
+
+
+def test_a_reading_costs_a_part_less_than_whatever_is_executed_in_it(bench: Bench) -> None:
+    """Less than half of the CPU time of a program that does nothing: a held robot would wait for that."""
+    bed = bench.bed
+    assert isinstance(bed, DockerTestbed)
+    bed.usage("wan")
+    _, began_s = bench.cpu("wan")
+    for _ in range(READINGS):
+        bed.usage("wan")
+    _, read_s = bench.cpu("wan")
+    for _ in range(READINGS):
+        docker("exec", name(bed, "wan"), "true")
+    _, executed_s = bench.cpu("wan")
+    assert read_s - began_s < (executed_s - read_s) / 2
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
