@@ -37,6 +37,7 @@ from common.guard import on_loopback
 from common.keys import RobotKeys
 from common.tasks import Kind, Task, kinds
 from robot_client.heartbeat import Heartbeat
+from robot_client.own_runs import OWN_RUNS
 from robot_client.runner import CLOUD, Condition, Execution, check_endpoint
 from robot_client.turns import Answer, Turns
 from robot_client.uploads import Uploads
@@ -99,7 +100,7 @@ class CloudRunner:
     ) -> None:
         check_endpoint(site, endpoint)
         self.site = site
-        self._heartbeat = Heartbeat(heartbeat_s, seed)
+        self._heartbeat = Heartbeat(heartbeat_s, seed, OWN_RUNS)
         self._endpoint = endpoint
         self._absent: str | None = f"no answer from {endpoint} yet"
         self._remote: dict[str, str] = {}

@@ -6,6 +6,7 @@ Pure: time comes in as an argument; who sends them is `cloud`.
 from collections import deque
 from random import Random
 
+from robot_client.own_runs import OwnRuns, may_be_late
 from robot_client.runner import Condition
 
 EVERY_S = 0.5
@@ -15,14 +16,16 @@ SLACK_S = 0.02  # beyond the usual round trip, if they vary no more: so much lat
 UNANSWERED_MAX = 16  # remembered; while so many are out they come SLOWER times as rarely
 SLOWER = 5
 LEAST_OF = 2  # round trips: one stalled segment is no slow link, and one that is quick again is believed
+BESIDE_LEAST_OF = 4  # where the robot computed meanwhile, and that may be why they are longer
 _SMOOTHING, _VARIATION = 1 / 8, 1 / 4  # of RFC 6298
 
 
 class Heartbeat:
-    """Of one connection. `every_s` 0: none are sent, and nothing is known."""
+    """Of one connection. `every_s` 0: none are sent, and nothing is known. `own_runs`: of the robot."""
 
-    def __init__(self, every_s: float, seed: int = 0) -> None:
+    def __init__(self, every_s: float, seed: int = 0, own_runs: OwnRuns | None = None) -> None:
         self._every_s = every_s
+        self._own_runs = own_runs or OwnRuns()
         self._random = Random(seed)
         self._next_id = 0
         self.stop()
@@ -39,7 +42,7 @@ class Heartbeat:
         self._sent: dict[int, float] = {}
         self._oldest_s = float("inf")  # when the first that is unanswered was sent
         self._heard_s = -float("inf")
-        self._recent: deque[float] = deque(maxlen=LEAST_OF)
+        self._recent: deque[float] = deque(maxlen=BESIDE_LEAST_OF)
         self._round_trip_s: float | None = None
         self._smooth_s = self._varies_s = 0.0
         self._back_s = -float("inf")  # when the site was last heard again
@@ -76,19 +79,25 @@ class Heartbeat:
         # They come back in order: those before it were lost with the connection that carried them.
         for older in [number for number in self._sent if number < id]:
             del self._sent[older]
-        if self._silent(now_s):
-            self._back_s = now_s
+        self._come_back(now_s)
         self._oldest_s = next(iter(self._sent.values()), float("inf"))
         self._vary(now_s - sent_s)
         if sent_s < self._back_s:
             self.hurry(now_s)  # it was held up by what made the site silent, and says nothing of the link now
         else:
-            self._recent.append(now_s - sent_s)
-            self._round_trip_s = min(self._recent)
+            self._measure(now_s - sent_s, beside=self._own_runs.since(sent_s))
         self.hear(now_s, queue)
+
+    def _measure(self, round_trip_s: float, *, beside: bool) -> None:
+        self._recent.append(round_trip_s)
+        if not (beside and may_be_late(round_trip_s, self._round_trip_s)):
+            while len(self._recent) > LEAST_OF:
+                self._recent.popleft()
+        self._round_trip_s = min(self._recent)
 
     def hear(self, now_s: float, queue: int) -> None:
         """Anything that the server said shows that it is there."""
+        self._come_back(now_s)
         self._heard_s, self._queue = now_s, queue
         if self._usual.queue != queue or self._usual.round_trip_s != self._round_trip_s:
             self._usual = Condition(self._round_trip_s, queue=queue)
@@ -111,6 +120,10 @@ class Heartbeat:
 
     def _silent(self, now_s: float) -> bool:
         return self._out_s(now_s) > max(SILENT_S, self._limit_s)
+
+    def _come_back(self, now_s: float) -> None:
+        if self._silent(now_s):
+            self._back_s = now_s
 
     def _vary(self, round_trip_s: float) -> None:
         """What is usual, whatever held it up: a link that is always slow is not silent."""

@@ -14,6 +14,7 @@ from common.tasks import Kind
 from robot_client.conformal import Conformal
 from robot_client.energy import Energy
 from robot_client.objectives import Expected, Objective
+from robot_client.own_runs import may_be_late
 from robot_client.policies.base import Outlook
 from robot_client.predictors import Prediction, Predictor
 from robot_client.predictors.features import Conditional
@@ -201,12 +202,14 @@ class SiteMemory:
         silent: bool,
         size: float,
         work: float | None = None,
+        beside: bool = False,
     ) -> None:
         """Take an execution; `outlook` is what was expected of it, `amount` as for `outlook`.
 
         A failed run is learnt as the time until it was given up: the one addition to Algorithm 1. To a
         predictor of measured features it says that the time is longer: a refusal at once says nothing, nor
-        does any failure where the site's heartbeats go unanswered (`silent`).
+        does any failure where the site's heartbeats go unanswered (`silent`). `beside`: the robot ran the
+        same task itself, and may have heard late of this site: to such a predictor the time is a bound.
         """
         expected_s = outlook.predicted_s if outlook else None
         overtaken = isinstance(execution.failure, Overtaken)
@@ -227,8 +230,14 @@ class SiteMemory:
             return
         behind = self.conditional and self._site == ONBOARD and outlook is not None and outlook.in_flight > 0
         waited_s = (execution.queue_s or 0.0) if behind else 0.0
+        if beside and self._conditional is not None and amount is not None and condition.load <= LOADED:
+            bound_s = _bound_s(self._conditional, amount, execution, self._seen(condition))
+            if bound_s is None:
+                self._use(moved, cpu_s)
+                return
+            seconds = bound_s
         held_up = condition.silent or (self._site != ONBOARD and condition.wait_s > 0)
-        interval = execution.ok and not held_up
+        interval = execution.ok and not held_up and not beside
         self._take(
             Observation(
                 size,
@@ -288,6 +297,22 @@ class SiteMemory:
         if self._site == ONBOARD:
             return self._energy.onboard_j(self._cpu_s.value or seconds)
         return self._energy.remote_j(seconds, self._bytes.value)
+
+
+def _bound_s(
+    predictor: Conditional, amount: float, execution: Execution, condition: Condition
+) -> float | None:
+    """What to learn of a time that the robot's own runs may have made too long; None: nothing.
+
+    It took no longer than that, and no less than the server's part and a round trip. Of all times between
+    these bounds (interval censoring) the one that changes least of what is expected is learnt.
+    """
+    found = predictor.predict(amount, condition=condition)
+    if not execution.ok or found is None or not may_be_late(execution.seconds, found.seconds):
+        return execution.seconds
+    least_s = (condition.round_trip_s or 0.0) + (execution.queue_s or 0.0) + (execution.run_s or 0.0)
+    bound_s = min(max(found.seconds, least_s), execution.seconds)
+    return None if bound_s == found.seconds else bound_s
 
 
 def _longer(execution: Execution, seconds: float, expected_s: float | None) -> bool:

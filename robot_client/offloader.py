@@ -524,7 +524,10 @@ class Offloader:
         outlook = asked.forecast.sites.get(site)
         if memory.conditional and outlook is not None:
             outlook = self._in_hindsight(outlook, execution)
-        memory.learn(amount, execution, outlook, silent=silent, size=asked.task.size, work=work)
+        beside = site == decision.second and decision.site == ONBOARD
+        memory.learn(
+            amount, execution, outlook, silent=silent, size=asked.task.size, work=work, beside=beside
+        )
         if execution.ok and decision.second is not None and decision.second_after_s == 0:
             asked.seconds[site] = execution.seconds
             if len(asked.seconds) == 2:

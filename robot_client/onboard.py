@@ -14,6 +14,7 @@ from common.errors import OffloadError, Overtaken, TaskFailed, describe
 from common.tasks import Kind, Task
 from common.wanted import call_while
 from robot_client.load import Load, LoadWatch
+from robot_client.own_runs import OWN_RUNS
 from robot_client.runner import ONBOARD, Condition, Execution
 
 ASIDE_MAX = 4  # runs that nobody waits for any more and that still go on
@@ -133,6 +134,7 @@ class OnboardRunner:
 def _run(run: _Run) -> Execution:
     cpu_before_s, started = cpu.used_s(), time.perf_counter()
     value, failure = None, None
+    OWN_RUNS.begin()
     try:
         value = call_while(lambda: not run.aside, run.task.kind.function, run.task.args)
     except BaseException as error:  # noqa: BLE001 - whatever a user's function raises is the task's failure
@@ -142,6 +144,7 @@ def _run(run: _Run) -> Execution:
     # Asked for its CPU time the kernel charges this thread, and under a quota stops it until what it overdrew
     # is paid: the caller waits for that too.
     now = time.perf_counter()
+    OWN_RUNS.end(now)
     return Execution(
         ONBOARD,
         now - run.published,

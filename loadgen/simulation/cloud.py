@@ -16,6 +16,7 @@ from loadgen.simulation.truth import Truth, number_of
 from loadgen.testbed import ROBOT
 from robot_client.cloud import PENDING_MAX
 from robot_client.heartbeat import Heartbeat
+from robot_client.own_runs import OwnRuns
 from robot_client.runner import CLOUD, Condition, Execution
 
 TASK, BEAT, CANCEL, BLOB = "task", "beat", "cancel", "blob"  # sorts of messages
@@ -51,6 +52,7 @@ class SimulatedCloud:
         link: Link,
         seed: int,
         heartbeat_s: float,
+        own_runs: OwnRuns,
     ) -> None:
         self.connection = Connection(
             clock, server, link, seed, on_up=self._start_beating, on_lost=self._fail_all
@@ -60,7 +62,7 @@ class SimulatedCloud:
         self._robot = robot
         self._truth = truth
         self._pending: dict[int, _Pending] = {}
-        self._heartbeat = Heartbeat(heartbeat_s, seed)
+        self._heartbeat = Heartbeat(heartbeat_s, seed, own_runs)
         self._start_beating()
 
     def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - the server knows every kind
@@ -166,6 +168,9 @@ class SimulatedCloud:
 
     def _hurry(self) -> None:
         self._heartbeat.hurry(self._clock.now_s())
+        self._plan_beat()
+
+    def _plan_beat(self) -> None:
         self._clock.at(self._heartbeat.due_s, partial(self._beat, self._heartbeat.due_s))
 
     def _end(
@@ -197,14 +202,14 @@ class SimulatedCloud:
 
     def _start_beating(self) -> None:
         self._heartbeat.start(self._clock.now_s())
-        self._clock.at(self._heartbeat.due_s, partial(self._beat, self._heartbeat.due_s))
+        self._plan_beat()
 
     def _beat(self, due_s: float) -> None:
         if self._heartbeat.due_s != due_s:  # another connection beats by now
             return
         number = self._heartbeat.beat(self._clock.now_s())
         self.connection.say(BEAT_BYTES, BEAT, number, partial(self._beat_back, number))
-        self._clock.at(self._heartbeat.due_s, partial(self._beat, self._heartbeat.due_s))
+        self._plan_beat()
 
     def _beat_back(self, number: int) -> None:
         queue = self._server.queue
@@ -212,3 +217,4 @@ class SimulatedCloud:
 
     def _beat_heard(self, number: int, queue: int) -> None:
         self._heartbeat.answer(number, self._clock.now_s(), queue)
+        self._plan_beat()

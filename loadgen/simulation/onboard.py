@@ -11,6 +11,7 @@ from loadgen.simulation.processor import Processor, Run
 from loadgen.simulation.truth import Truth
 from loadgen.testbed import ROBOT
 from robot_client.load import EVERY_S, FREE_MIN, HURRIED_S
+from robot_client.own_runs import OwnRuns
 from robot_client.runner import ONBOARD, Condition, Execution
 
 
@@ -25,6 +26,7 @@ class SimulatedOnboard:
         self._truth = truth
         self._runs: dict[int, tuple[Run, Future[Execution]]] = {}
         self._load = _Load(clock, processor)
+        self.own_runs = OwnRuns()
 
     def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - onboard always exists
         return None
@@ -34,6 +36,7 @@ class SimulatedOnboard:
         cpu_s = self._truth.cpu_s(ONBOARD, task)
         run = self._processor.add(cpu_s, partial(self._ended, task, cpu_s), owner=ROBOT)
         self._runs[task.id] = run, future
+        self.own_runs.begin()
         return future
 
     def cancel(self, task: Task) -> None:
@@ -41,6 +44,7 @@ class SimulatedOnboard:
         run, future = self._runs.pop(task.id, (None, None))
         if run is not None and future is not None:
             self._processor.stop(run)
+            self.own_runs.end(self._clock.now_s())
             failure, seconds = Overtaken("another site answered first"), self._clock.now_s() - run.added_s
             started = run.begun_s < math.inf
             future.set_result(Execution(ONBOARD, seconds, failure=failure, censored=True, started=started))
@@ -57,6 +61,7 @@ class SimulatedOnboard:
     def _ended(self, task: Task, cpu_s: float, run: Run) -> None:
         _, future = self._runs.pop(task.id)
         now_s = self._clock.now_s()
+        self.own_runs.end(now_s)
         future.set_result(
             Execution(
                 ONBOARD,

@@ -48,7 +48,14 @@ class World:
         self.truth = Truth(tasks[ROBOT], Noise(seed, noise))
         self.onboard = SimulatedOnboard(clock, self._robot, self.truth)
         self.cloud = SimulatedCloud(
-            clock, self._server, self._robot, self.truth, self._link, seed, heartbeat_s
+            clock,
+            self._server,
+            self._robot,
+            self.truth,
+            self._link,
+            seed,
+            heartbeat_s,
+            self.onboard.own_runs,
         )
         self._others: dict[str, OtherRobot] = {}
         for n, name in enumerate(scenario.robots()[1:], 1):

@@ -2,14 +2,26 @@
 
 import pytest
 
-from robot_client.heartbeat import EVERY_S, JITTER, SILENT_S, SLACK_S, SLOWER, UNANSWERED_MAX, Heartbeat
+from robot_client.heartbeat import (
+    BESIDE_LEAST_OF,
+    EVERY_S,
+    JITTER,
+    SILENT_S,
+    SLACK_S,
+    SLOWER,
+    UNANSWERED_MAX,
+    Heartbeat,
+)
+from robot_client.own_runs import LATE_MAX, OwnRuns
 
 TRIP_S = 0.03
 
 
-def beating(until_s: float, trip_s: float = TRIP_S, queue: int = 0) -> Heartbeat:
+def beating(
+    until_s: float, trip_s: float = TRIP_S, queue: int = 0, own_runs: OwnRuns | None = None
+) -> Heartbeat:
     """Answered ones from 0 on."""
-    heartbeat = Heartbeat(EVERY_S, seed=1)
+    heartbeat = Heartbeat(EVERY_S, seed=1, own_runs=own_runs)
     heartbeat.start(0.0)
     while heartbeat.due_s < until_s:
         now_s = heartbeat.due_s
@@ -63,6 +75,68 @@ def test_one_stalled_answer_is_no_slow_link() -> None:
     assert heartbeat.condition(2.2).round_trip_s == pytest.approx(TRIP_S)
     heartbeat.answer(heartbeat.beat(2.3), 2.5, 0)
     assert heartbeat.condition(2.5).round_trip_s == pytest.approx(0.2)
+
+
+def test_beside_an_own_run_a_round_trip_is_one_of_many() -> None:
+    """Only BESIDE_LEAST_OF longer ones in a row are believed, and one that is shorter again at once."""
+    own_runs = OwnRuns()
+    heartbeat = beating(2.0, own_runs=own_runs)
+    own_runs.begin()
+    for count in range(1, BESIDE_LEAST_OF + 1):
+        at_s = heartbeat.due_s
+        heartbeat.answer(heartbeat.beat(at_s), at_s + 1.5 * TRIP_S, 0)
+        known_s = heartbeat.condition(at_s + 0.1).round_trip_s
+        assert known_s == pytest.approx(TRIP_S if count < BESIDE_LEAST_OF else 1.5 * TRIP_S)
+    heartbeat.answer(heartbeat.beat(at_s + 1), at_s + 1 + TRIP_S, 0)
+    assert heartbeat.condition(at_s + 1.1).round_trip_s == pytest.approx(TRIP_S)
+
+
+def test_own_runs_do_not_explain_a_link_that_is_far_slower() -> None:
+    """Beyond LATE_MAX times as long as known, two in a row are believed, whatever the robot computes."""
+    own_runs = OwnRuns()
+    heartbeat = beating(2.0, own_runs=own_runs)
+    own_runs.begin()
+    for at_s in (2.0, 2.5):
+        heartbeat.answer(heartbeat.beat(at_s), at_s + 1.1 * LATE_MAX * TRIP_S, 0)
+    assert heartbeat.condition(2.6).round_trip_s == pytest.approx(1.1 * LATE_MAX * TRIP_S)
+
+
+def test_a_link_that_got_slow_is_so_beside_own_runs_too() -> None:
+    """What was quick before two slow answers in a row is forgotten."""
+    own_runs = OwnRuns()
+    heartbeat = beating(2.0, own_runs=own_runs)
+    for at_s in (2.0, 2.3):
+        heartbeat.answer(heartbeat.beat(at_s), at_s + 0.2, 0)
+    own_runs.begin()
+    heartbeat.answer(heartbeat.beat(2.6), 2.9, 0)
+    assert heartbeat.condition(2.9).round_trip_s == pytest.approx(0.2)
+
+
+def test_a_run_that_ended_after_the_question_was_beside_it() -> None:
+    """Runs that ended before it was sent are not."""
+    for ended_s, known_s in ((1.9, 1.5 * TRIP_S), (2.1, TRIP_S)):
+        own_runs = OwnRuns()
+        heartbeat = beating(2.0, own_runs=own_runs)
+        own_runs.begin()
+        own_runs.end(ended_s)
+        for at_s in (2.0, 2.05):
+            heartbeat.answer(heartbeat.beat(at_s), at_s + 1.5 * TRIP_S, 0)
+        assert heartbeat.condition(2.3).round_trip_s == pytest.approx(known_s)
+
+
+@pytest.mark.parametrize("reply_first", [False, True])
+def test_one_that_an_outage_held_up_is_no_round_trip(reply_first: bool) -> None:
+    """Be it the first that is heard again, or a task's reply; the next one is asked for at once."""
+    heartbeat = beating(2.0)
+    at_s = heartbeat.due_s
+    held = [heartbeat.beat(at_s), heartbeat.beat(at_s + 0.4)]
+    back_s = at_s + 0.5
+    if reply_first:
+        heartbeat.hear(back_s, queue=0)
+    for number in held:
+        heartbeat.answer(number, back_s, 0)
+    assert heartbeat.condition(back_s).round_trip_s == pytest.approx(TRIP_S)
+    assert heartbeat.due_s == back_s
 
 
 def test_silence_begins_after_the_limit_and_ends_with_a_word() -> None:

@@ -9,6 +9,7 @@ from common.tasks import kind_of, task
 from robot_client import objectives, predictors
 from robot_client.energy import Energy
 from robot_client.memory import KindMemory
+from robot_client.own_runs import LATE_MAX
 from robot_client.policies import Outlook
 from robot_client.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
 
@@ -43,11 +44,12 @@ def learn(
     silent: bool = False,
     condition: Condition = UNMEASURED,
     in_flight: int = 0,
+    beside: bool = False,
 ) -> None:
     site = of.site(execution.site)
     expected = outlook(of, execution.site, condition, in_flight=in_flight)
     of.pass_by()
-    site.learn(1.0, execution, expected, silent=silent, size=1.0)
+    site.learn(1.0, execution, expected, silent=silent, size=1.0, beside=beside)
 
 
 def known(predictor: str = predictors.AVERAGE) -> KindMemory:
@@ -105,6 +107,35 @@ def test_an_overtaken_run_takes_at_least_what_was_expected() -> None:
     predicted_s = outlook(one).predicted_s
     assert predicted_s is not None
     assert predicted_s > 0.3
+
+
+@pytest.mark.parametrize(
+    ("predictor", "seconds", "run_s", "learnt_s"),
+    [
+        (predictors.AVERAGE, 0.3, None, 0.2),  # heard late, perhaps
+        (predictors.AVERAGE, 0.1, None, 0.1),  # quicker than expected, however late it was heard
+        (predictors.AVERAGE, 0.39, 0.3, 0.3),  # the server says that it took longer
+        ("least-squares", 0.3, None, 0.3),  # learns what is measured
+    ],
+)
+def test_what_was_heard_beside_an_own_run_is_a_bound(
+    predictor: str, seconds: float, run_s: float | None, learnt_s: float
+) -> None:
+    """To a predictor of measured features; it is news of the site all the same."""
+    one = known(predictor)
+    for _ in range(100):
+        learn(one, Execution(CLOUD, seconds, run_s=run_s), beside=True)
+        assert one.site(CLOUD).age == 0
+    assert outlook(one).predicted_s == pytest.approx(learnt_s, rel=0.05)
+
+
+def test_own_runs_do_not_explain_what_is_far_later() -> None:
+    """Beyond LATE_MAX times as long as expected it is learnt."""
+    one = known()
+    learn(one, Execution(CLOUD, 1.01 * LATE_MAX * 0.2), beside=True)
+    found = outlook(one).predicted_s
+    assert found is not None
+    assert found > 0.2001
 
 
 def test_failures_of_a_silent_site_teach_nothing() -> None:

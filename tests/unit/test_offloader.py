@@ -23,8 +23,20 @@ from robot_client import policies, predictors
 from robot_client.allowance import DUPLICATES, Allowance
 from robot_client.offloader import Offloader
 from robot_client.onboard import OnboardRunner
+from robot_client.policies import Decision, Forecast
 from robot_client.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution, Runner
 from tests.fakes import ScriptedRunner
+from tests.virtual import VirtualClock, VirtualRunner
+
+
+class Scripted:
+    """Decides as it is told."""
+
+    def __init__(self) -> None:
+        self.next = Decision(ONBOARD, False, "plain", "scripted")
+
+    def decide(self, forecast: Forecast) -> Decision:  # noqa: ARG002
+        return self.next
 
 
 @task("add_one", size=lambda number: abs(number))
@@ -343,6 +355,32 @@ def test_late_tasks_are_learnt_with_the_load_that_made_them_late() -> None:
         assert hurried >= 6
         assert offload.last is not None
         assert offload.last.sites[CLOUD].predicted_s == pytest.approx(0.01, rel=0.2)
+
+
+@pytest.mark.parametrize(("chosen", "second", "learnt"), [(ONBOARD, CLOUD, False), (CLOUD, None, True)])
+def test_a_server_that_is_probed_beside_an_own_run_is_not_taken_for_slow(
+    chosen: str, second: str | None, learnt: bool
+) -> None:
+    """The robot may have been slow to hear; where the task was sent to the server, its time counts."""
+    policy, clock = Scripted(), VirtualClock()
+    home, cloud = VirtualRunner(ONBOARD, clock, 0.02), VirtualRunner(CLOUD, clock, 0.04)
+    with Offloader(
+        [home, cloud], policy=policy, predictor=lambda: predictors.make("average", 50), clock=clock
+    ) as offload:
+        for _ in range(30):
+            policy.next = Decision(CLOUD, False, "plain", "scripted")
+            offload(add_one, 2)
+        cloud.takes = 0.06
+        for _ in range(30):
+            policy.next = Decision(chosen, False, "probe", "scripted", second)
+            offload(add_one, 2)
+            clock.run_out()
+        policy.next = Decision(ONBOARD, False, "plain", "scripted")
+        offload(add_one, 2)
+        assert offload.last is not None
+        found = offload.last.sites[CLOUD].predicted_s
+        assert found is not None
+        assert (found > 0.045) == learnt
 
 
 def test_a_call_after_close_is_one_clear_error(make: Make) -> None:
