@@ -1,7 +1,7 @@
 """What this process computes itself: it is slow to hear of other sites meanwhile.
 
 All of its threads share the interpreter's lock and, under a quota, its CPU time. What it measures of a server
-then is too long, by up to some ten milliseconds on a tenth of a CPU.
+then is too long, by 10 to 50 ms on a tenth of a CPU.
 """
 
 import threading
