@@ -5,7 +5,7 @@ Neighbouring rows are not independent: they share a window, a stretch of road an
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from typing import Any
 
@@ -54,13 +54,21 @@ class Blocks:
 
         No figure has one below ROWS_MIN rows.
         """
+        return percentiles(self.resampled(figures))
+
+    def resampled(self, figures: Callable[[Picks], dict[str, Any]]) -> dict[str, Any]:
+        """Each figure of every resample; none below ROWS_MIN rows."""
         if self.rows < ROWS_MIN:
-            return tuple({} for _ in PERCENTS)
+            return {}
         parts = [figures(picks) for picks in self.picks()]
-        found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        return tuple(
-            {name: _percentile(values, percent) for name, values in found.items()} for percent in PERCENTS
-        )
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def percentiles(resampled: Mapping[str, Any]) -> tuple[dict[str, Any], ...]:
+    """Low and high end of each figure, None where it is undefined."""
+    return tuple(
+        {name: _percentile(values, percent) for name, values in resampled.items()} for percent in PERCENTS
+    )
 
 
 def block_length(rows: int) -> int:

@@ -16,7 +16,7 @@ import numpy as np
 
 from common.config import check, setting
 from common.errors import ConfigError
-from loadgen.bootstrap import BOUNDS, Blocks, Picks
+from loadgen.bootstrap import BOUNDS, Blocks, Picks, percentiles
 from loadgen.host import NOTED_PERCENT
 from loadgen.intervals import interval_columns, interval_figures
 from loadgen.outcome import Answered, Outcome
@@ -27,6 +27,7 @@ from loadgen.resume import PLAYS_MAX, play_once
 from loadgen.rows import Column
 from loadgen.scenario import Scenario, find_scenario, read_scenario
 from loadgen.score import quantile
+from loadgen.speed import at_one_speed, speed_slope
 from robot_client import policies, predictors
 from robot_client.runner import CLOUD, ONBOARD
 
@@ -98,9 +99,11 @@ class CompareConfig:
 class Line:
     """How one policy did with the tasks of all its runs; None: undefined.
 
-    `over_first` is its mean time over that of the first policy, on the same tasks. `recovery` counts tasks
-    after an outage. `coverage_percent` and `relative_width` are of the predictions' intervals.
-    `time_over_oracle` and `regret_ms` are of the `referenced` tasks, which each site ran alone too.
+    `over_first` is its mean time over that of the first policy, on the same tasks; `server_over_first` is
+    what the server itself took over what it took for the first, where both sent a task there, and
+    `at_one_speed` the first ratio with that taken out. `recovery` counts tasks after an outage.
+    `coverage_percent` and `relative_width` are of the predictions' intervals. `time_over_oracle` and
+    `regret_ms` are of the `referenced` tasks, which each site ran alone too.
     """
 
     policy: str
@@ -109,6 +112,8 @@ class Line:
     lost: int | None = None
     mean_ms: float | None = None
     over_first: float | None = None
+    at_one_speed: float | None = None
+    server_over_first: float | None = None
     p95_ms: float | None = None
     p99_ms: float | None = None
     late_percent: float | None = None
@@ -130,6 +135,8 @@ HEADINGS: dict[str, Heading] = {
     "lost": Heading("lost", "lost", 0),
     "mean_ms": Heading("mean ms", "mean", 1),
     "over_first": Heading("/ first", "/ first", 3),
+    "at_one_speed": Heading("at one speed", "at one speed", 3),
+    "server_over_first": Heading("server / first", "server / first", 3),
     "p95_ms": Heading("P95 ms", "P95", 1),
     "p99_ms": Heading("P99 ms", "P99", 1),
     "late_percent": Heading("late %", r"late \%", 2),
@@ -241,7 +248,12 @@ def _lines(policy: str, runs: Sequence[Outcome], first: Sequence[Outcome]) -> li
     measured: dict[str, Any] = _task_figures(columns, one)
     own = np.arange(counts["referenced"])[None]
     measured |= _reference_figures(referenced, own) if counts["referenced"] else {}
-    bounds = Blocks(count).intervals(lambda picks: _task_figures(columns, picks))
+    resampled = Blocks(count).resampled(lambda picks: _task_figures(columns, picks))
+    if resampled:
+        slope = speed_slope(resampled)
+        for figures in (measured, resampled):
+            figures["at_one_speed"] = at_one_speed(figures, slope)
+    bounds = percentiles(resampled)
     if counts["referenced"]:
         more = Blocks(counts["referenced"]).intervals(lambda picks: _reference_figures(referenced, picks))
         bounds = tuple({**bound, **other} for bound, other in zip(bounds, more, strict=True))
@@ -254,17 +266,19 @@ def _lines(policy: str, runs: Sequence[Outcome], first: Sequence[Outcome]) -> li
 def _columns(runs: Sequence[Outcome], first: Sequence[Outcome]) -> dict[str, Column]:
     """One value a task; NaN where it has none."""
     tasks: list[Answered] = []
-    of_first: list[float] = []
+    firsts: list[Answered | None] = []
     late: list[float] = []
     for run, other in zip(runs, first, strict=True):
-        theirs = {(one.robot, one.i): one.response_s for one in other.answered}
+        theirs = {(one.robot, one.i): one for one in other.answered}
         mine = sorted(run.answered, key=lambda one: (one.robot, one.i))
         tasks += mine
-        of_first += [theirs.get((one.robot, one.i), np.nan) for one in mine]
+        firsts += [theirs.get((one.robot, one.i)) for one in mine]
         late += [np.nan if run.deadline_s is None else one.response_s > run.deadline_s for one in mine]
     return {
         "response_s": np.array([one.response_s for one in tasks]),
-        "first_s": np.array(of_first),
+        "first_s": np.array([np.nan if one is None else one.response_s for one in firsts]),
+        "server_s": np.array([one.server_s for one in tasks], dtype=float),
+        "first_server_s": np.array([None if one is None else one.server_s for one in firsts], dtype=float),
         "late": np.array(late, dtype=float),
         "cloud": np.array([np.nan if one.both or not one.chosen else one.chosen == CLOUD for one in tasks]),
         "twice": np.array([len(one.sites) > 1 for one in tasks], dtype=float),
@@ -283,10 +297,11 @@ def _referenced(runs: Sequence[Outcome]) -> dict[str, Column]:
 def _task_figures(columns: Mapping[str, Column], picks: Picks) -> dict[str, Column]:
     """Figures of each resample (a row of `picks`)."""
     response, first = columns["response_s"][picks], columns["first_s"][picks]
-    paired = np.where(np.isnan(first), np.nan, response)
+    server, first_server = columns["server_s"][picks], columns["first_server_s"][picks]
     return {
         "mean_ms": 1e3 * response.mean(axis=-1),
-        "over_first": _ratio(paired, first),
+        "over_first": _ratio(response, first),
+        "server_over_first": _ratio(server, first_server),
         "p95_ms": 1e3 * quantile(response, 95),
         "p99_ms": 1e3 * quantile(response, 99),
         "late_percent": 100 * _mean(columns["late"][picks]),
@@ -313,7 +328,9 @@ def _mean(values: Column) -> Column:
 
 
 def _ratio(over: Column, under: Column) -> Column:
-    upper, lower = np.nansum(over, axis=-1), np.nansum(under, axis=-1)
+    """Of the sums over what both have; NaN where there is nothing."""
+    both = ~(np.isnan(over) | np.isnan(under))
+    upper, lower = np.where(both, over, 0.0).sum(axis=-1), np.where(both, under, 0.0).sum(axis=-1)
     ratio: Column = np.divide(upper, lower, where=lower > 0, out=np.full(len(over), np.nan))
     return ratio
 

@@ -26,7 +26,8 @@ READINGS_MIN = 6  # of what parts use, in the time that growth is looked for
 class Answered:
     """One task that was answered; times in s since the first task was due.
 
-    `wrong` says why the answer is wrong, `sites` are those it ran on, `intervals` those of their predictions.
+    `wrong` says why the answer is wrong, `sites` are those it ran on, `intervals` those of their predictions;
+    `server_s` is what the cloud's server itself took for it, without the way there and the queue.
     """
 
     i: int
@@ -40,6 +41,7 @@ class Answered:
     sites: tuple[str, ...]
     wrong: str | None = None
     intervals: tuple[Interval, ...] = ()
+    server_s: float | None = None
 
     @property
     def response_s(self) -> float:
@@ -259,6 +261,9 @@ def read_answered(answers: Path, records: Path, robot: str) -> list[Answered]:
                 both=decision.get("both", False),
                 sites=tuple(one["site"] for one in executions),
                 intervals=intervals_of(record, late),
+                server_s=next(
+                    (one["run_s"] for one in executions if one["site"] == CLOUD and one["ok"]), None
+                ),
             )
         )
     return found
