@@ -40,22 +40,30 @@ class Conformal:
         self._ends: tuple[float, float] | None = None  # scores between which the next one should be
         self._tail: _Tail | None = None
 
+    @property
+    def known(self) -> bool:
+        """Whether the errors tell, and not the spread alone."""
+        return len(self._sorted) >= SCORES_MIN
+
     def learn(self, predicted_s: float, seconds: float) -> None:
         """Take what came of a prediction."""
         if self._count:
             score = (seconds - predicted_s) / self._unit(predicted_s)
-            if len(self._sorted) >= SCORES_MIN:
+            if self.known:
                 low, high = self._interval()
-                missed = not low <= score <= high
-                outside = self._outside + RATE * (OUTSIDE - missed)
-                self._outside = min(OUTSIDE_MAX, max(OUTSIDE_MIN, outside))
+                self._adapt(missed=not low <= score <= high)
             self._add(score)
         self._count = min(self._count + 1, SCORES_MAX)
         self._usual_s += max(1 / self._count, USUAL_RATE) * (max(seconds, predicted_s) - self._usual_s)
 
+    def miss(self) -> None:
+        """A run was given up past the upper end: by how much it would have missed is not known."""
+        if self.known:
+            self._adapt(missed=True)
+
     def interval(self, predicted_s: float, spread_s: float | None) -> tuple[float, float] | None:
         """Lower and upper end of the COVERAGE interval; None while nothing tells."""
-        if len(self._sorted) < SCORES_MIN:
+        if not self.known:
             if spread_s is None:
                 return None
             return max(0.0, predicted_s - NORMAL_90 * spread_s), predicted_s + NORMAL_90 * spread_s
@@ -101,6 +109,11 @@ class Conformal:
 
     def _unit(self, predicted_s: float) -> float:
         return 0.5 * ((predicted_s if predicted_s > 0 else 0.0) + self._usual_s) or 1.0
+
+    def _adapt(self, *, missed: bool) -> None:
+        outside = self._outside + RATE * (OUTSIDE - missed)
+        self._outside = min(OUTSIDE_MAX, max(OUTSIDE_MIN, outside))
+        self._ends = None
 
     def _add(self, score: float) -> None:
         ordered = self._sorted

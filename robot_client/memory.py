@@ -237,7 +237,8 @@ class SiteMemory:
                 return
             seconds = bound_s
         held_up = condition.silent or (self._site != ONBOARD and condition.wait_s > 0)
-        interval = execution.ok and not held_up and not beside
+        past = outlook is not None and outlook.high_s is not None and seconds > outlook.high_s
+        interval = (execution.ok or (execution.censored and past)) and not held_up and not beside
         self._take(
             Observation(
                 size,
@@ -263,8 +264,10 @@ class SiteMemory:
     def _take(self, one: Observation) -> None:
         self.observations.append(one)
         self._use(one.bytes, one.cpu_s)
-        if one.predicted_s is not None:
+        if one.predicted_s is not None and one.ok:
             self._conformal.learn(one.predicted_s, one.seconds + one.waited_s)
+        elif one.predicted_s is not None:
+            self._conformal.miss()
         if self._conditional is None:
             self.predictor.learn(one.amount, one.seconds)
         elif one.condition.load > LOADED and len(self.predictor) >= LOADED_FROM:

@@ -5,7 +5,9 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
+from loadgen.intervals import intervals_of, late_seconds
 from loadgen.outcome import Answered, Outcome, Reference
 from loadgen.scenario import Scenario
 from loadgen.simulation.lockstep import LockstepClock
@@ -17,7 +19,7 @@ from robot_client import heartbeat, policies, predictors
 from robot_client.drive import OwnRecord
 from robot_client.offloader import BOTH, Offloader
 from robot_client.runner import CLOUD
-from robot_client.trace import Record
+from robot_client.trace import Record, as_dict
 from robot_client.workload import CLOSED, due_instants
 
 
@@ -41,7 +43,7 @@ def simulate(scenario: Scenario, tasks: Mapping[str, Tasks], *, noise: float = 1
     deadline_ms = scenario.workload.deadline_ms
     return Outcome(
         asked={ROBOT: scenario.workload.tasks},
-        answered=run.answered,
+        answered=run.answered(),
         references=run.references,
         deadline_s=None if deadline_ms is None else deadline_ms / 1e3,
     )
@@ -51,7 +53,7 @@ class _Run:
     """The first robot at work. Tasks that come whatever was answered have no references."""
 
     def __init__(self, scenario: Scenario, tasks: Mapping[str, Tasks], noise: float) -> None:
-        self.answered: list[Answered] = []
+        self._noted: list[tuple[int, float, float, dict[str, Any]]] = []  # number, due, ended, trace line
         self.references: list[Reference] = []
         self._scenario = scenario
         self._clock = LockstepClock()
@@ -110,7 +112,7 @@ class _Run:
 
     def _look(self) -> None:
         """Make happen what is due by now."""
-        for event in self._timeline.due(self._clock.now_s(), len(self.answered)):
+        for event in self._timeline.due(self._clock.now_s(), len(self._noted)):
             self._world.happen(event)
 
     def _ask(self, number: int, due_s: float) -> None:
@@ -127,19 +129,26 @@ class _Run:
         self._look()
 
     def _note(self, number: int, due_s: float, record: Record) -> None:
-        self.answered.append(
+        self._noted.append((number, due_s, self._clock.now_s(), as_dict(record)))
+
+    def answered(self) -> list[Answered]:
+        """Of all tasks, with what ended after its own."""
+        late = late_seconds(line for *_, line in self._noted)
+        return [
             Answered(
                 i=number,
                 robot=ROBOT,
                 due_s=due_s,
-                ended_s=self._clock.now_s(),
+                ended_s=ended_s,
                 error=None,
                 answer=None,
-                chosen=record.decision.site,
-                both=record.decision.both,
-                sites=tuple(execution.site for execution in record.executions),
+                chosen=line["decision"]["site"],
+                both=line["decision"]["both"],
+                sites=tuple(execution["site"] for execution in line["executions"]),
+                intervals=intervals_of(line, late),
             )
-        )
+            for number, due_s, ended_s, line in self._noted
+        ]
 
     def _reference(
         self, record: Record, due_s: float, deciding_s: float, foreseen: Mapping[str, float], number: int

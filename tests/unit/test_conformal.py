@@ -58,6 +58,24 @@ def test_nine_of_ten_times_are_inside(draw: Draw, seed: int) -> None:
     assert inside / asked == pytest.approx(COVERAGE, abs=0.03)
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_what_is_given_up_past_the_end_is_among_the_one_of_ten(seed: int) -> None:
+    """One run in 20 stalls and is given up: with those counted as missed nine of ten are inside."""
+    rng, conformal, inside, asked = Random(seed), Conformal(), 0, 0
+    for i in range(TASKS):
+        predicted, seconds = normal(rng, i)
+        ends = conformal.interval(predicted, None)
+        stalls = ends is not None and rng.random() < 0.05
+        if ends is not None:
+            asked += 1
+            inside += not stalls and ends[0] <= seconds <= ends[1]
+        if stalls:
+            conformal.miss()
+        else:
+            conformal.learn(predicted, seconds)
+    assert inside / asked == pytest.approx(COVERAGE, abs=0.015)
+
+
 def test_of_normal_errors_the_width_is_that_of_the_normal_interval() -> None:
     """With a constant prediction it comes to 2 x 1.645 standard deviations, to a quarter."""
     rng, conformal, widths = Random(3), Conformal(), []

@@ -1,6 +1,7 @@
 """What a kind's memory learns of each execution, and what it says of a site."""
 
 import math
+from random import Random
 
 import pytest
 
@@ -107,6 +108,29 @@ def test_an_overtaken_run_takes_at_least_what_was_expected() -> None:
     predicted_s = outlook(one).predicted_s
     assert predicted_s is not None
     assert predicted_s > 0.3
+
+
+def width(of: KindMemory) -> float:
+    """Of the interval, over the predicted time."""
+    found = outlook(of)
+    assert found.predicted_s is not None
+    assert found.low_s is not None
+    assert found.high_s is not None
+    return (found.high_s - found.low_s) / found.predicted_s
+
+
+def test_runs_that_are_given_up_past_their_interval_widen_it() -> None:
+    """They missed it; of one that is given up before its end nothing is known."""
+    rng, one = Random(1), memory()
+    for _ in range(60):
+        learn(one, Execution(CLOUD, 0.2 + rng.gauss(0, 0.01)))
+    before = width(one)
+    for _ in range(10):
+        learn(one, lost(Overtaken("late"), 0.2))
+    assert width(one) == pytest.approx(before, rel=0.1)
+    for _ in range(10):
+        learn(one, lost(Overtaken("late"), 0.4))
+    assert width(one) > before
 
 
 @pytest.mark.parametrize(

@@ -48,6 +48,7 @@ def test_a_table_over_all_scenarios_comes_first(printed: Callable[..., str]) -> 
         ]
         assert figures == [one["time_over_oracle"] for one in of_each]
         assert {(one["tasks"], one["referenced"], one["lost"]) for one in of_each} == {(60, 60, 0)}
+        assert all(50 < one["coverage_percent"] <= 100 for one in of_each)
     assert [table["testbed"] for table in each] == ["simulation", "simulation"]
 
 
