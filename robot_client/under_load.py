@@ -4,7 +4,6 @@ from collections import deque
 from statistics import median
 
 KEPT = 20  # of the last times under load
-LEAST = 3  # of them, before any is expected
 ODD = 3.0  # times their median: a longer time counts as so much
 PRIOR = 4.0  # times under load: so much does what is believed of a slope weigh, at the usual distance
 
@@ -12,10 +11,10 @@ PRIOR = 4.0  # times under load: so much does what is believed of a slope weigh,
 class UnderLoad:
     """A line over the times that were expected without the load.
 
-    Loads come seldom and are short, and the first times under one are of whatever sizes come by: a line
-    through them alone is not to be believed far from them. So its slope has a prior. What runs onboard takes
-    so many times as long (`onboard`); a server as long, but the robot is slow to send and to hear. It is
-    ridge regression, with its penalty in units of the mean (Hoerl and Kennard, 1970).
+    Loads come seldom and are short: the first time under one tells. The first ones are of whatever sizes come
+    by, and a line through them alone is not to be believed far from them. So its slope has a prior. What runs
+    onboard takes so many times as long (`onboard`); a server as long, but the robot is slow to send and to
+    hear. It is ridge regression, with its penalty in units of the mean (Hoerl and Kennard, 1970).
     """
 
     def __init__(self, *, onboard: bool) -> None:
@@ -24,7 +23,7 @@ class UnderLoad:
 
     @property
     def known(self) -> bool:
-        return len(self._kept) >= LEAST
+        return bool(self._kept)
 
     def learn(self, expected_s: float, seconds: float) -> None:
         """It took so long where without the load `expected_s` was expected."""

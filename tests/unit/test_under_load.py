@@ -4,7 +4,7 @@ from random import Random
 
 import pytest
 
-from robot_client.under_load import KEPT, LEAST, ODD, UnderLoad
+from robot_client.under_load import KEPT, ODD, UnderLoad
 
 
 def taught(*times: tuple[float, float], onboard: bool = False) -> UnderLoad:
@@ -14,18 +14,18 @@ def taught(*times: tuple[float, float], onboard: bool = False) -> UnderLoad:
     return one
 
 
-def test_it_is_known_after_a_few_times() -> None:
-    """Not before."""
-    one = UnderLoad(onboard=False)
-    for n in range(LEAST):
-        assert not one.known, n
-        one.learn(0.04, 0.1)
+def test_one_time_under_load_tells_of_all_sizes() -> None:
+    """Before it nothing is known."""
+    one = UnderLoad(onboard=True)
+    assert not one.known
+    one.learn(0.02, 0.28)
     assert one.known
+    assert one.expect(0.04) == pytest.approx(0.56)
 
 
 def test_a_server_takes_so_much_longer_and_onboard_so_many_times_as_long() -> None:
     """Where all that was seen was one kind of task."""
-    times = [(0.04, 0.12)] * LEAST
+    times = [(0.04, 0.12)] * 3
     assert taught(*times).expect(0.02) == pytest.approx(0.12 - 0.02)
     assert taught(*times, onboard=True).expect(0.02) == pytest.approx(0.06)
 
@@ -55,6 +55,6 @@ def test_one_odd_time_counts_as_a_few_of_the_usual_ones() -> None:
 
 def test_it_is_never_quicker_than_without_the_load() -> None:
     """Nor where far larger tasks are asked for, or times of 0 were seen."""
-    assert taught(*[(0.04, 0.01)] * LEAST).expect(0.04) == 0.04
-    assert taught(*[(0.0, 0.0)] * LEAST, onboard=True).expect(0.5) == 0.5
+    assert taught((0.04, 0.01)).expect(0.04) == 0.04
+    assert taught((0.0, 0.0), onboard=True).expect(0.5) == 0.5
     assert taught((0.04, 0.3), (0.05, 0.2), (0.06, 0.1)).expect(5.0) >= 5.0
