@@ -102,8 +102,9 @@ class Line:
     `over_first` is its mean time over that of the first policy, on the same tasks; `server_over_first` is
     what the server itself took over what it took for the first, where both sent a task there, and
     `at_one_speed` the first ratio with that taken out. `recovery` counts tasks after an outage.
-    `coverage_percent` and `relative_width` are of the predictions' intervals. `time_over_oracle` and
-    `regret_ms` are of the `referenced` tasks, which each site ran alone too.
+    `coverage_percent` and the widths are of the predictions' intervals: over the predicted time, and over the
+    constant width that holds as many. `time_over_oracle` and `regret_ms` are of the `referenced` tasks, which
+    each site ran alone too.
     """
 
     policy: str
@@ -122,6 +123,7 @@ class Line:
     recovery: float | None = None
     coverage_percent: float | None = None
     relative_width: float | None = None
+    width_over_constant: float | None = None
     referenced: int = 0
     time_over_oracle: float | None = None
     regret_ms: float | None = None
@@ -145,6 +147,7 @@ HEADINGS: dict[str, Heading] = {
     "recovery": Heading("recovery", "recovery", 1),
     "coverage_percent": Heading("coverage %", r"coverage \%", 1),
     "relative_width": Heading("width", "width", 2),
+    "width_over_constant": Heading("/ constant", "/ constant", 2),
     "referenced": Heading("referenced", "referenced", 0),
     "time_over_oracle": Heading("time/oracle", "time/oracle", 3),
     "regret_ms": Heading("regret ms", "regret", 1),

@@ -41,20 +41,38 @@ def test_a_late_answer_counts_with_its_true_time() -> None:
     late = [{"id": "a-1", "site": "cloud", "seconds": 0.09, "ok": True, "censored": False}]
     (found,) = intervals_of(overtaken, late_seconds([overtaken, record("onboard", 0.2, late=late)]))
     assert found.held
-    assert found.relative_width == pytest.approx(0.5)
+    assert (found.width_s, found.error_s) == (pytest.approx(0.05), pytest.approx(-0.01))
+
+
+def interval(width_s: float, held: bool, *, site: str = "cloud", error_s: float = 0.0) -> Interval:
+    return Interval(site, 2.0, width_s, error_s, held)
 
 
 def test_coverage_and_width_are_of_all_executions_of_the_picked_tasks() -> None:
     """Three times held of four is 75 %; the median width is that of the middle two; nothing is undefined."""
     tasks = [
-        (Interval(1.0, True), Interval(4.0, False)),
+        (interval(2.0, True), interval(8.0, False)),
         (),
-        (Interval(2.0, True),),
-        (Interval(3.0, True),),
+        (interval(4.0, True),),
+        (interval(6.0, True),),
     ]
     found = interval_figures(interval_columns(tasks), np.array([[0, 1, 2, 3], [1, 1, 1, 1], [2, 2, 3, 1]]))
     assert found["coverage_percent"] == pytest.approx([75.0, np.nan, 100.0], nan_ok=True)
     assert found["relative_width"] == pytest.approx([2.5, np.nan, 2.0], nan_ok=True)
     nothing = interval_figures(interval_columns([(), ()]), np.array([[0, 1]]))
-    assert np.isnan(nothing["coverage_percent"]).all()
-    assert np.isnan(nothing["relative_width"]).all()
+    assert all(np.isnan(figure).all() for figure in nothing.values())
+
+
+def test_a_width_is_compared_with_the_constant_one_of_its_site_that_holds_as_many() -> None:
+    """By hand: of the cloud's errors -1, 0, 1, 5 s three were held, and 2 s are enough for three; onboard two
+    of 0, 4 s and one that was given up, for which it takes 4 s."""
+    cloud = [(interval(3.0, held, error_s=error_s),) for error_s, held in ((-1, 1), (0, 1), (1, 1), (5, 0))]
+    onboard = [
+        (interval(8.0, held, site="onboard", error_s=error_s),)
+        for error_s, held in ((0, True), (4, True), (np.inf, False))
+    ]
+    columns = interval_columns(cloud + onboard)
+    found = interval_figures(columns, np.array([[0, 1, 2, 3], [3, 2, 1, 0]]))
+    assert found["width_over_constant"] == pytest.approx([1.5, 1.5])
+    assert interval_figures(columns, np.array([[4, 5, 6]]))["width_over_constant"] == pytest.approx([2.0])
+    assert interval_figures(columns, np.arange(7)[None])["width_over_constant"] == pytest.approx([1.5])
