@@ -12,8 +12,12 @@ from robot_client.window import checked_length
 CLIP = 3.0  # standard deviations of the running error that one observation may pull by
 CLIP_FROM = 8  # observations: before them nothing is known to be an outlier
 SCALE_RATE = 0.05  # of the running error, once so many observations made it
+PACE_RATE = 0.3  # of a time's ratio to what was expected that the pace takes over
+PACE_MAX = 2.0  # times what was expected: a longer one counts as this long
+PACE_FAR = 100.0  # times as slow as the line, or as quick, at most
+PACE_WINDOWS = 4  # windows are the memory of the line
 NORMAL = math.sqrt(math.pi / 2)  # standard deviation over mean absolute error, of normal errors
-GROWTH = 2.0  # clips: a larger error counts as this large in the running error, so that it can grow
+GROWTH = 2.0  # times what is usual, or was seen before: a larger error counts as this large
 
 
 class Scale:
@@ -104,6 +108,28 @@ class ClippedLeastSquares:
         self._slope = self._sdt / self._sdd if self._sdd > weight * least * least else 0.0
 
 
+class Paced:
+    """A line times a pace: what a site takes for all sizes alike changes far sooner than its line does.
+
+    The pace follows the last times by a share of PACE_RATE of their ratio to what was expected, at most
+    PACE_MAX either way, on the logarithm; the line is learnt from times at a pace of 1.
+    """
+
+    def __init__(self, window: int, seed: int = 0) -> None:
+        self._line = ClippedLeastSquares(PACE_WINDOWS * window, seed)
+        self._pace = 1.0
+
+    def expect(self, size: float) -> float:
+        """The expected seconds alone."""
+        return self._pace * self._line.expect(size)
+
+    def learn(self, size: float, seconds: float) -> None:
+        if len(self._line) >= CLIP_FROM and (expected := self.expect(size)) > 0:
+            ratio = min(max(seconds / expected, 1 / PACE_MAX), PACE_MAX)
+            self._pace = min(max(self._pace * ratio**PACE_RATE, 1 / PACE_FAR), PACE_FAR)
+        self._line.learn(size, seconds / self._pace)
+
+
 class BayesianLeastSquares(RecursiveLeastSquares):
     """Bayesian linear regression with unknown noise; nothing is forgotten unless told.
 
@@ -141,8 +167,9 @@ class Kalman:
     West and Harrison, Bayesian Forecasting and Dynamic Models; noise of the walks as shares of the
     measured one, so that no unit matters. Innovations are clipped at CLIP running errors. After RUN
     innovations of one sign beyond SIGNAL running errors the last of them is not clipped, and the level as
-    uncertain as it is large: what has changed for good is believed at once. Alone it can lock on to what it
-    last saw of a site that is no longer tried: it needs probes.
+    uncertain as it is large: what has changed for good is believed at once. It counts as at most GROWTH times
+    the one before: an outlier behind a small one is no change. Alone it can lock on to what it last saw of a
+    site that is no longer tried: it needs probes.
     """
 
     LEVEL_NOISE = 0.1  # variance a task over that of the measurement
@@ -160,6 +187,7 @@ class Kalman:
         self._reach = 0.0  # mean square distance of sizes from the origin
         self._scale = Scale()
         self._run = 0  # innovations of one sign beyond SIGNAL, with that sign
+        self._last_error = 0.0
 
     @property
     def full(self) -> bool:
@@ -185,7 +213,9 @@ class Kalman:
         error = seconds - expected
         clip, deviation = self._scale.clip, self._scale.deviation
         self._scale.add(error)
+        most, self._last_error = GROWTH * abs(self._last_error), error
         if self._watch(error, deviation):
+            error = min(max(error, -most), most)
             self._p00 += error * error
         elif error > clip:
             error = clip

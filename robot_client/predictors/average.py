@@ -1,9 +1,9 @@
-"""Dynamic model averaging: two predictors of one site, each believed as far as it was right of late."""
+"""Dynamic model averaging: three predictors of one site, each believed as far as it was right of late."""
 
 import math
 from collections.abc import Sequence
 
-from robot_client.predictors.adaptive import CLIP, ClippedLeastSquares, Kalman, Scale
+from robot_client.predictors.adaptive import CLIP, ClippedLeastSquares, Kalman, Paced, Scale
 from robot_client.predictors.base import Prediction, check_observation
 from robot_client.predictors.features import Conditional, Gains
 from robot_client.predictors.robust import TheilSen
@@ -17,14 +17,17 @@ START_CLIP_FROM = 5  # fewer have no outliers
 EXCESS_RATE = 0.05  # of the mean of what was clipped
 EXCESS_MAX = 8.0  # clips that count of it, at most: hedges bound what is waited for
 
+Three = tuple[float, float, float]  # a value of each model
+
 
 class Average(Conditional):
-    """Least squares on what is seen and a Kalman filter on what is left without the measured features.
+    """Least squares on what is seen; a Kalman filter and a line at a pace on what is left without features.
 
-    The mean of their predictions, weighted by how small their errors were of late: Raftery, Karny and
-    Ettler, Online Prediction Under Model Uncertainty Via Dynamic Model Averaging (2010), with clipped
-    absolute errors in place of densities: an outlier is no model's fault. The spread is the running error of
-    the average itself. `blind`: the features are not looked at.
+    The features are those that were measured. The mean of the models' predictions is weighted by how small
+    their errors were of late: Raftery, Karny and Ettler, Online Prediction Under Model Uncertainty Via
+    Dynamic Model Averaging (2010), with clipped absolute errors in place of densities: an outlier is no
+    model's fault. The spread is the running error of the average itself. `blind`: the features are not
+    looked at.
 
     The first START observations are held to a line that bears outliers; what was clipped off any counts in
     the mean, as times do that nobody can foretell.
@@ -39,8 +42,9 @@ class Average(Conditional):
         """Begin anew, with what `_first` holds not yet learnt."""
         self._seen = ClippedLeastSquares(self._window, self._seed)
         self._left = Kalman(self._window, self._seed)
-        self._seen_error = self._left_error = 0.0
-        self._share = 0.5  # of `_left` in the mean
+        self._paced = Paced(self._window, self._seed)
+        self._errors: Three = (0.0, 0.0, 0.0)  # of the models, in units of the average's own
+        self._shares: Three = (1 / 3, 1 / 3, 1 / 3)  # of the models in the mean
         self._gains = Gains()
         self._scale = Scale()
         self._excess = 0.0
@@ -68,12 +72,14 @@ class Average(Conditional):
 
     def _learn(self, size: float, seconds: float, condition: Condition) -> None:
         if len(self):
-            self._judge(*self._each(size, condition), seconds)
+            self._judge(self._each(size, condition), seconds)
         self._seen.learn(size, seconds)
         rest = max(0.0, seconds - (condition.round_trip_s or 0.0))
         if (condition.queue or condition.load) and len(self._left):
             self._learn_gains(size, rest, condition)
-        self._left.learn(size, rest / self._gains.crowding(condition))
+        rest /= self._gains.crowding(condition)
+        self._left.learn(size, rest)
+        self._paced.learn(size, rest)
 
     def predict(
         self,
@@ -83,34 +89,47 @@ class Average(Conditional):
     ) -> Prediction | None:
         if not self._first:
             return None
-        seen, left = self._each(size, UNMEASURED if self._blind else condition)
+        each = self._each(size, UNMEASURED if self._blind else condition)
         return Prediction(
-            seen + self._share * (left - seen) + self._excess,
+            self._mean(each) + self._excess,
             self._scale.deviation if self._scale.count > 1 else None,
         )
 
-    def _each(self, size: float, condition: Condition) -> tuple[float, float]:
-        """What each of the two expects."""
-        seen, rest = self._seen.expect(size), self._left.expect(size)
-        left = condition.round_trip_s or 0.0
-        if rest > 0:
-            left += self._gains.crowding(condition) * rest
-        return (seen if seen > 0 else 0.0), left
+    def _each(self, size: float, condition: Condition) -> Three:
+        """What each of the models expects."""
+        seen, left, paced = self._seen.expect(size), self._left.expect(size), self._paced.expect(size)
+        way, crowding = condition.round_trip_s or 0.0, self._gains.crowding(condition)
+        return (
+            seen if seen > 0 else 0.0,
+            way + crowding * left if left > 0 else way,
+            way + crowding * paced if paced > 0 else way,
+        )
 
-    def _judge(self, seen: float, left: float, seconds: float) -> None:
+    def _mean(self, each: Three) -> float:
+        """By their shares; to the bit what they say where all say the same."""
+        (_, left_share, paced_share), (seen, left, paced) = self._shares, each
+        return seen + left_share * (left - seen) + paced_share * (paced - seen)
+
+    def _judge(self, each: Three, seconds: float) -> None:
         """How far each was off; the weights that follow."""
         scale = self._scale
         unit, clip = scale.deviation, scale.clip
-        error = seconds - seen - self._share * (left - seen)
+        error = seconds - self._mean(each)
         self._exceed(error - clip, clip)
         scale.add(error)
         unit = unit or scale.deviation
         if not unit:
             return
-        fresh = 1 - MEMORY
-        self._seen_error = MEMORY * self._seen_error + fresh * min(abs(seconds - seen) / unit, ERROR_MAX)
-        self._left_error = MEMORY * self._left_error + fresh * min(abs(seconds - left) / unit, ERROR_MAX)
-        self._share = 1 / (1 + math.exp(SHARPNESS * (self._left_error - self._seen_error)))
+        a, b, c = (min(abs(seconds - expected) / unit, ERROR_MAX) for expected in each)
+        x, y, z = self._errors
+        x, y, z = self._errors = (
+            MEMORY * x + (1 - MEMORY) * a,
+            MEMORY * y + (1 - MEMORY) * b,
+            MEMORY * z + (1 - MEMORY) * c,
+        )
+        least = min(x, y, z)  # one weight is 1: none of them need be so small that their sum is 0
+        x, y, z = (math.exp(SHARPNESS * (least - one)) for one in (x, y, z))
+        self._shares = x / (x + y + z), y / (x + y + z), z / (x + y + z)
 
     def _exceed(self, beyond_s: float, clip: float) -> None:
         """What was clipped at `clip` was so much more."""

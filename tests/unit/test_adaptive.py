@@ -11,8 +11,10 @@ from robot_client.predictors.adaptive import (
     CLIP_FROM,
     GROWTH,
     NORMAL,
+    PACE_FAR,
     SCALE_RATE,
     ClippedLeastSquares,
+    Paced,
     Scale,
 )
 from robot_client.predictors.linear import RecursiveLeastSquares
@@ -127,6 +129,36 @@ def test_kalman_does_not_follow_noise() -> None:
         off.append(abs(at(predictor, size) - 0.2 - 0.1 * size))
         predictor.learn(size, seconds)
     assert sum(off) / len(off) < 0.006
+
+
+def test_an_outlier_behind_a_small_one_is_no_change() -> None:
+    """An innovation of three deviations and then one a hundred times as large: the level stays near."""
+    predictor = taught("kalman", stream(200))
+    predictor.learn(3.0, 0.53)
+    predictor.learn(3.0, 3.5)
+    assert at(predictor) == pytest.approx(0.5, abs=0.1)
+
+
+@pytest.mark.parametrize("name", ["blind-average", "average"])
+def test_a_pace_seen_on_small_tasks_is_that_of_large_ones(name: str) -> None:
+    """A quarter of the CPU, and only tasks of size 1 to 2 go there meanwhile: one of 5 takes four times as
+    long too, and is quick again when they are."""
+    rng = Random(4)
+    predictor = taught(name, stream(200))
+    for slower, expected in ((4, 2.8), (1, 0.7)):
+        for _ in range(15):
+            size = rng.uniform(1, 2)
+            predictor.learn(size, slower * (0.2 + 0.1 * size + rng.gauss(0, 0.01)))
+        assert at(predictor, 5.0) == pytest.approx(expected, rel=0.3)
+
+
+def test_a_pace_is_bounded() -> None:
+    """Times of 0 for long, and then any: neither is divided by nothing."""
+    one = Paced(10)
+    for seconds in [*[1.0] * 20, *[0.0] * 2000, *[1e15] * 2000]:
+        one.learn(2.0, seconds)
+        assert 1 / PACE_FAR <= one._pace <= PACE_FAR
+    assert 0 < one.expect(2.0) < 1e18
 
 
 @pytest.mark.parametrize("name", [*FOLLOWING, "bayesian-least-squares"])

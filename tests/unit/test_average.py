@@ -1,4 +1,4 @@
-"""The average of two predictors."""
+"""The average of three predictors."""
 
 from random import Random
 
@@ -26,11 +26,11 @@ class Says:
         return self.seconds
 
 
-def of(seen: float, left: float) -> Average:
+def of(seen: float, left: float, paced: float) -> Average:
     """Past its start, with models that say these."""
     one = blind_average(50)
     one._first = [(2.0, 1.0, UNMEASURED)] * START
-    one._seen, one._left = Says(seen), Says(left)  # type: ignore[assignment]
+    one._seen, one._left, one._paced = Says(seen), Says(left), Says(paced)  # type: ignore[assignment]
     return one
 
 
@@ -60,13 +60,13 @@ def test_what_is_clipped_counts_in_the_mean() -> None:
 
 def test_before_they_have_erred_all_count_alike() -> None:
     """The first prediction is the plain mean."""
-    assert predicted(of(0.1, 0.3)) == pytest.approx(0.2)
+    assert predicted(of(0.1, 0.3, 0.5)) == pytest.approx(0.3)
 
 
-@pytest.mark.parametrize("best", [0.1, 0.5])
+@pytest.mark.parametrize("best", [0.1, 0.5, 0.9])
 def test_the_better_model_wins(best: float) -> None:
     """After thirty tasks the model that is right has nine tenths of the say."""
-    one, rng = of(0.1, 0.5), Random(1)
+    one, rng = of(0.1, 0.5, 0.9), Random(1)
     for _ in range(30):
         one.learn(2.0, best * rng.uniform(0.9, 1.1))
     assert predicted(one) == pytest.approx(best, abs=0.04)
@@ -74,7 +74,7 @@ def test_the_better_model_wins(best: float) -> None:
 
 def test_a_model_that_becomes_right_is_believed_again() -> None:
     """Errors fade: forty tasks after the other one took over it has the say."""
-    one = of(0.1, 0.5)
+    one = of(0.1, 0.5, 0.9)
     for _ in range(200):
         one.learn(2.0, 0.1)
     for _ in range(40):
@@ -84,7 +84,7 @@ def test_a_model_that_becomes_right_is_believed_again() -> None:
 
 def test_an_outlier_does_not_sway() -> None:
     """One time a hundred times as long moves the prediction by less than a tenth of what parts the models."""
-    one, rng = of(0.1, 0.5), Random(2)
+    one, rng = of(0.1, 0.5, 0.9), Random(2)
     for _ in range(50):
         one.learn(2.0, 0.1 * rng.uniform(0.9, 1.1))
     before = predicted(one)
@@ -95,12 +95,12 @@ def test_an_outlier_does_not_sway() -> None:
 def test_where_all_agree_the_prediction_is_theirs() -> None:
     """To the bit, also of a time that no sum of binary fractions is."""
     for seconds in (0.1, 0.3, 1e-9):
-        assert predicted(of(seconds, seconds)) == seconds
+        assert predicted(of(seconds, seconds, seconds)) == seconds
 
 
 def test_no_time_is_below_zero() -> None:
     """A model that says less than nothing counts as 0."""
-    assert predicted(of(-1.0, -2.0)) == 0.0
+    assert predicted(of(-1.0, -2.0, -0.5)) == 0.0
 
 
 @pytest.mark.parametrize("make", [Average, blind_average])
