@@ -22,6 +22,7 @@ pytestmark = [pytest.mark.compose, pytest.mark.timeout(600), pytest.mark.usefixt
 END_S = 60.0
 HOG = "/tmp/hog-"  # stands in no other command
 READINGS = 10
+ROUNDS = 4
 # A testbed in a process of its own, until it is ended.
 HOST = """
 import signal, sys, time
@@ -138,14 +139,19 @@ def test_a_reading_costs_a_part_less_than_whatever_is_executed_in_it(bench: Benc
     bed = bench.bed
     assert isinstance(bed, DockerTestbed)
     bed.usage("wan")
-    _, began_s = bench.cpu("wan")
-    for _ in range(READINGS):
-        bed.usage("wan")
-    _, read_s = bench.cpu("wan")
-    for _ in range(READINGS):
-        docker("exec", name(bed, "wan"), "true")
-    _, executed_s = bench.cpu("wan")
-    assert read_s - began_s < (executed_s - read_s) / 2
+    read_s, executed_s = [], []
+    for _ in range(ROUNDS):  # what the part does itself, as when it has just begun, adds to some of them
+        _, began_s = bench.cpu("wan")
+        for _ in range(READINGS):
+            bed.usage("wan")
+        _, between_s = bench.cpu("wan")
+        for _ in range(READINGS):
+            docker("exec", name(bed, "wan"), "true")
+        _, ended_s = bench.cpu("wan")
+        read_s.append(between_s - began_s)
+        executed_s.append(ended_s - between_s)
+    print(read_s, executed_s)
+    assert min(read_s) < min(executed_s) / 2
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
