@@ -194,7 +194,7 @@ def _predictors() -> Table:
             sizes[n % WINDOW], seconds[n % WINDOW] = size, 0.04 * size
             LinearRegression().fit(sizes[:, np.newaxis], seconds).predict([[size]])
 
-    found = each_of({"least squares": ours(least), "average of two": ours(average), "river": river}, CALLS)
+    found = each_of({"least squares": ours(least), "average of three": ours(average), "river": river}, CALLS)
     found |= each_of({"numpy.polyfit": polyfit, "scikit-learn": sklearn}, CALLS // 10)
     base = found["least squares"]
     rows = [[name, f"{each * 1e6:.2f}", f"{each / base:.1f}"] for name, each in found.items()]
