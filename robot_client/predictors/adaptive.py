@@ -7,7 +7,7 @@ import math
 
 from robot_client.predictors.base import SIZE_MIN, Prediction, check_observation
 from robot_client.predictors.linear import ROUNDING, RecursiveLeastSquares, checked_forgetting
-from robot_client.window import checked_length
+from robot_client.window import WINDOW_MAX, checked_length
 
 CLIP = 3.0  # standard deviations of the running error that one observation may pull by
 CLIP_FROM = 8  # observations: before them nothing is known to be an outlier
@@ -116,7 +116,7 @@ class Paced:
     """
 
     def __init__(self, window: int, seed: int = 0) -> None:
-        self._line = ClippedLeastSquares(PACE_WINDOWS * window, seed)
+        self._line = ClippedLeastSquares(min(PACE_WINDOWS * checked_length(window), WINDOW_MAX), seed)
         self._pace = 1.0
 
     def expect(self, size: float) -> float:

@@ -127,7 +127,7 @@ class Average(Conditional):
             MEMORY * y + (1 - MEMORY) * b,
             MEMORY * z + (1 - MEMORY) * c,
         )
-        least = min(x, y, z)  # one weight is 1: none of them need be so small that their sum is 0
+        least = min(x, y, z)  # so that one weight is 1, and their sum never 0
         x, y, z = (math.exp(SHARPNESS * (least - one)) for one in (x, y, z))
         self._shares = x / (x + y + z), y / (x + y + z), z / (x + y + z)
 

@@ -4,6 +4,7 @@ from random import Random
 
 import pytest
 
+from common.errors import ConfigError
 from robot_client import predictors
 from robot_client.predictors import Predictor
 from robot_client.predictors.adaptive import (
@@ -18,6 +19,7 @@ from robot_client.predictors.adaptive import (
     Scale,
 )
 from robot_client.predictors.linear import RecursiveLeastSquares
+from robot_client.window import WINDOW_MAX
 
 FOLLOWING = ("clipped-least-squares", "kalman", "blind-average", "average")
 ROBUST = ("clipped-least-squares", "kalman")
@@ -150,6 +152,15 @@ def test_a_pace_seen_on_small_tasks_is_that_of_large_ones(name: str) -> None:
             size = rng.uniform(1, 2)
             predictor.learn(size, slower * (0.2 + 0.1 * size + rng.gauss(0, 0.01)))
         assert at(predictor, 5.0) == pytest.approx(expected, rel=0.3)
+
+
+@pytest.mark.parametrize("name", FOLLOWING)
+@pytest.mark.parametrize("window", [2, WINDOW_MAX])
+def test_every_window_that_is_allowed_will_do(name: str, window: int) -> None:
+    """The shortest and the longest; what is longer is refused by its own number."""
+    assert at(taught(name, stream(20), window)) == pytest.approx(0.5, abs=0.1)
+    with pytest.raises(ConfigError, match=rf"^window {WINDOW_MAX + 1}: "):
+        taught(name, stream(20), WINDOW_MAX + 1)
 
 
 def test_a_pace_is_bounded() -> None:
