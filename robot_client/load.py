@@ -1,4 +1,4 @@
-"""How much of the robot's own CPU other programs take: a feature of onboard times.
+"""What the robot's CPU can do now, and how much of it other programs take: features of onboard times.
 
 In a container, or wherever else a CPU quota holds, the CPU is the quota: what others of the group use is
 missing to this process, and so is the time that all of them are throttled for.
@@ -14,24 +14,28 @@ from common.cpu import READ_BYTES_MAX, QuotaGroup, parse_usage, quota_group
 
 EVERY_S = 0.5  # read no more often: a reading costs more than a decision
 HURRIED_S = 0.05  # but so often where it may just have changed; what a shorter time tells is ticks
-QUOTA_EVERY = 8  # readings: how often the quota is looked up again
+LOOKED_UP_EVERY = 8  # readings: how often it is looked up whether there is a quota, and how clocks are held
 FREE_MIN = 0.1  # of the CPU: where this process leaves less to others, what they take says nothing
 PROCESSES_MAX = 64  # of a group whose CPU time is the sum of theirs
+CLOCKS = Path("/sys/devices/system/cpu/cpufreq")
+CLOCKS_MAX = 16  # of them are looked at: CPUs of one kind share one
 TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 
 
 class Load:
     """Reads the CPU time of all that shares the CPU with the process at `proc` (/proc/self).
 
-    Everything is found at the first reading: by then the process must be where its quota is.
+    `capacity`: so much of one CPU at full clock may a thread use, above 0 to 1, by the quota and by how low
+    the clock is held, as where it gets hot (cpufreq's scaling_max_freq).
     """
 
-    def __init__(self, proc: Path, root: Path = Path("/proc")) -> None:
+    def __init__(self, proc: Path, root: Path = Path("/proc"), clocks: Path = CLOCKS) -> None:
+        self.capacity = 1.0
         self._proc = proc
         self._root = root
+        self._clocks = clocks
+        self._clock = 1.0
         self._group: QuotaGroup | None = None
-        self._found = False
-        self._cpus = 1.0
         self._readings = 0
         self._read_at_s = -EVERY_S
         self._others_s = self._own_s = 0.0
@@ -50,13 +54,12 @@ class Load:
         return self._share
 
     def _read(self, now_s: float, since_s: float) -> None:
-        first = not self._found
-        if first:
-            self._group, self._found = quota_group(self._proc), True
-        if self._readings % QUOTA_EVERY == 0:
-            self._cpus = (self._group.cpus() if self._group else None) or float(os.cpu_count() or 1)
+        first = self._readings == 0
+        if self._readings % LOOKED_UP_EVERY == 0:
+            first = self._look_up() or first
         self._readings += 1
-        cpus = self._cpus
+        cpus = (self._group.cpus() if self._group else None) or float(os.cpu_count() or 1)
+        self.capacity = self._clock * min(1.0, cpus)
         own_s = time.process_time()
         others_s = self._total_s() - own_s
         took_s, left_s = others_s - self._others_s, cpus * since_s - (own_s - self._own_s)
@@ -65,6 +68,12 @@ class Load:
             return
         if left_s >= FREE_MIN * cpus * since_s:
             self._share = min(1.0, max(0.0, took_s / left_s))
+
+    def _look_up(self) -> bool:
+        """Whether the CPU is another group's than before."""
+        self._clock = _clock(self._clocks)
+        before, self._group = self._group, quota_group(self._proc)
+        return self._group != before
 
     def _total_s(self) -> float:
         """CPU seconds of all, this process among them."""
@@ -101,25 +110,25 @@ class LoadWatch:
 
     def __init__(self, load: Load) -> None:
         self._load = load
-        self._share = 0.0
+        self._latest = (0.0, 1.0)
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="load", daemon=True)
         self._starting = threading.Lock()
         self._reading = threading.Lock()
 
-    def latest(self) -> float:
-        """The share that was read last."""
+    def latest(self) -> tuple[float, float]:
+        """The share and the capacity that were read last."""
         if self._thread.ident is None:
             with self._starting:
                 if self._thread.ident is None and not self._closed.is_set():
                     self._thread.start()
-        return self._share
+        return self._latest
 
     def hurry(self) -> None:
         """Read it now, in the caller's thread, unless it is being read or has just been."""
         if self._thread.ident is not None and self._reading.acquire(blocking=False):
             try:
-                self._share = self._load.share(HURRIED_S)
+                self._read()
             finally:
                 self._reading.release()
 
@@ -129,9 +138,22 @@ class LoadWatch:
     def _run(self) -> None:
         while True:
             with self._reading:
-                self._share = self._load.share(HURRIED_S)
+                self._read()
             if self._closed.wait(EVERY_S):
                 return
+
+    def _read(self) -> None:
+        self._latest = (self._load.share(HURRIED_S), self._load.capacity)
+
+
+def _clock(folder: Path) -> float:
+    """The highest clock that is allowed over the highest there is; 1 where the kernel does not tell."""
+    allowed = full = 0
+    with contextlib.suppress(OSError, ValueError):
+        for policy in sorted(folder.glob("policy*"))[:CLOCKS_MAX]:
+            allowed += int(_read(policy / "scaling_max_freq"))
+            full += int(_read(policy / "cpuinfo_max_freq"))
+    return min(1.0, allowed / full) if allowed > 0 and full > 0 else 1.0
 
 
 def _read(path: str | Path) -> bytes:

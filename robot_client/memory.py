@@ -187,11 +187,11 @@ class SiteMemory:
         if condition.load <= LOADED:
             self._round_trip_s = condition.round_trip_s
         elif self._under_load.known:
-            found = model.predict(amount, self.age + 1, self._quiet(condition))
+            found = _foretold(model, amount, self.age + 1, self._quiet(condition))
             if found is None:
                 return None
             return found._replace(seconds=self._under_load.expect(found.seconds))
-        return model.predict(amount, self.age + 1, self._seen(condition))
+        return _foretold(model, amount, self.age + 1, self._seen(condition))
 
     def learn(
         self,
@@ -271,11 +271,12 @@ class SiteMemory:
         if self._conditional is None:
             self.predictor.learn(one.amount, one.seconds)
         elif one.condition.load > LOADED and len(self.predictor) >= LOADED_FROM:
-            found = self._conditional.predict(one.amount, condition=self._quiet(one.condition))
+            found = _foretold(self._conditional, one.amount, 1, self._quiet(one.condition))
             if found is not None:
                 self._under_load.learn(found.seconds, one.seconds)
         else:
-            self._conditional.learn(one.amount, one.seconds, self._seen(one.condition))
+            condition = self._seen(one.condition)
+            self._conditional.learn(one.amount, one.seconds * condition.capacity, condition)
 
     def _quiet(self, condition: Condition) -> Condition:
         """What it would be without the load."""
@@ -316,6 +317,19 @@ def _bound_s(
     least_s = (condition.round_trip_s or 0.0) + (execution.queue_s or 0.0) + (execution.run_s or 0.0)
     bound_s = min(max(found.seconds, least_s), execution.seconds)
     return None if bound_s == found.seconds else bound_s
+
+
+def _foretold(model: Conditional, amount: float, ahead: int, condition: Condition) -> Prediction | None:
+    """By seconds on a whole CPU: with half of it everything takes twice as long."""
+    found, capacity = model.predict(amount, ahead, condition), condition.capacity
+    if found is None or capacity == 1.0:
+        return found
+    seconds, spread_s, error_s = found
+    return Prediction(
+        seconds / capacity,
+        None if spread_s is None else spread_s / capacity,
+        None if error_s is None else error_s / capacity,
+    )
 
 
 def _longer(execution: Execution, seconds: float, expected_s: float | None) -> bool:

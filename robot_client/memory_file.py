@@ -102,6 +102,7 @@ def _condition(given: Any) -> Condition:
         queue=int(_number(given["queue"])),
         load=_number(given["load"]),
         wait_s=_number(given["wait_s"]),
+        capacity=_share(given.get("capacity", 1.0)),  # unknown to earlier versions
     )
 
 
@@ -110,6 +111,12 @@ def _number(given: Any, least: float = 0.0) -> float:
         raise TypeError(f"{given!r} where a number was expected")
     if not (least <= given and math.isfinite(given)):
         raise ValueError(f"{given} where a finite number from {least:g} was expected")
+    return float(given)
+
+
+def _share(given: Any) -> float:
+    if not 0 < _number(given) <= 1:
+        raise ValueError(f"{given} where a share above 0 to 1 was expected")
     return float(given)
 
 

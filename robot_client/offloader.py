@@ -534,17 +534,23 @@ class Offloader:
                 self._regret.learn(asked.seconds[decision.site], asked.seconds[decision.second])
 
     def _in_hindsight(self, outlook: Outlook, execution: Execution) -> Outlook:
-        """With the robot's load as it is now, where the time tells that this may have changed meanwhile."""
+        """With the robot's load and capacity as they are now, where the time tells that they changed."""
         if not execution.ok or outlook.low_s is None or outlook.high_s is None:
             return outlook
         before = outlook.condition
-        later = execution.seconds > outlook.high_s and before.load <= LOADED
-        sooner = execution.seconds < outlook.low_s and before.load > LOADED
+        later, sooner = execution.seconds > outlook.high_s, execution.seconds < outlook.low_s
         if not (later or sooner):
             return outlook
         self._runners[ONBOARD].hurry()
-        load = self._load(execution.site)
-        return outlook if load == before.load else replace(outlook, condition=replace(before, load=load))
+        load, capacity = before.load, before.capacity
+        if later if load <= LOADED else sooner:
+            load = self._load(execution.site)
+        if execution.site == ONBOARD:
+            now = self._runners[ONBOARD].condition().capacity
+            capacity = min(capacity, now) if later else max(capacity, now)
+        if (load, capacity) == (before.load, before.capacity):
+            return outlook
+        return replace(outlook, condition=replace(before, load=load, capacity=capacity))
 
     def _load(self, site: str) -> float:
         """Of the robot; of a server only where its times tell of that."""

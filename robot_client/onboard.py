@@ -84,9 +84,9 @@ class OnboardRunner:
         self._load.hurry()
 
     def condition(self) -> Condition:
-        found, load = self._condition, self._load.latest()
-        if found.load != load:
-            found = self._condition = Condition(load=load)
+        found, (load, capacity) = self._condition, self._load.latest()
+        if found.load != load or found.capacity != capacity:
+            found = self._condition = Condition(load=load, capacity=capacity)
         return found
 
     def close(self) -> None:

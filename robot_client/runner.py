@@ -76,7 +76,8 @@ class Condition:
     `round_trip_s` is that of its heartbeats (None: it has none); `silent`: they go unanswered; `queue`: tasks
     that wait there, as it last said; `load`: the share of the robot's own CPU that others take, 0 to 1, of a
     server only while it is so large that the server's times tell of it; `wait_s`: how long the robot's own
-    tasks, or a link that is held up, will still keep it from beginning.
+    tasks, or a link that is held up, will still keep it from beginning; `capacity`: so much of one CPU at
+    full clock may a task of the robot use, above 0 to 1, of a server always 1.
     """
 
     round_trip_s: float | None = None
@@ -84,6 +85,7 @@ class Condition:
     queue: int = 0
     load: float = 0.0
     wait_s: float = 0.0
+    capacity: float = 1.0
 
 
 UNMEASURED = Condition()

@@ -53,7 +53,7 @@ class SimulatedOnboard:
         self._load.share(HURRIED_S)
 
     def condition(self) -> Condition:
-        return Condition(load=self._load.share())
+        return Condition(load=self._load.share(), capacity=self._load.capacity)
 
     def close(self) -> None:
         pass
@@ -76,17 +76,19 @@ class SimulatedOnboard:
 
 
 class _Load:
-    """What `robot_client.load` would read of the quota: the share of the rest that others took."""
+    """What `robot_client.load` would read of the quota, and of what is left of it the share of others."""
 
     def __init__(self, clock: VirtualClock, processor: Processor) -> None:
         self._clock = clock
         self._processor = processor
         self._read_at_s = self._own_s = self._others_s = self._share = 0.0
+        self.capacity = min(1.0, processor.cpus)
 
     def share(self, every_s: float = EVERY_S) -> float:
         since_s = self._clock.now_s() - self._read_at_s
         if since_s >= every_s:
             self._processor.settle()
+            self.capacity = min(1.0, self._processor.cpus)
             own_s, others_s = self._processor.own_s, self._processor.others_s
             took_s, left_s = others_s - self._others_s, self._processor.cpus * since_s - (own_s - self._own_s)
             self._own_s, self._others_s, self._read_at_s = own_s, others_s, self._clock.now_s()

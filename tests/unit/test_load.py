@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from robot_client import load
-from robot_client.load import EVERY_S, HURRIED_S, TICK_S, Load, LoadWatch
+from robot_client.load import EVERY_S, HURRIED_S, LOOKED_UP_EVERY, TICK_S, Load, LoadWatch
 from tests.unit.test_cpu import Machine
 
 CPUS = os.cpu_count() or 1
@@ -164,6 +164,32 @@ def test_in_a_group_with_a_quota_the_cpu_is_the_quota(machine: Machine, times: T
     assert share == pytest.approx(0.5, abs=0.01)
 
 
+def test_the_capacity_is_what_quota_and_clock_leave(machine: Machine, times: Times, tmp_path: Path) -> None:
+    """Of one CPU at full clock, at the next reading; a quota that is given later is found."""
+    point = machine.mount("", "cgroup2")
+    machine.process("", "/robot")
+    group = machine.write(point / "robot", cpu_max="max 100000\n", cpu_stat="usage_usec 6000000\n")
+    clocks = [tmp_path / "clocks" / name for name in ("policy0", "policy4")]
+    for clock in clocks:
+        machine.write(clock)
+        (clock / "scaling_max_freq").write_text("2000000\n")
+        (clock / "cpuinfo_max_freq").write_text("2000000\n")
+    root = machine.proc
+    (root / "stat").write_text("cpu  0 0 0 9 5 0 0 0 0 0\n")
+    one = Load(machine.proc, root, tmp_path / "clocks")
+    assert (one.share(), one.capacity) == (0.0, 1.0)
+    machine.write(group, cpu_max="50000 100000\n")
+    (clocks[0] / "scaling_max_freq").write_text("1000000\n")
+    for _ in range(LOOKED_UP_EVERY):
+        later(times, EVERY_S)
+        assert one.share() == 0.0
+    assert one.capacity == pytest.approx(0.75 * 0.5)
+    machine.write(group, cpu_max="400000 100000\n")
+    later(times, EVERY_S)
+    one.share()
+    assert one.capacity == 0.75
+
+
 def test_a_group_that_counts_nothing_is_the_sum_of_its_processes(machine: Machine, times: Times) -> None:
     """Quota and count in other hierarchies: CPU times come from /proc/PID/stat, odd names too."""
     limited = machine.mount("cpu", "cgroup", "rw,cpu")
@@ -198,7 +224,7 @@ def test_a_watch_reads_in_a_thread_of_its_own() -> None:
     watch = LoadWatch(counted)
     assert counted.read_by == []
     until = time.monotonic() + 10
-    while watch.latest() < 2:
+    while watch.latest()[0] < 2:
         assert time.monotonic() < until
         time.sleep(0.01)
     assert threading.current_thread() not in counted.read_by
@@ -228,7 +254,7 @@ def test_a_watch_that_is_hurried_reads_in_the_callers_thread() -> None:
     watch.hurry()
     assert counted.read_by == []
     until = time.monotonic() + 10
-    while not watch.latest():
+    while not watch.latest()[0]:
         assert time.monotonic() < until
         time.sleep(0.01)
     watch.hurry()

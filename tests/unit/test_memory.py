@@ -261,6 +261,20 @@ def test_a_round_trip_that_a_loaded_robot_measured_is_not_the_servers() -> None:
     assert outlook(one, condition=quiet).predicted_s == pytest.approx(0.05, rel=0.05)
 
 
+def test_what_was_learnt_on_half_a_cpu_tells_of_a_whole_one() -> None:
+    """Spread and interval too; a predictor that knows of no features learns what it sees, as published."""
+    one, half = memory(), Condition(capacity=0.5)
+    for n in range(30):
+        learn(one, Execution(ONBOARD, 0.2 + 0.01 * (n % 3 - 1)), condition=half)
+    before, after = outlook(one, ONBOARD, half), outlook(one, ONBOARD)
+    assert before.predicted_s == pytest.approx(0.2, rel=0.05)
+    assert before.predicted_s == pytest.approx(2 * (after.predicted_s or 0.0))
+    assert before.spread_s == pytest.approx(2 * (after.spread_s or 0.0))
+    published = memory(predictors.LEAST_SQUARES)
+    learn(published, Execution(ONBOARD, 0.2), condition=half)
+    assert outlook(published, ONBOARD).predicted_s == pytest.approx(0.2)
+
+
 def test_a_server_that_is_first_used_by_a_loaded_robot_gets_known() -> None:
     """Else the warm-up would not end while the load lasts."""
     one = memory()

@@ -357,6 +357,36 @@ def test_late_tasks_are_learnt_with_the_load_that_made_them_late() -> None:
         assert offload.last.sites[CLOUD].predicted_s == pytest.approx(0.01, rel=0.2)
 
 
+@pytest.mark.parametrize(("capacity", "seconds"), [(0.25, 0.02), (1.0, 0.005)])
+def test_odd_tasks_are_learnt_with_the_capacity_that_made_them_odd(capacity: float, seconds: float) -> None:
+    """Held, or set free, since its CPU was last looked at, a robot is as quick as before for that CPU."""
+    before = true = Condition(capacity=0.5)
+
+    class Held(ScriptedRunner):
+        def hurry(self) -> None:
+            super().hurry()
+            self.measured = true
+
+    takes: Iterator[float] = itertools.cycle([0.009, 0.01, 0.011])
+    home = Held(ONBOARD, lambda one: Execution(ONBOARD, next(takes), one.args))
+    home.measured = before
+    with Offloader(
+        [home, cloud_answers()],
+        policy=policies.make(ONBOARD),
+        predictor=lambda: predictors.make("average", 50),
+    ) as offload:
+        for _ in range(60):
+            offload(add_one, 2)
+        takes, true = itertools.repeat(seconds), Condition(capacity=capacity)
+        for _ in range(6):
+            home.measured = before  # as it was read before
+            offload(add_one, 2)
+        home.measured, true, takes = before, before, itertools.repeat(0.01)
+        offload(add_one, 2)
+        assert offload.last is not None
+        assert offload.last.sites[ONBOARD].predicted_s == pytest.approx(0.01, rel=0.2)
+
+
 @pytest.mark.parametrize(("chosen", "second", "learnt"), [(ONBOARD, CLOUD, False), (CLOUD, None, True)])
 def test_a_server_that_is_probed_beside_an_own_run_is_not_taken_for_slow(
     chosen: str, second: str | None, learnt: bool

@@ -20,7 +20,7 @@ from robot_client.offloader import Offloader
 from robot_client.policies import Outlook
 from robot_client.policies.wrappers import PROBE_EVERY
 from robot_client.predictors.linear import LeastSquares
-from robot_client.runner import CLOUD, ONBOARD, Condition, Execution
+from robot_client.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
 from robot_client.store import HALF_LIFE_S, SAVE_EVERY_S, Store
 from robot_client.trace import Record
 from tests.fakes import ScriptedRunner
@@ -60,7 +60,9 @@ class Robot:
             return Execution(name, seconds, one.kind.function(*one.args), bytes_out=100, cpu_s=0.01)
 
         runner = ScriptedRunner(name, script)
-        runner.measured = Condition(round_trip_s=0.02, queue=1) if name != ONBOARD else Condition(load=0.4)
+        runner.measured = (
+            Condition(round_trip_s=0.02, queue=1) if name != ONBOARD else Condition(load=0.4, capacity=0.5)
+        )
         return runner
 
     def started(
@@ -310,6 +312,36 @@ def test_one_bad_number_spoils_the_file(robot: Robot, caplog: pytest.LogCaptureF
     with robot.started() as offload:
         assert robot.outlooks(offload)[ONBOARD].predicted_s is None
     assert "-1.0 where a finite number from 0 was expected" in caplog.text
+
+
+@pytest.mark.parametrize("capacity", [0.0, 1.5])
+def test_a_capacity_of_nothing_or_of_more_than_a_cpu_spoils_the_file(
+    robot: Robot, caplog: pytest.LogCaptureFixture, capacity: float
+) -> None:
+    """Times are divided by it."""
+    with robot.started() as offload:
+        robot.ask(offload, 20)
+    whole = json.loads(robot.path.read_bytes())
+    whole["kinds"]["store_plain"]["sites"][ONBOARD]["observations"][-1]["condition"]["capacity"] = capacity
+    robot.path.write_text(json.dumps(whole))
+    with robot.started() as offload:
+        assert robot.outlooks(offload)[ONBOARD].predicted_s is None
+    assert f"{capacity} where a share above 0 to 1 was expected" in caplog.text
+
+
+def test_a_file_of_before_capacities_is_read(robot: Robot) -> None:
+    """What a robot learnt does not end with an update: its CPU was whole then."""
+    robot.sites[0].measured = UNMEASURED
+    with robot.started() as offload:
+        robot.ask(offload, 20)
+        before = robot.outlooks(offload)
+    whole = json.loads(robot.path.read_bytes())
+    for site in whole["kinds"]["store_plain"]["sites"].values():
+        for one in site["observations"]:
+            del one["condition"]["capacity"]
+    robot.path.write_text(json.dumps(whole))
+    with robot.started() as offload:
+        assert robot.outlooks(offload)[ONBOARD].predicted_s == before[ONBOARD].predicted_s
 
 
 def test_a_file_too_large_is_not_read(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
