@@ -17,11 +17,13 @@ from cloud_server.outcome import Blobs, Outcome, run_task, warm_kinds
 from cloud_server.workers import Call, Died, Setup, Worker
 from common.blobs import Buffer
 from common.errors import CloudBroken
+from common.threads import join_all
 from common.wanted import always
 
 __all__ = ["EXECUTORS", "Executor", "Outcome", "Processes", "Threads"]
 
 MEMORY_BYTES_MAX = 2 << 30  # of one worker process
+CLOSE_WAIT_S = 1.0  # for threads whose tasks are abandoned
 SPARES = 1  # worker processes beyond those that run tasks: a start takes longer than a crash may cost
 
 Done = Callable[["Future[Outcome]"], None]
@@ -85,8 +87,12 @@ class Threads:
     def __init__(self, workers: int) -> None:
         self.workers = self.up = workers
         self._calls: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
-        for n in range(workers + 1):  # one may do what is to be done meanwhile
-            threading.Thread(target=self._work, name=f"task-{n}", daemon=True).start()
+        self._threads = [
+            threading.Thread(target=self._work, name=f"task-{n}", daemon=True)
+            for n in range(workers + 1)  # one may do what is to be done meanwhile
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def warm(self, changed: Callable[[str], None] = lambda _: None) -> "Future[None]":  # noqa: ARG002
         warmed: Future[None] = Future()
@@ -123,8 +129,9 @@ class Threads:
         with contextlib.suppress(Empty):
             while True:
                 self._calls.get_nowait()
-        for _ in range(self.workers + 1):
+        for _ in self._threads:
             self._calls.put(None)
+        join_all(self._threads, CLOSE_WAIT_S)
 
     def _work(self) -> None:
         while (call := self._calls.get()) is not None:

@@ -12,6 +12,7 @@ from common import cpu
 from common.cpu import SELF
 from common.errors import OffloadError, Overtaken, TaskFailed, describe
 from common.tasks import Kind, Task
+from common.threads import join_all
 from common.wanted import call_while
 from robot_client.load import Load, LoadWatch
 from robot_client.own_runs import OWN_RUNS
@@ -19,6 +20,7 @@ from robot_client.runner import ONBOARD, Condition, Execution
 
 ASIDE_MAX = 4  # runs that nobody waits for any more and that still go on
 ASIDE_NICE = 10  # theirs: beside a task of nice 0 a tenth of its CPU time (sched(7))
+CLOSE_WAIT_S = 1.0  # for what runs at the end
 
 
 @dataclass(eq=False, slots=True)
@@ -46,6 +48,7 @@ class OnboardRunner:
         self._line: SimpleQueue[_Run | None] = SimpleQueue()
         self._runs: dict[int, _Run] = {}  # that have not ended
         self._threads = 0  # without those aside
+        self._started: list[threading.Thread] = []  # all of them, but for some that have ended
         self._aside = 0
         self._closed = False
         self._lock = threading.Lock()
@@ -90,6 +93,7 @@ class OnboardRunner:
         return found
 
     def close(self) -> None:
+        """What runs is waited for, for CLOSE_WAIT_S at most."""
         with self._lock:
             if self._closed:
                 return
@@ -102,10 +106,13 @@ class OnboardRunner:
                 self._line.put(None)
         for run in waiting:
             run.future.cancel()
+        join_all(self._started, CLOSE_WAIT_S)
 
     def _start_thread(self) -> None:
         self._threads += 1
-        threading.Thread(target=self._work, name=ONBOARD, daemon=True).start()
+        thread = threading.Thread(target=self._work, name=ONBOARD, daemon=True)
+        thread.start()
+        self._started = [*(one for one in self._started if one.is_alive()), thread]
 
     def _put_aside(self, run: _Run, thread: int) -> None:
         run.aside = True

@@ -276,6 +276,16 @@ def test_closing_does_not_wait_for_a_task_that_hangs(make: Callable[..., Executo
         os.kill(pid, 0)
 
 
+def test_closing_leaves_no_thread_that_can_end(module: str) -> None:
+    """One that ends with the process may take it down (SIGABRT)."""
+    for _ in range(20):
+        before = set(threading.enumerate())
+        executor = EXECUTORS["threads"](3, [module], 1000)
+        assert value(run(executor, "exec_where", 0))
+        executor.close()
+        assert set(threading.enumerate()) - before == set()
+
+
 def test_closing_while_workers_start_ends_them(module: str) -> None:
     """A server told to stop before it was ready stops."""
     executor = EXECUTORS["processes"](2, [module], 1000)

@@ -9,6 +9,7 @@ import pytest
 from common.errors import OffloadError, Overtaken, Unwanted
 from common.tasks import Task, kind_of, task
 from common.wanted import check_wanted
+from robot_client import onboard
 from robot_client.onboard import ASIDE_MAX, ASIDE_NICE, OnboardRunner
 
 WAIT_S = 5.0
@@ -149,6 +150,31 @@ def test_closing_ends_what_waits(runner: OnboardRunner) -> None:
         runner.submit(call(3), 1.0)
     gate.open.set()
     assert runs.result(WAIT_S).value == 1
+
+
+@pytest.mark.usefixtures("runner")
+def test_closing_leaves_no_thread_that_can_end() -> None:
+    """One that ended with the process took it down, now and then (SIGABRT); those set aside count too."""
+    for _ in range(20):
+        gate.__init__()  # type: ignore[misc]
+        one, before = OnboardRunner(2), set(threading.enumerate())
+        aside, plain = call(1), [one.submit(call(number, at_once), 1.0) for number in range(4)]
+        one.submit(aside, 1.0)
+        until_begun(1)
+        one.cancel(aside)
+        assert [future.result(WAIT_S).ok for future in plain] == [True] * 4
+        gate.open.set()
+        one.close()
+        assert {thread.name for thread in set(threading.enumerate()) - before} <= {"load"}
+
+
+def test_closing_does_not_wait_for_ever(runner: OnboardRunner, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A task that does not end is left behind."""
+    monkeypatch.setattr(onboard, "CLOSE_WAIT_S", 0.05)
+    runs = runner.submit(call(1), 1.0)
+    until_begun(1)
+    runner.close()
+    assert not runs.done()
 
 
 @pytest.mark.usefixtures("runner")
