@@ -18,7 +18,7 @@ from common.errors import ConfigError
 from robot_client import memory_file
 from robot_client.memory import KindMemory, Observation
 from robot_client.memory_file import PER_SIZE, PER_WORK, KeptKind, KeptSite, Unreadable
-from robot_client.policies.wrappers import PROBE_EVERY
+from robot_client.policies.wrappers import STALE
 
 SAVE_EVERY_S = 30.0  # at most, between the first task and the end
 WRITE_WAIT_S = 5.0  # for a disk at the end
@@ -66,7 +66,7 @@ class Store:
             if name not in sites:
                 self._away.setdefault(kind.name, {})[name] = site
             elif observations := _as_learnt(self._believed(site), kept.per, memory.per_work):
-                memory.site(name).recall(observations, age=PROBE_EVERY)
+                memory.site(name).recall(observations, age=STALE)
                 log.info("%s on %s: %d observations recalled", kind.name, name, len(observations))
 
     def due(self, now_s: float) -> bool:

@@ -8,7 +8,9 @@ from robot_client.policies.base import Decision, Forecast, Outlook, Policy, chea
 from robot_client.runner import ONBOARD
 
 PROBE_EVERY = 20  # tasks without news of a site
-SLOWER_MAX = 4.0  # times as slow as the chosen site: so much more seldom onboard is tried, at most
+MEASURED = 2.0  # times more seldom is onboard tried: its load and its capacity are measured
+SELDOM_MAX = 4.0  # times more seldom, at most
+STALE = round(PROBE_EVERY * SELDOM_MAX)  # tasks without news after which every site is tried
 RESERVED = 1  # second runs that are left for hedges
 HEDGE_MIN_S = 1e-3  # a wait of 0 is a probe
 BREAK_AFTER = 3  # failures in a row
@@ -20,7 +22,7 @@ class Probe:
 
     The first answer is used, and both times are learnt: nobody waits for what is only tried. A site whose
     heartbeats go unanswered is not tried: the first one that is answered says more. Onboard, where a run
-    takes the time of the tasks beside it, is tried the more seldom the slower it is expected to be.
+    takes the time of the tasks beside it, is tried more seldom, the more so the slower it is expected to be.
     """
 
     def __init__(self, inner: Policy) -> None:
@@ -135,7 +137,7 @@ def _probe_after(site: str, one: Outlook, chosen: Outlook) -> float:
     """Tasks without news of this site."""
     if site != ONBOARD or not one.predicted_s or not chosen.predicted_s:
         return PROBE_EVERY
-    return PROBE_EVERY * min(max(1.0, one.predicted_s / chosen.predicted_s), SLOWER_MAX)
+    return PROBE_EVERY * min(MEASURED * max(1.0, one.predicted_s / chosen.predicted_s), SELDOM_MAX)
 
 
 def _broken(failures: int, age: int) -> bool:

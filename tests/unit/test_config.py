@@ -385,7 +385,7 @@ def test_a_command_keeps_and_uses_its_memory(tmp_path: Path) -> None:
     records = list(trace.read(tmp_path / "trace.jsonl"))
     assert records[0]["sites"]["onboard"]["predicted_s"] is None
     assert records[8]["sites"]["onboard"]["predicted_s"] is not None
-    assert (records[8]["i"], records[8]["sites"]["onboard"]["age"]) == (0, 20)
+    assert (records[8]["i"], records[8]["sites"]["onboard"]["age"]) == (0, 80)
     command = [sys.executable, "-m", "robot_client", *flags.replace("memory.json", ".").split(), "1"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=30, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (2, "robot-client: memory .: is a folder\n")

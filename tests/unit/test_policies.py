@@ -12,7 +12,14 @@ from common.errors import ConfigError
 from robot_client import policies
 from robot_client.policies import Decision, Forecast, Outlook, Policy, rules, wrappers
 from robot_client.policies.rules import EPSILON, WARM_UP
-from robot_client.policies.wrappers import BREAK_AFTER, BROKEN_FOR, BROKEN_MAX, PROBE_EVERY, SLOWER_MAX
+from robot_client.policies.wrappers import (
+    BREAK_AFTER,
+    BROKEN_FOR,
+    BROKEN_MAX,
+    MEASURED,
+    PROBE_EVERY,
+    SELDOM_MAX,
+)
 from robot_client.runner import CLOUD, ONBOARD
 from tests import policy_checks
 from tests.policy_checks import EDGE, SILENT
@@ -155,9 +162,11 @@ def test_a_site_without_news_is_probed_at_once(age: int, probed: bool) -> None:
     assert ("cloud is probed" in decision.reason) == probed
 
 
-@pytest.mark.parametrize(("onboard_s", "after"), [(0.11, 1.1), (0.3, 3.0), (2.0, SLOWER_MAX)])
+@pytest.mark.parametrize(
+    ("onboard_s", "after"), [(0.11, 1.1 * MEASURED), (0.15, 1.5 * MEASURED), (2.0, SELDOM_MAX)]
+)
 def test_a_slow_robot_is_probed_more_seldom(onboard_s: float, after: float) -> None:
-    """By as much as it is slower than the chosen site, up to SLOWER_MAX: a probe takes its tasks' time."""
+    """By as much as it is slower than the chosen site, up to SELDOM_MAX: a probe takes its tasks' time."""
     for age, probed in ((PROBE_EVERY * after - 1, False), (PROBE_EVERY * after + 1, True)):
         sites = {ONBOARD: known(onboard_s, age=age), CLOUD: known(0.1)}
         assert (decide("probe:greedy", sites).second == ONBOARD) == probed
@@ -203,7 +212,7 @@ def test_what_is_not_known_cannot_be_hedged(sites: dict[str, Outlook]) -> None:
 
 def test_a_probe_goes_before_a_hedge() -> None:
     """In either order a stale site is probed at once and not hedged to later."""
-    sites = {ONBOARD: known(0.5, age=50), CLOUD: known(0.2)}
+    sites = {ONBOARD: known(0.5, age=100), CLOUD: known(0.2)}
     for name in ("hedge:probe:greedy", "probe:hedge:greedy"):
         decision = decide(name, sites)
         assert decision.second == ONBOARD

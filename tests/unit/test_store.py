@@ -18,7 +18,7 @@ from robot_client import policies, predictors, store
 from robot_client.memory import OBSERVATIONS_MAX
 from robot_client.offloader import Offloader
 from robot_client.policies import Outlook
-from robot_client.policies.wrappers import PROBE_EVERY
+from robot_client.policies.wrappers import STALE
 from robot_client.predictors.linear import LeastSquares
 from robot_client.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
 from robot_client.store import HALF_LIFE_S, SAVE_EVERY_S, Store
@@ -164,7 +164,7 @@ def test_the_time_away_halves_what_is_believed(robot: Robot, half_lives: float, 
     with robot.started(window=300) as offload:
         found = robot.outlooks(offload)
         assert [list(one.window) for one in robot.windows] == newest
-        assert found[CLOUD].age == (PROBE_EVERY if kept else 0)
+        assert found[CLOUD].age == (STALE if kept else 0)
 
 
 def test_a_probe_comes_soon_after_a_restart(robot: Robot) -> None:
