@@ -78,6 +78,15 @@ def usage_file(proc: Path) -> Path | None:
     return group.usage if group else None
 
 
+def read_small(path: str | Path) -> bytes:
+    """A small file of the kernel's: a Python file object costs more than the reading."""
+    file = os.open(path, os.O_RDONLY)
+    try:
+        return os.read(file, READ_BYTES_MAX)
+    finally:
+        os.close(file)
+
+
 @dataclass(frozen=True, slots=True)
 class QuotaGroup:
     """A cgroup with a CPU quota: its folder, the name of the quota's file there, and the file of its use."""
@@ -89,9 +98,10 @@ class QuotaGroup:
     def cpus(self) -> float | None:
         """The quota in CPUs; None where there is none any more."""
         try:
-            limit, *period = (self.folder / self.quota).read_text().split()
-            period_us = period[0] if period else (self.folder / "cpu.cfs_period_us").read_text()
-            return None if limit in UNLIMITED else int(limit) / int(period_us)
+            limit, *period = read_small(f"{self.folder}/{self.quota}").decode().split()
+            if limit in UNLIMITED:
+                return None
+            return int(limit) / int(period[0] if period else read_small(f"{self.folder}/cpu.cfs_period_us"))
         except (OSError, ValueError, IndexError):
             return None
 

@@ -10,7 +10,7 @@ import threading
 import time
 from pathlib import Path
 
-from common.cpu import READ_BYTES_MAX, QuotaGroup, parse_usage, quota_group
+from common.cpu import QuotaGroup, parse_usage, quota_group, read_small
 
 EVERY_S = 0.5  # read no more often: a reading costs more than a decision
 HURRIED_S = 0.05  # but so often where it may just have changed; what a shorter time tells is ticks
@@ -58,7 +58,7 @@ class Load:
         if self._readings % LOOKED_UP_EVERY == 0:
             first = self._look_up() or first
         self._readings += 1
-        cpus = (self._group.cpus() if self._group else None) or float(os.cpu_count() or 1)
+        cpus = self._quota() or float(os.cpu_count() or 1)
         self.capacity = self._clock * min(1.0, cpus)
         own_s = time.process_time()
         others_s = self._total_s() - own_s
@@ -70,24 +70,29 @@ class Load:
             self._share = min(1.0, max(0.0, took_s / left_s))
 
     def _look_up(self) -> bool:
-        """Whether the CPU is another group's than before."""
+        """Whether the CPU is another group's than before: one whose quota holds is not looked for again."""
         self._clock = _clock(self._clocks)
+        if self._quota():
+            return False
         before, self._group = self._group, quota_group(self._proc)
         return self._group != before
+
+    def _quota(self) -> float | None:
+        return self._group.cpus() if self._group else None
 
     def _total_s(self) -> float:
         """CPU seconds of all, this process among them."""
         if self._group is None:
             return self._machine_s()
         if self._group.usage is not None:
-            return parse_usage(_read(self._group.usage))
-        pids = _read(f"{self._group.folder}/cgroup.procs").decode().split()
+            return parse_usage(read_small(self._group.usage))
+        pids = read_small(f"{self._group.folder}/cgroup.procs").decode().split()
         return sum(self._process_s(pid) for pid in pids[:PROCESSES_MAX])
 
     def _machine_s(self) -> float:
         """From /proc/stat: all but idling, waiting for disks, and guests, who are users already."""
         user, nice, system, _idle, _wait, *rest = map(
-            int, _read(f"{self._root}/stat").split(b"\n", 1)[0].split()[1:9]
+            int, read_small(f"{self._root}/stat").split(b"\n", 1)[0].split()[1:9]
         )
         return TICK_S * (user + nice + system + sum(rest))
 
@@ -95,7 +100,7 @@ class Load:
         if pid == str(os.getpid()):
             return time.process_time()  # ticks are too coarse where it is taken away again
         try:
-            fields = _read(f"{self._root}/{pid}/stat").rpartition(b")")[2].split()
+            fields = read_small(f"{self._root}/{pid}/stat").rpartition(b")")[2].split()
         except OSError:  # it has just ended
             return 0.0
         return TICK_S * (int(fields[11]) + int(fields[12]))
@@ -151,15 +156,6 @@ def _clock(folder: Path) -> float:
     allowed = full = 0
     with contextlib.suppress(OSError, ValueError):
         for policy in sorted(folder.glob("policy*"))[:CLOCKS_MAX]:
-            allowed += int(_read(policy / "scaling_max_freq"))
-            full += int(_read(policy / "cpuinfo_max_freq"))
+            allowed += int(read_small(policy / "scaling_max_freq"))
+            full += int(read_small(policy / "cpuinfo_max_freq"))
     return min(1.0, allowed / full) if allowed > 0 and full > 0 else 1.0
-
-
-def _read(path: str | Path) -> bytes:
-    """A small file of the kernel's: a Python file object costs more than the reading."""
-    file = os.open(path, os.O_RDONLY)
-    try:
-        return os.read(file, READ_BYTES_MAX)
-    finally:
-        os.close(file)

@@ -39,6 +39,7 @@ BOTH = "both"
 TIMEOUT_MAX_S = 24 * 3600.0
 POLL_S = 0.01
 LATE_MAX = 64  # executions that ended after their task, kept for the next record
+FREED = 0.5  # of the time that was expected: a robot that is so quick may have got its CPU back
 OVERDUE = 0.5  # of the time it took so far: what a task that should be done is taken to need still
 
 log = logging.getLogger(__name__)
@@ -537,15 +538,17 @@ class Offloader:
         """With the robot's load and capacity as they are now, where the time tells that they changed."""
         if not execution.ok or outlook.low_s is None or outlook.high_s is None:
             return outlook
-        before = outlook.condition
+        before, home = outlook.condition, execution.site == ONBOARD
         later, sooner = execution.seconds > outlook.high_s, execution.seconds < outlook.low_s
-        if not (later or sooner):
+        odd = later if before.load <= LOADED else sooner
+        freed = home and sooner and execution.seconds < FREED * (outlook.predicted_s or 0.0)
+        if not (odd or freed):
             return outlook
         self._runners[ONBOARD].hurry()
         load, capacity = before.load, before.capacity
-        if later if load <= LOADED else sooner:
+        if odd:
             load = self._load(execution.site)
-        if execution.site == ONBOARD:
+        if home:
             now = self._runners[ONBOARD].condition().capacity
             capacity = min(capacity, now) if later else max(capacity, now)
         if (load, capacity) == (before.load, before.capacity):

@@ -357,10 +357,10 @@ def test_late_tasks_are_learnt_with_the_load_that_made_them_late() -> None:
         assert offload.last.sites[CLOUD].predicted_s == pytest.approx(0.01, rel=0.2)
 
 
-@pytest.mark.parametrize(("capacity", "seconds"), [(0.25, 0.02), (1.0, 0.005)])
+@pytest.mark.parametrize(("capacity", "seconds"), [(0.2, 0.02), (1.0, 0.004)])
 def test_odd_tasks_are_learnt_with_the_capacity_that_made_them_odd(capacity: float, seconds: float) -> None:
     """Held, or set free, since its CPU was last looked at, a robot is as quick as before for that CPU."""
-    before = true = Condition(capacity=0.5)
+    before = true = Condition(capacity=0.4)
 
     class Held(ScriptedRunner):
         def hurry(self) -> None:
