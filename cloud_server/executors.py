@@ -3,8 +3,10 @@
 import contextlib
 import logging
 import math
+import resource
 import tempfile
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
@@ -16,6 +18,7 @@ from typing import Protocol
 from cloud_server.outcome import Blobs, Outcome, run_task, warm_kinds
 from cloud_server.workers import Call, Died, Setup, Worker
 from common.blobs import Buffer
+from common.cpu import process_s
 from common.errors import CloudBroken
 from common.threads import join_all
 from common.wanted import always
@@ -74,6 +77,9 @@ class Executor(Protocol):
     ) -> Outcome | None:
         """Run a task in this thread while another one does `meanwhile`; None: tasks do not run here."""
 
+    def used_s(self) -> float:
+        """CPU seconds of the server and its workers so far. Any thread."""
+
     def close(self) -> None:
         """Stop; tasks still running are abandoned. Safe to call twice."""
 
@@ -124,6 +130,9 @@ class Threads:
     ) -> Outcome | None:
         self._calls.put(meanwhile)
         return run_task(kind, frames, blobs, wanted)
+
+    def used_s(self) -> float:
+        return time.process_time()
 
     def close(self) -> None:
         with contextlib.suppress(Empty):
@@ -208,6 +217,11 @@ class Processes:
 
     def run(self, *_: object, meanwhile: Callable[[], None]) -> None:  # noqa: ARG002
         return None
+
+    def used_s(self) -> float:
+        ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+        alive_s = sum(process_s(worker.pid) for worker in self._workers if worker.pid)
+        return time.process_time() + ended.ru_utime + ended.ru_stime + alive_s
 
     def close(self) -> None:
         workers, self._workers = self._workers, []

@@ -24,8 +24,10 @@ from cloud_server.waiting import CRASHES_MAX, Crashes, Waiting, Work
 from common import VERSION, tasks
 from common.blobs import BlobStore, Buffer
 from common.channel import Channel
+from common.cpu import SELF
 from common.errors import ConfigError, OffloadError, ProtocolError
 from common.keys import KeyPair
+from common.load import SERVER_EVERY_S, Load, LoadWatch
 from common.wire import (
     Blob,
     Cancel,
@@ -103,6 +105,7 @@ class Server:
         self._crew = Crew(
             executor, turn=self._turn, answered=self._answered, wanted=self._wanted, over=self._over
         )
+        self._load = LoadWatch(Load(SELF, own_s=executor.used_s), SERVER_EVERY_S)
         self._closed = False
         self._chosen: list[Work] = []  # to be started by who chose it
         metrics.queue_depth.set_function(lambda: len(self._waiting))
@@ -227,7 +230,7 @@ class Server:
             case Blob(data):
                 self._blobs.add(data, self._robot_of(peer))
             case Ping(id):
-                self._outbox.send(peer, Pong(id, len(self._waiting)))
+                self._outbox.send(peer, Pong(id, len(self._waiting), *self._load.latest()))
             case Hello():
                 # Robots ask again until they are answered, and send no task before that.
                 if self._ready and self._drain_until is None:
@@ -323,6 +326,8 @@ class Server:
             error = f"BadValue: the result takes {size} bytes, at most {self._message_bytes_max} are allowed"
             outcome = replace(outcome, status="failed", error=error, frames=[], server_fault=True)
         if work.wanted:
+            self._load.hurry()  # what was taken during the task, not before it
+            load, capacity = self._load.latest()
             self._outbox.send(
                 work.peer,
                 Reply(
@@ -335,6 +340,8 @@ class Server:
                     server_fault=outcome.server_fault,
                     body=outcome.frames,
                     cpu_s=outcome.cpu_s,
+                    load=load,
+                    capacity=capacity,
                 ),
             )
         self._count(request, outcome.status if work.wanted else "cancelled")
@@ -403,6 +410,7 @@ class Server:
             self._closed = True
         self._channel.wake()
         self._crew.leave(SEND_LAST_S)
+        self._load.close()
         self._executor.close()
         self._backlog.close()
         with self._channel.lock:

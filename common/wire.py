@@ -57,6 +57,7 @@ ID_MAX = 2**63 - 1
 COUNT_MAX = 2**31 - 1
 SECONDS_MAX = 1e6
 DIGEST_BYTES = 32
+IDLE = {"load": 0.0, "capacity": 1.0}  # what a server has that does not say
 STATUSES = ("ok", "failed", "unknown_task", "busy", "expired", "need_blob")
 
 
@@ -98,7 +99,7 @@ class Reply:
 
     `server_fault`: it failed, but not by the task's own doing, so another site may well answer. `cpu_s` is
     the CPU time that the server used while the task ran; None, and not sent, where it did not run, or where
-    the server is older than the field.
+    the server is older than the field. `load` and `capacity` are as in a pong.
     """
 
     id: int
@@ -111,6 +112,8 @@ class Reply:
     server_fault: bool = False
     body: list[Buffer] = field(default_factory=list)
     cpu_s: float | None = None
+    load: float = 0.0
+    capacity: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,8 +123,15 @@ class Ping:
 
 @dataclass(frozen=True, slots=True)
 class Pong:
+    """How the server is: tasks in its queue; `load`: the share of its CPU that other programs take, 0 to 1;
+    `capacity`: so much of one CPU may a task use, above 0 to 1. The last two are sent where they differ from
+    an idle machine's.
+    """
+
     id: int
     queue_depth: int = 0
+    load: float = 0.0
+    capacity: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,21 +153,25 @@ Message = Hello | Request | Reply | Ping | Pong | Cancel | Blob
 
 def pack(message: Message) -> list[Buffer]:
     """The frames of a message; buffers in it are not copied. BadValue where it breaks a bound."""
-    name, names = _FIELDS[type(message)]
+    kind, names = _FIELDS[type(message)]
     fields = {field: getattr(message, field) for field in names}
     if isinstance(message, Reply):
         if message.error:
             fields["error"] = message.error[:ERROR_LENGTH_MAX].encode("utf-8", "replace").decode()
         if message.cpu_s is None:
             del fields["cpu_s"]
-    header: bytes = msgpack.packb([VERSION, name, fields])
+    if isinstance(message, Reply | Pong):
+        for name, idle in IDLE.items():
+            if fields[name] == idle:
+                del fields[name]
+    header: bytes = msgpack.packb([VERSION, kind, fields])
     frames: list[Buffer] = [header]
     if isinstance(message, Request | Reply):
         frames += message.body
     elif isinstance(message, Blob):
         frames.append(message.data)
     if len(header) > HEADER_BYTES_MAX or len(frames) > FRAMES_MAX:
-        raise BadValue(f"a {name} with a header of {len(header)} bytes and {len(frames)} frames is too big")
+        raise BadValue(f"a {kind} with a header of {len(header)} bytes and {len(frames)} frames is too big")
     return frames
 
 
@@ -200,6 +214,12 @@ class _Fields:
         value: Any = self.values.get(name)
         if type(value) not in (int, float) or not (math.isfinite(value) and 0 <= value <= SECONDS_MAX):
             raise self.wrong(name, f"a number 0 to {SECONDS_MAX:g}")
+        return float(value)
+
+    def share(self, name: str) -> float:
+        value: Any = self.values.get(name, IDLE[name])
+        if type(value) not in (int, float) or not 0 <= value <= 1 or (name == "capacity" and not value):
+            raise self.wrong(name, f"a share {'above ' if name == 'capacity' else ''}0 to 1")
         return float(value)
 
     def text(self, name: str, length_max: int) -> str:
@@ -273,6 +293,8 @@ def _reply(fields: _Fields, rest: list[Buffer]) -> Reply:
         server_fault=fields.flag("server_fault"),
         body=rest,
         cpu_s=fields.seconds("cpu_s") if "cpu_s" in fields.values else None,
+        load=fields.share("load"),
+        capacity=fields.share("capacity"),
     )
 
 
@@ -283,7 +305,8 @@ def _ping(fields: _Fields, rest: list[Buffer]) -> Ping:
 
 def _pong(fields: _Fields, rest: list[Buffer]) -> Pong:
     _frame_count("pong", rest, 0)
-    return Pong(fields.whole("id", 0, ID_MAX), fields.whole("queue_depth", 0, COUNT_MAX))
+    queue = fields.whole("queue_depth", 0, COUNT_MAX)
+    return Pong(fields.whole("id", 0, ID_MAX), queue, fields.share("load"), fields.share("capacity"))
 
 
 def _cancel(fields: _Fields, rest: list[Buffer]) -> Cancel:

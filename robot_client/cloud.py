@@ -36,7 +36,7 @@ from common.errors import (
 from common.guard import on_loopback
 from common.keys import RobotKeys
 from common.tasks import Kind, Task, kinds
-from robot_client.heartbeat import Heartbeat
+from robot_client.heartbeat import Heartbeat, Told
 from robot_client.own_runs import OWN_RUNS
 from robot_client.runner import CLOUD, Condition, Execution, check_endpoint
 from robot_client.turns import Answer, Turns
@@ -329,12 +329,14 @@ class CloudRunner:
                 self._heartbeat.start(received)
             self._absent = None
             return
-        if isinstance(message, wire.Pong):
-            self._heartbeat.answer(message.id, received, message.queue_depth)
+        if not isinstance(message, wire.Pong | wire.Reply):
             return
-        if isinstance(message, wire.Reply):
-            self._heartbeat.hear(received, message.queue_depth)
-        if isinstance(message, wire.Reply) and message.id in self._pending:
+        told = Told(message.queue_depth, message.load, message.capacity)
+        if isinstance(message, wire.Pong):
+            self._heartbeat.answer(message.id, received, told)
+            return
+        self._heartbeat.hear(received, told)
+        if message.id in self._pending:
             if message.status == "need_blob":
                 self._send_blobs(self._pending[message.id], message.missing)
             else:

@@ -1,10 +1,11 @@
-"""Heartbeats: small questions to a server whose answers tell the round trip, its queue, and that it is there.
+"""Heartbeats: small questions to a server; answers tell the round trip, queue and CPU, and that it is there.
 
 Pure: time comes in as an argument; who sends them is `cloud`.
 """
 
 from collections import deque
 from random import Random
+from typing import NamedTuple
 
 from robot_client.own_runs import OwnRuns, may_be_late
 from robot_client.runner import Condition
@@ -18,6 +19,14 @@ SLOWER = 5
 LEAST_OF = 2  # round trips: one stalled segment is no slow link, and one that is quick again is believed
 BESIDE_LEAST_OF = 4  # where the robot computed meanwhile, and that may be why they are longer
 _SMOOTHING, _VARIATION = 1 / 8, 1 / 4  # of RFC 6298
+
+
+class Told(NamedTuple):
+    """What a server says of itself, as in `common.wire`."""
+
+    queue: int = 0
+    load: float = 0.0
+    capacity: float = 1.0
 
 
 class Heartbeat:
@@ -46,7 +55,7 @@ class Heartbeat:
         self._round_trip_s: float | None = None
         self._smooth_s = self._varies_s = 0.0
         self._back_s = -float("inf")  # when the site was last heard again
-        self._queue = 0
+        self._told = Told()
         self._usual = Condition()  # while no answer is waited for
 
     @property
@@ -71,7 +80,7 @@ class Heartbeat:
         self.due_s = now_s + pause_s
         return self._next_id
 
-    def answer(self, id: int, now_s: float, queue: int) -> None:
+    def answer(self, id: int, now_s: float, told: Told) -> None:
         """The answer to one of them."""
         sent_s = self._sent.pop(id, None)
         if sent_s is None:
@@ -86,7 +95,7 @@ class Heartbeat:
             self.hurry(now_s)  # it was held up by what made the site silent, and says nothing of the link now
         else:
             self._measure(now_s - sent_s, beside=self._own_runs.since(sent_s))
-        self.hear(now_s, queue)
+        self.hear(now_s, told)
 
     def _measure(self, round_trip_s: float, *, beside: bool) -> None:
         self._recent.append(round_trip_s)
@@ -95,12 +104,13 @@ class Heartbeat:
                 self._recent.popleft()
         self._round_trip_s = min(self._recent)
 
-    def hear(self, now_s: float, queue: int) -> None:
+    def hear(self, now_s: float, told: Told) -> None:
         """Anything that the server said shows that it is there."""
         self._come_back(now_s)
-        self._heard_s, self._queue = now_s, queue
-        if self._usual.queue != queue or self._usual.round_trip_s != self._round_trip_s:
-            self._usual = Condition(self._round_trip_s, queue=queue)
+        self._heard_s = now_s
+        if self._told != told or self._usual.round_trip_s != self._round_trip_s:
+            self._told = told
+            self._usual = self._condition()
 
     def condition(self, now_s: float) -> Condition:
         """A site whose answer is late is expected to be held up for as long again."""
@@ -108,7 +118,13 @@ class Heartbeat:
             return self._usual
         out_s = self._out_s(now_s)
         late = self._smooth_s > 0 and out_s > max(self._smooth_s + SLACK_S, self._limit_s)
-        return Condition(self._round_trip_s, self._silent(now_s), self._queue, wait_s=out_s if late else 0.0)
+        return self._condition(silent=self._silent(now_s), wait_s=out_s if late else 0.0)
+
+    def _condition(self, *, silent: bool = False, wait_s: float = 0.0) -> Condition:
+        queue, load, capacity = self._told
+        return Condition(
+            self._round_trip_s, silent, queue, wait_s=wait_s, capacity=capacity, server_load=load
+        )
 
     def _out_s(self, now_s: float) -> float:
         """For how long an answer has been waited for and nothing was heard; negative: none is."""

@@ -24,7 +24,9 @@ from robot_client.under_load import UnderLoad
 
 AMOUNT_RATE = 0.1  # of the bytes and CPU seconds that a task usually takes
 OBSERVATIONS_MAX = 200  # of a site, kept for `store`
-LOADED = 0.3  # of the robot's own CPU taken by others: from there on all times tell of that
+LOADED = (
+    0.3  # of the robot's CPU taken by others: from there on all times tell of that; the same of a server's
+)
 LOADED_FROM = 10  # times of a site: the first ones are all learnt as one
 
 log = logging.getLogger(__name__)
@@ -121,7 +123,8 @@ class SiteMemory:
 
     What it takes while the robot is LOADED is learnt apart: the robot is slow to run, to send and to hear
     then, by more than a gain on the load tells, and everything is as quick as before once that is over. A
-    server's round trip tells of the robot then, and is taken to be what it was before.
+    server's round trip tells of the robot then, and is taken to be what it was before. So is what a server
+    takes while others have its CPU, beyond the round trip.
     """
 
     def __init__(
@@ -137,6 +140,7 @@ class SiteMemory:
         self._conditional = predictor if isinstance(predictor, Conditional) else None
         self.conditional = self._conditional is not None
         self._under_load = UnderLoad(onboard=site == ONBOARD)
+        self._server_under_load = UnderLoad(onboard=True)
         self._site = site
         self._round_trip_s: float | None = None  # the last one without load
         self._failures = 0
@@ -184,14 +188,23 @@ class SiteMemory:
         )
 
     def _foresee(self, model: Conditional, amount: float, condition: Condition) -> Prediction | None:
-        if condition.load <= LOADED:
+        loaded = condition.load > LOADED
+        if not loaded:
             self._round_trip_s = condition.round_trip_s
         elif self._under_load.known:
-            found = _foretold(model, amount, self.age + 1, self._quiet(condition))
-            if found is None:
-                return None
-            return found._replace(seconds=self._under_load.expect(found.seconds))
-        return _foretold(model, amount, self.age + 1, self._seen(condition))
+            found = self._unloaded(model, amount, self._quiet(condition))
+            return found and found._replace(seconds=self._under_load.expect(found.seconds))
+        return self._unloaded(model, amount, condition)
+
+    def _unloaded(self, model: Conditional, amount: float, condition: Condition) -> Prediction | None:
+        """But for what others take of a server's CPU, and what `model` knows of loads."""
+        if condition.server_load <= LOADED or not self._server_under_load.known:
+            return _foretold(model, amount, self.age + 1, self._seen(condition))
+        found = _foretold(model, amount, self.age + 1, self._seen(replace(condition, server_load=0.0)))
+        if found is None:
+            return None
+        way_s = condition.round_trip_s or 0.0
+        return found._replace(seconds=way_s + self._server_under_load.expect(found.seconds - way_s))
 
     def learn(
         self,
@@ -231,7 +244,7 @@ class SiteMemory:
         behind = self.conditional and self._site == ONBOARD and outlook is not None and outlook.in_flight > 0
         waited_s = (execution.queue_s or 0.0) if behind else 0.0
         if beside and self._conditional is not None and amount is not None and condition.load <= LOADED:
-            bound_s = _bound_s(self._conditional, amount, execution, self._seen(condition))
+            bound_s = _bound_s(self._unloaded(self._conditional, amount, condition), execution, condition)
             if bound_s is None:
                 self._use(moved, cpu_s)
                 return
@@ -270,21 +283,28 @@ class SiteMemory:
             self._conformal.miss()
         if self._conditional is None:
             self.predictor.learn(one.amount, one.seconds)
-        elif one.condition.load > LOADED and len(self.predictor) >= LOADED_FROM:
-            found = _foretold(self._conditional, one.amount, 1, self._quiet(one.condition))
+        elif len(self.predictor) >= LOADED_FROM and one.condition.load > LOADED:
+            found = self._unloaded(self._conditional, one.amount, self._quiet(one.condition))
             if found is not None:
                 self._under_load.learn(found.seconds, one.seconds)
+        elif len(self.predictor) >= LOADED_FROM and one.condition.server_load > LOADED:
+            alone, way_s = replace(one.condition, server_load=0.0), one.condition.round_trip_s or 0.0
+            found = _foretold(self._conditional, one.amount, 1, self._seen(alone))
+            if found is not None:
+                self._server_under_load.learn(found.seconds - way_s, max(0.0, one.seconds - way_s))
         else:
-            condition = self._seen(one.condition)
-            self._conditional.learn(one.amount, one.seconds * condition.capacity, condition)
+            held_s = max(0.0, one.seconds - (one.condition.round_trip_s or 0.0))  # to that capacity
+            seconds = one.seconds - held_s * (1.0 - one.condition.capacity)
+            self._conditional.learn(one.amount, seconds, self._seen(one.condition))
 
     def _quiet(self, condition: Condition) -> Condition:
         """What it would be without the load."""
         return replace(condition, load=0.0, round_trip_s=self._round_trip_s or condition.round_trip_s)
 
     def _seen(self, condition: Condition) -> Condition:
-        """By the predictors: no server is slower for the robot's load."""
-        return replace(condition, load=0.0) if condition.load and self._site != ONBOARD else condition
+        """By the predictors, to which a site's load is that of its own CPU."""
+        load = condition.load if self._site == ONBOARD else condition.server_load
+        return condition if condition.load == load else replace(condition, load=load)
 
     def _use(self, moved: float, cpu_s: float | None) -> None:
         self._bytes.add(moved)
@@ -303,15 +323,12 @@ class SiteMemory:
         return self._energy.remote_j(seconds, self._bytes.value)
 
 
-def _bound_s(
-    predictor: Conditional, amount: float, execution: Execution, condition: Condition
-) -> float | None:
+def _bound_s(found: Prediction | None, execution: Execution, condition: Condition) -> float | None:
     """What to learn of a time that the robot's own runs may have made too long; None: nothing.
 
     It took no longer than that, and no less than the server's part and a round trip. Of all times between
     these bounds (interval censoring) the one that changes least of what is expected is learnt.
     """
-    found = predictor.predict(amount, condition=condition)
     if not execution.ok or found is None or not may_be_late(execution.seconds, found.seconds):
         return execution.seconds
     least_s = (condition.round_trip_s or 0.0) + (execution.queue_s or 0.0) + (execution.run_s or 0.0)
@@ -320,13 +337,14 @@ def _bound_s(
 
 
 def _foretold(model: Conditional, amount: float, ahead: int, condition: Condition) -> Prediction | None:
-    """By seconds on a whole CPU: with half of it everything takes twice as long."""
+    """By seconds on a whole CPU: with half of it all takes twice as long, but for the way there and back."""
     found, capacity = model.predict(amount, ahead, condition), condition.capacity
     if found is None or capacity == 1.0:
         return found
     seconds, spread_s, error_s = found
+    way_s = condition.round_trip_s or 0.0
     return Prediction(
-        seconds / capacity,
+        way_s + max(0.0, seconds - way_s) / capacity,
         None if spread_s is None else spread_s / capacity,
         None if error_s is None else error_s / capacity,
     )

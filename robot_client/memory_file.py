@@ -102,7 +102,8 @@ def _condition(given: Any) -> Condition:
         queue=int(_number(given["queue"])),
         load=_number(given["load"]),
         wait_s=_number(given["wait_s"]),
-        capacity=_share(given.get("capacity", 1.0)),  # unknown to earlier versions
+        capacity=_share(given.get("capacity", 1.0)),  # unknown to earlier versions, as what follows
+        server_load=_number(given.get("server_load", 0.0)),
     )
 
 

@@ -535,11 +535,14 @@ class Offloader:
                 self._regret.learn(asked.seconds[decision.site], asked.seconds[decision.second])
 
     def _in_hindsight(self, outlook: Outlook, execution: Execution) -> Outlook:
-        """With the robot's load and capacity as they are now, where the time tells that they changed."""
+        """With loads and capacities as they are now, where the time tells that they changed."""
         if not execution.ok or outlook.low_s is None or outlook.high_s is None:
             return outlook
-        before, home = outlook.condition, execution.site == ONBOARD
+        home = execution.site == ONBOARD
         later, sooner = execution.seconds > outlook.high_s, execution.seconds < outlook.low_s
+        if not home and (later or sooner):
+            outlook = self._as_the_server_says(execution.site, outlook, later=later)
+        before = outlook.condition
         odd = later if before.load <= LOADED else sooner
         freed = home and sooner and execution.seconds < FREED * (outlook.predicted_s or 0.0)
         if not (odd or freed):
@@ -554,6 +557,14 @@ class Offloader:
         if (load, capacity) == (before.load, before.capacity):
             return outlook
         return replace(outlook, condition=replace(before, load=load, capacity=capacity))
+
+    def _as_the_server_says(self, site: str, outlook: Outlook, *, later: bool) -> Outlook:
+        """In its answer to what was late, or early."""
+        before, now = outlook.condition, self._runners[site].condition()
+        worse, better = (max, min) if later else (min, max)
+        load = worse(before.server_load, now.server_load)
+        capacity = better(before.capacity, now.capacity)
+        return replace(outlook, condition=replace(before, server_load=load, capacity=capacity))
 
     def _load(self, site: str) -> float:
         """Of the robot; of a server only where its times tell of that."""

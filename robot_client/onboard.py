@@ -11,10 +11,10 @@ from queue import SimpleQueue
 from common import cpu
 from common.cpu import SELF
 from common.errors import OffloadError, Overtaken, TaskFailed, describe
+from common.load import Load, LoadWatch
 from common.tasks import Kind, Task
 from common.threads import join_all
 from common.wanted import call_while
-from robot_client.load import Load, LoadWatch
 from robot_client.own_runs import OWN_RUNS
 from robot_client.runner import ONBOARD, Condition, Execution
 

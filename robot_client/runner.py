@@ -77,7 +77,8 @@ class Condition:
     that wait there, as it last said; `load`: the share of the robot's own CPU that others take, 0 to 1, of a
     server only while it is so large that the server's times tell of it; `wait_s`: how long the robot's own
     tasks, or a link that is held up, will still keep it from beginning; `capacity`: so much of one CPU at
-    full clock may a task of the robot use, above 0 to 1, of a server always 1.
+    full clock may a task use there, above 0 to 1; `server_load`: the share of a server's CPU that others
+    take. Capacity and load of a server are what it last said.
     """
 
     round_trip_s: float | None = None
@@ -86,6 +87,7 @@ class Condition:
     load: float = 0.0
     wait_s: float = 0.0
     capacity: float = 1.0
+    server_load: float = 0.0
 
 
 UNMEASURED = Condition()

@@ -15,7 +15,7 @@ from loadgen.simulation.server import BUSY, NEED_BLOB, Key, Reply, Server
 from loadgen.simulation.truth import Truth, number_of
 from loadgen.testbed import ROBOT
 from robot_client.cloud import PENDING_MAX
-from robot_client.heartbeat import Heartbeat
+from robot_client.heartbeat import Heartbeat, Told
 from robot_client.own_runs import OwnRuns
 from robot_client.runner import CLOUD, Condition, Execution
 
@@ -121,7 +121,7 @@ class SimulatedCloud:
 
     def _hear(self, pending: _Pending, reply: Reply, size: int) -> None:
         """The robot receives it."""
-        self._heartbeat.hear(self._clock.now_s(), reply.queue)
+        self._heartbeat.hear(self._clock.now_s(), reply.told)
         self._clock.after(self.sending_s, partial(self._take, pending, reply, size))
 
     def _take(self, pending: _Pending, reply: Reply, size: int) -> None:
@@ -134,7 +134,7 @@ class SimulatedCloud:
             pending.attempt += 1
             self._send(pending)
         elif reply.status == BUSY:
-            self._end(pending, CloudBusy(f"{reply.queue} requests are waiting"), started=False)
+            self._end(pending, CloudBusy(f"{reply.told.queue} requests are waiting"), started=False)
         else:
             self._end_well(pending, reply, size)
 
@@ -212,9 +212,9 @@ class SimulatedCloud:
         self._plan_beat()
 
     def _beat_back(self, number: int) -> None:
-        queue = self._server.queue
-        self.connection.answer(BEAT_REPLY_BYTES, BEAT, number, partial(self._beat_heard, number, queue))
+        told = self._server.told
+        self.connection.answer(BEAT_REPLY_BYTES, BEAT, number, partial(self._beat_heard, number, told))
 
-    def _beat_heard(self, number: int, queue: int) -> None:
-        self._heartbeat.answer(number, self._clock.now_s(), queue)
+    def _beat_heard(self, number: int, told: Told) -> None:
+        self._heartbeat.answer(number, self._clock.now_s(), told)
         self._plan_beat()

@@ -5,12 +5,13 @@ from concurrent.futures import Future
 from functools import partial
 
 from common.errors import Overtaken
+from common.load import HURRIED_S
 from common.tasks import Kind, Task
 from loadgen.simulation.clock import VirtualClock
+from loadgen.simulation.load import SimulatedLoad
 from loadgen.simulation.processor import Processor, Run
 from loadgen.simulation.truth import Truth
 from loadgen.testbed import ROBOT
-from robot_client.load import EVERY_S, FREE_MIN, HURRIED_S
 from robot_client.own_runs import OwnRuns
 from robot_client.runner import ONBOARD, Condition, Execution
 
@@ -25,7 +26,7 @@ class SimulatedOnboard:
         self._processor = processor
         self._truth = truth
         self._runs: dict[int, tuple[Run, Future[Execution]]] = {}
-        self._load = _Load(clock, processor)
+        self._load = SimulatedLoad(clock, processor)
         self.own_runs = OwnRuns()
 
     def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - onboard always exists
@@ -73,25 +74,3 @@ class SimulatedOnboard:
                 cpu_s=cpu_s,
             )
         )
-
-
-class _Load:
-    """What `robot_client.load` would read of the quota, and of what is left of it the share of others."""
-
-    def __init__(self, clock: VirtualClock, processor: Processor) -> None:
-        self._clock = clock
-        self._processor = processor
-        self._read_at_s = self._own_s = self._others_s = self._share = 0.0
-        self.capacity = min(1.0, processor.cpus)
-
-    def share(self, every_s: float = EVERY_S) -> float:
-        since_s = self._clock.now_s() - self._read_at_s
-        if since_s >= every_s:
-            self._processor.settle()
-            self.capacity = min(1.0, self._processor.cpus)
-            own_s, others_s = self._processor.own_s, self._processor.others_s
-            took_s, left_s = others_s - self._others_s, self._processor.cpus * since_s - (own_s - self._own_s)
-            self._own_s, self._others_s, self._read_at_s = own_s, others_s, self._clock.now_s()
-            if left_s >= FREE_MIN * self._processor.cpus * since_s:
-                self._share = min(1.0, max(0.0, took_s / left_s))
-        return self._share

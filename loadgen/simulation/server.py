@@ -5,10 +5,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
+from common.load import HURRIED_S, SERVER_EVERY_S
 from loadgen.scenario import CloudPart
 from loadgen.simulation.clock import VirtualClock
 from loadgen.simulation.costs import START_S
+from loadgen.simulation.load import SimulatedLoad
 from loadgen.simulation.processor import Processor, Run
+from robot_client.heartbeat import Told
 
 QUEUE_MAX = 64  # requests in line, as `cloud-server` has it; beyond it the answer is busy
 UNREAD_MAX = 100_000  # messages that a paused server has not read
@@ -19,10 +22,10 @@ Key = tuple[str, int]  # robot, and the number that it gave the request
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """What the server says to a request; `queue` are those in line when it does."""
+    """What the server says to a request, and of itself when it does."""
 
     status: str
-    queue: int
+    told: Told
     queue_s: float = 0.0
     run_s: float = 0.0
     cpu_s: float = 0.0
@@ -35,6 +38,8 @@ class Server:
         self.up = True
         self.listeners: list[Callable[[], None]] = []
         self.processor = Processor(clock, part.cpus, part.workers)
+        self._load = SimulatedLoad(clock, self.processor)
+        clock.after(SERVER_EVERY_S, self._look)
         self._clock = clock
         self._has_blob = True  # robots have warmed it up before the run
         self._paused = False
@@ -46,6 +51,15 @@ class Server:
     def queue(self) -> int:
         return self.processor.waiting
 
+    @property
+    def told(self) -> Told:
+        """What it says of itself."""
+        return Told(self.queue, self._load.latest, self._load.capacity)
+
+    def _look(self) -> None:
+        self._load.share(SERVER_EVERY_S)
+        self._clock.after(SERVER_EVERY_S, self._look)
+
     def hear(self, message: Callable[[], object]) -> None:
         """A message has arrived."""
         if self.up and not self._paused:
@@ -56,9 +70,9 @@ class Server:
     def request(self, key: Key, cpu_s: float, budget_s: float, answer: Callable[[Reply], object]) -> None:
         """Put it in line; `answer` is called when it has run, unless its budget was over before it began."""
         if not self._has_blob:
-            answer(Reply(NEED_BLOB, self.queue))
+            answer(Reply(NEED_BLOB, self.told))
         elif self.queue >= QUEUE_MAX:
-            answer(Reply(BUSY, self.queue))
+            answer(Reply(BUSY, self.told))
         else:
             self._wanted[key] = self.processor.add(
                 cpu_s,
@@ -107,4 +121,5 @@ class Server:
     def _ended(self, key: Key, cpu_s: float, answer: Callable[[Reply], object], run: Run) -> None:
         if self._wanted.pop(key, None) is not None:
             queue_s, run_s = run.begun_s - run.added_s, self._clock.now_s() - run.begun_s
-            answer(Reply(OK, self.queue, queue_s, run_s, cpu_s))
+            self._load.share(HURRIED_S)
+            answer(Reply(OK, self.told, queue_s, run_s, cpu_s))

@@ -152,13 +152,15 @@ def _times(one: Outlook) -> str:
 
 
 def _measured(site: str, condition: Condition, of: str) -> str:
-    said = ""
+    said, there = "", of if of or site == ONBOARD else " there"
     if condition.round_trip_s is not None:
         said = f", queue{of} {condition.queue}, rtt{of} {condition.round_trip_s * 1e3:.3g} ms"
     if site == ONBOARD and condition.load >= 0.005:
         said += f", load{of} {condition.load:.0%}"
+    if condition.server_load >= 0.005:
+        said += f", load{there} {condition.server_load:.0%}"
     if condition.capacity < 1.0:
-        said += f", capacity{of} {condition.capacity:.0%}"
+        said += f", capacity{there} {condition.capacity:.0%}"
     if condition.wait_s:
         said += f", wait{of} {condition.wait_s * 1e3:.3g} ms"
     return said

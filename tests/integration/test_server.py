@@ -25,6 +25,7 @@ from cloud_server.web import Web, create_app
 from common import VERSION, wire
 from common.errors import ConfigError
 from common.wire import Blob, Cancel, Hello, Ping, Pong, Reply, Request
+from robot_client.memory import LOADED
 
 pytestmark = pytest.mark.integration
 
@@ -237,9 +238,31 @@ def test_hello_and_ping_are_answered(serve: Serve, join: Join) -> None:
     assert len(hello.tasks["served_sum"]) == 64
     assert hello.software == VERSION
     peer.send(Ping(5))
-    assert peer.receive() == Pong(5, 0)
+    pong = peer.receive()
+    assert isinstance(pong, Pong)
+    assert (pong.id, pong.queue_depth) == (5, 0)
     peer.socket.send_multipart([bytes.fromhex("9202a568656c6c6f")])
     assert peer.receive() == hello
+
+
+@pytest.mark.parametrize("executor", sorted(EXECUTORS))
+def test_a_server_says_that_others_take_its_cpu(serve: Serve, join: Join, executor: str) -> None:
+    """In pongs and in replies, soon after other programs began to compute on all of its CPUs."""
+    peer = join(serve(executor).server.endpoint)
+    with ExitStack() as stack:
+        for _ in range(os.cpu_count() or 1):
+            busy = stack.enter_context(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
+            stack.callback(busy.kill)
+        load, until = 0.0, time.monotonic() + WAIT_S
+        while load < LOADED:
+            assert time.monotonic() < until
+            time.sleep(0.05)
+            peer.send(Ping(1))
+            pong = peer.receive()
+            assert isinstance(pong, Pong)
+            load = pong.load
+        peer.request(2, "served_zeros", 3)
+        assert peer.reply().load > 0
 
 
 @pytest.mark.parametrize("executor", sorted(EXECUTORS))
@@ -342,7 +365,9 @@ def test_a_cancelled_request_never_runs(serve: Serve, join: Join, pipe: Path) ->
         peer.send(Cancel(id))
     until(lambda: running.server.status().queue_depth == 1)
     peer.send(Ping(1))
-    assert peer.receive() == Pong(1, 1)
+    pong = peer.receive()
+    assert isinstance(pong, Pong)
+    assert (pong.id, pong.queue_depth) == (1, 1)
     pipe.write_text("go")
     assert other.reply().id == 2
     assert peer.value(3, "served_count") == before + 1

@@ -4,6 +4,7 @@ import hashlib
 import importlib
 import os
 import select
+import signal
 import subprocess
 import sys
 import threading
@@ -192,6 +193,28 @@ def test_the_outcome_says_what_cpu_time_was_used(executor: Executor, tmp_path: P
     for name, one, expected_s in [("burn", outcome, burnt_s), ("wait", waited, 0), ("raise", failed, 0)]:
         assert one.cpu_s == pytest.approx(expected_s, abs=TOLERANCE_S), name
     assert run(executor, "exec_burn", 0.0).cpu_s > 0
+
+
+def test_what_server_and_workers_used_is_told(executor: Executor) -> None:
+    """All that it computes is its own, in whatever process."""
+    before_s = executor.used_s()
+    burnt_s = value(run(executor, "exec_burn", BURNT_S))
+    used_s = executor.used_s() - before_s
+    assert burnt_s <= used_s + TOLERANCE_S
+
+
+def test_what_a_worker_used_that_died_is_told(make: Callable[..., Executor]) -> None:
+    """Else what others use seemed to be so much more for a moment."""
+    executor = make("processes")
+    run(executor, "exec_burn", BURNT_S)
+    worker, *_ = value(run(executor, "exec_where", 0))
+    used_s = executor.used_s()
+    os.kill(worker, signal.SIGKILL)
+    until = time.monotonic() + WAIT_S
+    while Path(f"/proc/{worker}").exists():  # it is waited for
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    assert executor.used_s() >= used_s
 
 
 def test_every_worker_is_warm_and_tasks_run_side_by_side(executor: Executor, tmp_path: Path) -> None:

@@ -11,10 +11,12 @@ from robot_client.heartbeat import (
     SLOWER,
     UNANSWERED_MAX,
     Heartbeat,
+    Told,
 )
 from robot_client.own_runs import LATE_MAX, OwnRuns
 
 TRIP_S = 0.03
+IDLE = Told()
 
 
 def beating(
@@ -25,8 +27,20 @@ def beating(
     heartbeat.start(0.0)
     while heartbeat.due_s < until_s:
         now_s = heartbeat.due_s
-        heartbeat.answer(heartbeat.beat(now_s), now_s + trip_s, queue)
+        heartbeat.answer(heartbeat.beat(now_s), now_s + trip_s, Told(queue))
     return heartbeat
+
+
+def test_what_the_server_says_of_its_cpu_is_told() -> None:
+    """By any answer of it, also while another one is waited for; of a lost connection nothing is left."""
+    heartbeat = beating(2.0)
+    assert (heartbeat.condition(2.0).server_load, heartbeat.condition(2.0).capacity) == (0.0, 1.0)
+    heartbeat.hear(2.0, Told(0, 0.75, 0.5))
+    heartbeat.beat(2.1)
+    for now_s in (2.0, 2.2, 9.0):
+        assert (heartbeat.condition(now_s).server_load, heartbeat.condition(now_s).capacity) == (0.75, 0.5)
+    heartbeat.start(10.0)
+    assert (heartbeat.condition(10.0).server_load, heartbeat.condition(10.0).capacity) == (0.0, 1.0)
 
 
 def test_before_the_connection_nothing_is_due_or_known() -> None:
@@ -54,7 +68,7 @@ def test_they_come_in_jittered_intervals() -> None:
         one.start(0.0)
         for _ in range(50):
             now_s = one.due_s
-            one.answer(one.beat(now_s), now_s, 0)
+            one.answer(one.beat(now_s), now_s, IDLE)
             found.append(one.due_s - now_s)
     assert all((1 - JITTER) * EVERY_S <= pause <= (1 + JITTER) * EVERY_S for pause in pauses)
     assert max(pauses) - min(pauses) > 0.5 * JITTER * EVERY_S
@@ -71,9 +85,9 @@ def test_round_trip_and_queue_are_told() -> None:
 def test_one_stalled_answer_is_no_slow_link() -> None:
     """The median of three: a second slow one moves it."""
     heartbeat = beating(2.0)
-    heartbeat.answer(heartbeat.beat(2.0), 2.2, 0)
+    heartbeat.answer(heartbeat.beat(2.0), 2.2, IDLE)
     assert heartbeat.condition(2.2).round_trip_s == pytest.approx(TRIP_S)
-    heartbeat.answer(heartbeat.beat(2.3), 2.5, 0)
+    heartbeat.answer(heartbeat.beat(2.3), 2.5, IDLE)
     assert heartbeat.condition(2.5).round_trip_s == pytest.approx(0.2)
 
 
@@ -84,10 +98,10 @@ def test_beside_an_own_run_a_round_trip_is_one_of_many() -> None:
     own_runs.begin()
     for count in range(1, BESIDE_LEAST_OF + 1):
         at_s = heartbeat.due_s
-        heartbeat.answer(heartbeat.beat(at_s), at_s + 1.5 * TRIP_S, 0)
+        heartbeat.answer(heartbeat.beat(at_s), at_s + 1.5 * TRIP_S, IDLE)
         known_s = heartbeat.condition(at_s + 0.1).round_trip_s
         assert known_s == pytest.approx(TRIP_S if count < BESIDE_LEAST_OF else 1.5 * TRIP_S)
-    heartbeat.answer(heartbeat.beat(at_s + 1), at_s + 1 + TRIP_S, 0)
+    heartbeat.answer(heartbeat.beat(at_s + 1), at_s + 1 + TRIP_S, IDLE)
     assert heartbeat.condition(at_s + 1.1).round_trip_s == pytest.approx(TRIP_S)
 
 
@@ -97,7 +111,7 @@ def test_own_runs_do_not_explain_a_link_that_is_far_slower() -> None:
     heartbeat = beating(2.0, own_runs=own_runs)
     own_runs.begin()
     for at_s in (2.0, 2.5):
-        heartbeat.answer(heartbeat.beat(at_s), at_s + 1.1 * LATE_MAX * TRIP_S, 0)
+        heartbeat.answer(heartbeat.beat(at_s), at_s + 1.1 * LATE_MAX * TRIP_S, IDLE)
     assert heartbeat.condition(2.6).round_trip_s == pytest.approx(1.1 * LATE_MAX * TRIP_S)
 
 
@@ -106,9 +120,9 @@ def test_a_link_that_got_slow_is_so_beside_own_runs_too() -> None:
     own_runs = OwnRuns()
     heartbeat = beating(2.0, own_runs=own_runs)
     for at_s in (2.0, 2.3):
-        heartbeat.answer(heartbeat.beat(at_s), at_s + 0.2, 0)
+        heartbeat.answer(heartbeat.beat(at_s), at_s + 0.2, IDLE)
     own_runs.begin()
-    heartbeat.answer(heartbeat.beat(2.6), 2.9, 0)
+    heartbeat.answer(heartbeat.beat(2.6), 2.9, IDLE)
     assert heartbeat.condition(2.9).round_trip_s == pytest.approx(0.2)
 
 
@@ -120,7 +134,7 @@ def test_a_run_that_ended_after_the_question_was_beside_it() -> None:
         own_runs.begin()
         own_runs.end(ended_s)
         for at_s in (2.0, 2.05):
-            heartbeat.answer(heartbeat.beat(at_s), at_s + 1.5 * TRIP_S, 0)
+            heartbeat.answer(heartbeat.beat(at_s), at_s + 1.5 * TRIP_S, IDLE)
         assert heartbeat.condition(2.3).round_trip_s == pytest.approx(known_s)
 
 
@@ -132,9 +146,9 @@ def test_one_that_an_outage_held_up_is_no_round_trip(reply_first: bool) -> None:
     held = [heartbeat.beat(at_s), heartbeat.beat(at_s + 0.4)]
     back_s = at_s + 0.5
     if reply_first:
-        heartbeat.hear(back_s, queue=0)
+        heartbeat.hear(back_s, IDLE)
     for number in held:
-        heartbeat.answer(number, back_s, 0)
+        heartbeat.answer(number, back_s, IDLE)
     assert heartbeat.condition(back_s).round_trip_s == pytest.approx(TRIP_S)
     assert heartbeat.due_s == back_s
 
@@ -146,7 +160,7 @@ def test_silence_begins_after_the_limit_and_ends_with_a_word() -> None:
     unanswered = heartbeat.beat(at_s)
     assert not heartbeat.condition(at_s + 0.99 * SILENT_S).silent
     assert heartbeat.condition(at_s + 1.01 * SILENT_S).silent
-    heartbeat.answer(unanswered, at_s + 0.4, 0)
+    heartbeat.answer(unanswered, at_s + 0.4, IDLE)
     assert not heartbeat.condition(at_s + 0.4).silent
 
 
@@ -155,7 +169,7 @@ def test_any_answer_of_the_server_breaks_the_silence() -> None:
     heartbeat = beating(2.0)
     at_s = heartbeat.due_s
     heartbeat.beat(at_s)
-    heartbeat.hear(at_s + 0.4, queue=7)
+    heartbeat.hear(at_s + 0.4, Told(7))
     condition = heartbeat.condition(at_s + 0.5)
     assert (condition.silent, condition.queue) == (False, 7)
     assert heartbeat.condition(at_s + 0.4 + 1.01 * SILENT_S).silent
@@ -169,7 +183,7 @@ def test_an_answer_that_is_late_holds_the_site_up_for_as_long_again() -> None:
     late_s = TRIP_S + SLACK_S
     assert heartbeat.condition(at_s + 0.99 * late_s).wait_s == 0
     assert heartbeat.condition(at_s + 1.01 * late_s).wait_s == pytest.approx(1.01 * late_s)
-    heartbeat.answer(unanswered, at_s + 0.2, 0)
+    heartbeat.answer(unanswered, at_s + 0.2, IDLE)
     assert heartbeat.condition(at_s + 0.2).wait_s == 0
     first = Heartbeat(EVERY_S)
     first.start(0.0)
@@ -194,7 +208,7 @@ def test_a_link_that_is_always_slow_is_not_silent() -> None:
     for step in range(4_000):
         now_s = step * 0.01
         while out and out[0][0] <= now_s:
-            heartbeat.answer(out.pop(0)[1], now_s, 0)
+            heartbeat.answer(out.pop(0)[1], now_s, IDLE)
         if heartbeat.due_s <= now_s:
             out.append((now_s + 1.0, heartbeat.beat(now_s)))
         if now_s > 5.0:
@@ -221,9 +235,9 @@ def test_an_answer_settles_those_before_it() -> None:
     """They come back in order: older ones are lost, and no silence is counted from them."""
     heartbeat = beating(2.0)
     lost = heartbeat.beat(2.1)
-    heartbeat.answer(heartbeat.beat(2.3), 2.33, 0)
+    heartbeat.answer(heartbeat.beat(2.3), 2.33, IDLE)
     assert not heartbeat.condition(60.0).silent
-    heartbeat.answer(lost, 9.0, queue=99)
+    heartbeat.answer(lost, 9.0, Told(99))
     assert heartbeat.condition(9.0).queue == 0, "an answer that is not waited for"
 
 
@@ -235,5 +249,5 @@ def test_a_lost_connection_leaves_nothing() -> None:
     assert heartbeat.due_s == float("inf")
     assert heartbeat.condition(9.0) == Heartbeat(0.0).condition(0.0)
     heartbeat.start(10.0)
-    heartbeat.answer(old, 10.1, 9)
+    heartbeat.answer(old, 10.1, Told(9))
     assert heartbeat.condition(10.1).round_trip_s is None

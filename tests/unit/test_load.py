@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from robot_client import load
-from robot_client.load import EVERY_S, HURRIED_S, LOOKED_UP_EVERY, TICK_S, Load, LoadWatch
+from common import load
+from common.load import EVERY_S, HURRIED_S, LOOKED_UP_EVERY, TICK_S, Load, LoadWatch
 from tests.unit.test_cpu import Machine
 
 CPUS = os.cpu_count() or 1
@@ -190,6 +190,19 @@ def test_the_capacity_is_what_quota_and_clock_leave(machine: Machine, times: Tim
     assert one.capacity == 0.75
 
 
+def test_what_the_workers_of_this_process_take_is_no_load(tmp_path: Path, times: Times) -> None:
+    """Whoever asks says what is his own."""
+    host = Host(tmp_path)
+    own_s = 5.0
+    one = Load(host.root / "self", host.root, own_s=lambda: own_s)
+    one.share()
+    for n in range(1, 11):
+        later(times, EVERY_S)
+        own_s = 5.0 + 0.4 * n
+        host.busy_s(0.4 * n)
+        assert one.share() == pytest.approx(0.0, abs=2 * TICK_S / EVERY_S)
+
+
 def test_a_group_that_counts_nothing_is_the_sum_of_its_processes(machine: Machine, times: Times) -> None:
     """Quota and count in other hierarchies: CPU times come from /proc/PID/stat, odd names too."""
     limited = machine.mount("cpu", "cgroup", "rw,cpu")
@@ -219,18 +232,21 @@ def test_a_group_that_counts_nothing_is_the_sum_of_its_processes(machine: Machin
 
 
 def test_a_watch_reads_in_a_thread_of_its_own() -> None:
-    """Whoever looks at it only takes what was read; nothing is read before the first look, or once closed."""
+    """But for the first look, as nothing is read before; once it is closed nothing is read either."""
     counted = Counted(Path("/proc/self"))
     watch = LoadWatch(counted)
     assert counted.read_by == []
     until = time.monotonic() + 10
-    while watch.latest()[0] < 2:
+    assert watch.latest()[0] == 1
+    while watch.latest()[0] < 3:
         assert time.monotonic() < until
         time.sleep(0.01)
-    assert threading.current_thread() not in counted.read_by
+    first, second, *_ = counted.read_by
+    assert first is threading.current_thread()
+    assert counted.read_by.count(first) == 1
     watch.close()
-    counted.read_by[0].join(10)
-    assert not counted.read_by[0].is_alive()
+    second.join(10)
+    assert not second.is_alive()
 
 
 def test_who_hurries_reads_at_once_and_not_too_often(tmp_path: Path, times: Times) -> None:

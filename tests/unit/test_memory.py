@@ -275,6 +275,32 @@ def test_what_was_learnt_on_half_a_cpu_tells_of_a_whole_one() -> None:
     assert outlook(published, ONBOARD).predicted_s == pytest.approx(0.2)
 
 
+def test_what_a_server_takes_while_others_have_its_cpu_is_learnt_apart() -> None:
+    """At the first time under load it is expected to need longer; what it needs alone stays what it was."""
+    one, alone = memory(), Condition(round_trip_s=0.03)
+    busy = Condition(round_trip_s=0.03, server_load=1.0)
+    for _ in range(20):
+        learn(one, Execution(CLOUD, 0.05), condition=alone)
+    assert (outlook(one, condition=busy).predicted_s or 0) > 1.2 * 0.05
+    for _ in range(5):
+        learn(one, Execution(CLOUD, 0.13), condition=busy)
+    assert outlook(one, condition=busy).predicted_s == pytest.approx(0.13, rel=0.02)
+    assert outlook(one, condition=alone).predicted_s == pytest.approx(0.05, rel=0.02)
+
+
+def test_half_of_a_servers_cpu_doubles_its_part_and_not_the_way_there() -> None:
+    """What was learnt before and after tells of the same server."""
+    one = memory()
+    for _ in range(20):
+        learn(one, Execution(CLOUD, 0.07), condition=Condition(round_trip_s=0.03))
+    held = Condition(round_trip_s=0.03, capacity=0.5)
+    assert outlook(one, condition=held).predicted_s == pytest.approx(0.03 + 2 * 0.04, rel=0.02)
+    for _ in range(20):
+        learn(one, Execution(CLOUD, 0.11), condition=held)
+    whole = outlook(one, condition=Condition(round_trip_s=0.03))
+    assert whole.predicted_s == pytest.approx(0.07, rel=0.02)
+
+
 def test_a_server_that_is_first_used_by_a_loaded_robot_gets_known() -> None:
     """Else the warm-up would not end while the load lasts."""
     one = memory()

@@ -357,6 +357,38 @@ def test_late_tasks_are_learnt_with_the_load_that_made_them_late() -> None:
         assert offload.last.sites[CLOUD].predicted_s == pytest.approx(0.01, rel=0.2)
 
 
+@pytest.mark.parametrize(
+    ("busy", "seconds"), [(Condition(server_load=1.0), 0.05), (Condition(capacity=0.2), 0.05)]
+)
+def test_late_tasks_are_learnt_with_what_the_server_said_in_its_answer(
+    busy: Condition, seconds: float
+) -> None:
+    """Others took its CPU, or it was held to a part of it, after the task was sent: alone it is as before."""
+    cloud = cloud_answers()
+    takes: Iterator[float] = itertools.cycle([0.009, 0.01, 0.011])
+
+    def answer(one: Task) -> Execution:
+        cloud.measured = says
+        return Execution(CLOUD, next(takes), one.args)
+
+    cloud.script, says = answer, UNMEASURED
+    home = ScriptedRunner(ONBOARD, lambda one: Execution(ONBOARD, 0.05, one.args))
+    with Offloader(
+        [home, cloud], policy=policies.make(CLOUD), predictor=lambda: predictors.make("average", 50)
+    ) as offload:
+        for _ in range(60):
+            offload(add_one, 2)
+        takes, says = itertools.repeat(seconds), busy
+        for _ in range(6):
+            cloud.measured = UNMEASURED  # as it was said before
+            offload(add_one, 2)
+        cloud.measured = says = UNMEASURED
+        takes = itertools.repeat(0.01)
+        offload(add_one, 2)
+        assert offload.last is not None
+        assert offload.last.sites[CLOUD].predicted_s == pytest.approx(0.01, rel=0.2)
+
+
 @pytest.mark.parametrize(("capacity", "seconds"), [(0.2, 0.02), (1.0, 0.004)])
 def test_odd_tasks_are_learnt_with_the_capacity_that_made_them_odd(capacity: float, seconds: float) -> None:
     """Held, or set free, since its CPU was last looked at, a robot is as quick as before for that CPU."""

@@ -7,18 +7,21 @@ from pathlib import Path
 import pytest
 
 from common.errors import Overtaken
+from common.load import SERVER_EVERY_S
 from loadgen.relay.link import LinkConditions
-from loadgen.scenario import read_scenario
+from loadgen.scenario import CloudPart, read_scenario
 from loadgen.simulation.clock import VirtualClock
 from loadgen.simulation.costs import HASH
 from loadgen.simulation.lockstep import LockstepClock
 from loadgen.simulation.processor import Processor, Run
+from loadgen.simulation.server import Server
 from loadgen.simulation.tasks import find_tasks
 from loadgen.simulation.way import Way
 from loadgen.simulation.world import World
 from loadgen.testbed import ROBOT
 from loadgen.timeline import Event
 from robot_client import predictors
+from robot_client.heartbeat import Told
 from robot_client.offloader import Offloader
 from robot_client.policies import Decision, Forecast
 from robot_client.trace import Record
@@ -99,6 +102,20 @@ def test_work_shares_the_quota_with_hogs() -> None:
     clock.pass_by(9.0)
     assert ended == [(0.0, 0.0, pytest.approx(3.0)), (0.0, pytest.approx(3.0), pytest.approx(5.0))]
     assert (processor.own_s, processor.others_s) == (pytest.approx(2.0), pytest.approx(0.5))
+
+
+def test_a_server_knows_what_hogs_take_of_its_cpu() -> None:
+    """As it reads it ten times a second, and the quota that it has then."""
+    clock = VirtualClock()
+    server = Server(clock, CloudPart(cpus=1.0))
+    clock.pass_by(1.0)
+    assert server.told == Told(0, 0.0, 1.0)
+    server.processor.change(hogs=3, cpus=0.5)
+    clock.pass_by(2 * SERVER_EVERY_S)
+    assert server.told == Told(0, 1.0, 0.5)
+    server.processor.change(hogs=0, cpus=2.0)
+    clock.pass_by(2 * SERVER_EVERY_S)
+    assert server.told == Told(0, 0.0, 1.0)
 
 
 def test_workers_share_it_among_them_too() -> None:

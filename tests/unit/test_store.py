@@ -61,7 +61,9 @@ class Robot:
 
         runner = ScriptedRunner(name, script)
         runner.measured = (
-            Condition(round_trip_s=0.02, queue=1) if name != ONBOARD else Condition(load=0.4, capacity=0.5)
+            Condition(round_trip_s=0.02, queue=1, server_load=0.2)
+            if name != ONBOARD
+            else Condition(load=0.4, capacity=0.5)
         )
         return runner
 
@@ -338,7 +340,7 @@ def test_a_file_of_before_capacities_is_read(robot: Robot) -> None:
     whole = json.loads(robot.path.read_bytes())
     for site in whole["kinds"]["store_plain"]["sites"].values():
         for one in site["observations"]:
-            del one["condition"]["capacity"]
+            del one["condition"]["capacity"], one["condition"]["server_load"]
     robot.path.write_text(json.dumps(whole))
     with robot.started() as offload:
         assert robot.outlooks(offload)[ONBOARD].predicted_s == before[ONBOARD].predicted_s

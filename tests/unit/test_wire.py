@@ -60,6 +60,11 @@ GOLDEN: list[tuple[wire.Message, str]] = [
     ),
     (Ping(1), "9301a470696e6781a2696401"),
     (Pong(1, 2), "9301a4706f6e6782a2696401ab71756575655f646570746802"),
+    (
+        Pong(1, 0, 0.5, 0.25),
+        "9301a4706f6e6784a2696401ab71756575655f646570746800a46c6f6164cb3fe0000000000000"
+        "a86361706163697479cb3fd0000000000000",
+    ),
     (Cancel(2**63 - 1), "9301a663616e63656c81a26964cf7fffffffffffffff"),
     (Blob(b"map"), "9301a4626c6f6280|6d6170"),
 ]
@@ -100,6 +105,24 @@ def test_a_reply_without_cpu_time_is_as_it_was() -> None:
     reply = wire.unpack([msgpack.packb([1, "reply", REPLY]), b"\xc0"])
     assert isinstance(reply, Reply)
     assert reply.cpu_s is None
+
+
+def test_a_server_that_does_not_say_how_its_cpu_is_is_idle() -> None:
+    """One of before these fields, and one that has nothing to say: an idle machine's are not sent."""
+    assert wire.unpack([msgpack.packb([1, "pong", {"id": 5, "queue_depth": 2}])]) == Pong(5, 2, 0.0, 1.0)
+    for message in (Pong(5, 2), Reply(7, "busy")):
+        assert not any(field in wire.pack(message)[0] for field in (b"load", b"capacity"))
+
+
+@pytest.mark.parametrize("field", ["load", "capacity"])
+@pytest.mark.parametrize("share", [-0.01, 1.01, float("nan"), "1", True, None])
+def test_what_is_no_share_of_a_cpu_is_refused(field: str, share: Any) -> None:
+    """Times are multiplied and divided by it: a capacity of 0 is refused too."""
+    for name, fields, rest in (("pong", {"id": 5, "queue_depth": 2}, []), ("reply", REPLY, [b"\xc0"])):
+        assert wire.unpack([msgpack.packb([1, name, fields | {field: 1}]), *rest])
+        for wrong in (share, 0) if field == "capacity" else (share,):
+            with pytest.raises(ProtocolError, match=rf"{name}\.{field}"):
+                wire.unpack([msgpack.packb([1, name, fields | {field: wrong}]), *rest])
 
 
 @pytest.mark.parametrize("cpu_s", [-1e-9, float("nan"), float("inf"), 1e7, "1", True, None])

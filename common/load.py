@@ -1,4 +1,4 @@
-"""What the robot's CPU can do now, and how much of it other programs take: features of onboard times.
+"""What the CPU can do now, and how much of it other programs take: features of the times of tasks.
 
 In a container, or wherever else a CPU quota holds, the CPU is the quota: what others of the group use is
 missing to this process, and so is the time that all of them are throttled for.
@@ -8,11 +8,13 @@ import contextlib
 import os
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from common.cpu import QuotaGroup, parse_usage, quota_group, read_small
 
-EVERY_S = 0.5  # read no more often: a reading costs more than a decision
+EVERY_S = 0.5  # by a robot, and no more often: a reading costs more than a decision
+SERVER_EVERY_S = 0.1  # by a server, for all of its robots
 HURRIED_S = 0.05  # but so often where it may just have changed; what a shorter time tells is ticks
 LOOKED_UP_EVERY = 8  # readings: how often it is looked up whether there is a quota, and how clocks are held
 FREE_MIN = 0.1  # of the CPU: where this process leaves less to others, what they take says nothing
@@ -25,12 +27,20 @@ TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 class Load:
     """Reads the CPU time of all that shares the CPU with the process at `proc` (/proc/self).
 
+    `own_s`: CPU seconds of what is not others; None: of this process.
     `capacity`: so much of one CPU at full clock may a thread use, above 0 to 1, by the quota and by how low
     the clock is held, as where it gets hot (cpufreq's scaling_max_freq).
     """
 
-    def __init__(self, proc: Path, root: Path = Path("/proc"), clocks: Path = CLOCKS) -> None:
+    def __init__(
+        self,
+        proc: Path,
+        root: Path = Path("/proc"),
+        clocks: Path = CLOCKS,
+        own_s: Callable[[], float] | None = None,
+    ) -> None:
         self.capacity = 1.0
+        self._ours_s = own_s or time.process_time
         self._proc = proc
         self._root = root
         self._clocks = clocks
@@ -60,7 +70,7 @@ class Load:
         self._readings += 1
         cpus = self._quota() or float(os.cpu_count() or 1)
         self.capacity = self._clock * min(1.0, cpus)
-        own_s = time.process_time()
+        own_s = self._ours_s()
         others_s = self._total_s() - own_s
         took_s, left_s = others_s - self._others_s, cpus * since_s - (own_s - self._own_s)
         self._others_s, self._own_s, self._read_at_s = others_s, own_s, now_s
@@ -107,14 +117,15 @@ class Load:
 
 
 class LoadWatch:
-    """Reads a load every EVERY_S in a thread of its own, from the first look at it on.
+    """Reads a load at the first look at it, and from then on every `every_s` in a thread of its own.
 
     A process that asks for its CPU time is charged what it owes, and waits there for its quota: a thread that
     decides must not be the one to ask.
     """
 
-    def __init__(self, load: Load) -> None:
+    def __init__(self, load: Load, every_s: float = EVERY_S) -> None:
         self._load = load
+        self._every_s = every_s
         self._latest = (0.0, 1.0)
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="load", daemon=True)
@@ -126,6 +137,7 @@ class LoadWatch:
         if self._thread.ident is None:
             with self._starting:
                 if self._thread.ident is None and not self._closed.is_set():
+                    self._read()
                     self._thread.start()
         return self._latest
 
@@ -141,11 +153,9 @@ class LoadWatch:
         self._closed.set()
 
     def _run(self) -> None:
-        while True:
+        while not self._closed.wait(self._every_s):
             with self._reading:
                 self._read()
-            if self._closed.wait(EVERY_S):
-                return
 
     def _read(self) -> None:
         self._latest = (self._load.share(HURRIED_S), self._load.capacity)
