@@ -37,6 +37,8 @@ class Metrics:
         self.bytes_in = Counter("offboard_bytes_in", "Bytes of messages received", registry=r)
         self.bytes_out = Counter("offboard_bytes_out", "Bytes of messages sent", registry=r)
         self.blob_bytes = Gauge("offboard_blob_bytes", "Bytes of large arguments kept", registry=r)
+        self.load = Gauge("offboard_load", "Share of the CPU that other programs take", registry=r)
+        self.capacity = Gauge("offboard_capacity", "So much of one CPU may a task use", registry=r)
         self.dropped = Counter(
             "offboard_dropped", "Messages not understood, and answers nobody took", ["reason"], registry=r
         )

@@ -111,6 +111,8 @@ class Server:
         metrics.queue_depth.set_function(lambda: len(self._waiting))
         metrics.running.set_function(lambda: len(self._running))
         metrics.blob_bytes.set_function(lambda: self._blobs.byte_count)
+        metrics.load.set_function(lambda: self._load.latest()[0])
+        metrics.capacity.set_function(lambda: self._load.latest()[1])
 
     def run(self) -> bool:
         """Serve until drained; True when everything that was accepted has been answered."""

@@ -247,8 +247,9 @@ def test_hello_and_ping_are_answered(serve: Serve, join: Join) -> None:
 
 @pytest.mark.parametrize("executor", sorted(EXECUTORS))
 def test_a_server_says_that_others_take_its_cpu(serve: Serve, join: Join, executor: str) -> None:
-    """In pongs and in replies, soon after other programs began to compute on all of its CPUs."""
-    peer = join(serve(executor).server.endpoint)
+    """In pongs, replies and metrics, soon after other programs began to compute on all of its CPUs."""
+    running = serve(executor)
+    peer = join(running.server.endpoint)
     with ExitStack() as stack:
         for _ in range(os.cpu_count() or 1):
             busy = stack.enter_context(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
@@ -263,6 +264,7 @@ def test_a_server_says_that_others_take_its_cpu(serve: Serve, join: Join, execut
             load = pong.load
         peer.request(2, "served_zeros", 3)
         assert peer.reply().load > 0
+        assert running.counted("load") > 0
 
 
 @pytest.mark.parametrize("executor", sorted(EXECUTORS))
