@@ -37,6 +37,7 @@ class Heartbeat:
         self._own_runs = own_runs or OwnRuns()
         self._random = Random(seed)
         self._next_id = 0
+        self._round_trip_s: float | None = None
         self.stop()
 
     def start(self, now_s: float) -> None:
@@ -46,17 +47,16 @@ class Heartbeat:
             self.due_s = now_s
 
     def stop(self) -> None:
-        """The connection is gone: nothing is known of the next one."""
+        """The connection is gone: nothing is known of the next one until it tells but the last round trip."""
         self.due_s = float("inf")
         self._sent: dict[int, float] = {}
         self._oldest_s = float("inf")  # when the first that is unanswered was sent
         self._heard_s = -float("inf")
         self._recent: deque[float] = deque(maxlen=BESIDE_LEAST_OF)
-        self._round_trip_s: float | None = None
         self._smooth_s = self._varies_s = 0.0
         self._back_s = -float("inf")  # when the site was last heard again
         self._told = Told()
-        self._usual = Condition()  # while no answer is waited for
+        self._usual = self._condition()  # while no answer is waited for
 
     @property
     def unanswered(self) -> int:

@@ -24,9 +24,7 @@ from robot_client.under_load import UnderLoad
 
 AMOUNT_RATE = 0.1  # of the bytes and CPU seconds that a task usually takes
 OBSERVATIONS_MAX = 200  # of a site, kept for `store`
-LOADED = (
-    0.3  # of the robot's CPU taken by others: from there on all times tell of that; the same of a server's
-)
+LOADED = 0.3  # of the robot's CPU, or a server's, taken by others: from there on times tell of that
 LOADED_FROM = 10  # times of a site: the first ones are all learnt as one
 
 log = logging.getLogger(__name__)
@@ -123,8 +121,8 @@ class SiteMemory:
 
     What it takes while the robot is LOADED is learnt apart: the robot is slow to run, to send and to hear
     then, by more than a gain on the load tells, and everything is as quick as before once that is over. A
-    server's round trip tells of the robot then, and is taken to be what it was before. So is what a server
-    takes while others have its CPU, beyond the round trip.
+    server's round trip tells of the robot then, and is taken to be what it was before. What a server takes
+    beyond the round trip while it is LOADED itself is learnt apart too.
     """
 
     def __init__(
@@ -204,7 +202,8 @@ class SiteMemory:
         if found is None:
             return None
         way_s = condition.round_trip_s or 0.0
-        return found._replace(seconds=way_s + self._server_under_load.expect(found.seconds - way_s))
+        alone_s = max(0.0, found.seconds - way_s)
+        return found._replace(seconds=way_s + self._server_under_load.expect(alone_s))
 
     def learn(
         self,
@@ -291,7 +290,8 @@ class SiteMemory:
             alone, way_s = replace(one.condition, server_load=0.0), one.condition.round_trip_s or 0.0
             found = _foretold(self._conditional, one.amount, 1, self._seen(alone))
             if found is not None:
-                self._server_under_load.learn(found.seconds - way_s, max(0.0, one.seconds - way_s))
+                alone_s, took_s = (max(0.0, seconds - way_s) for seconds in (found.seconds, one.seconds))
+                self._server_under_load.learn(alone_s, took_s)
         else:
             held_s = max(0.0, one.seconds - (one.condition.round_trip_s or 0.0))  # to that capacity
             seconds = one.seconds - held_s * (1.0 - one.condition.capacity)

@@ -14,6 +14,7 @@ from robot_client.heartbeat import (
     Told,
 )
 from robot_client.own_runs import LATE_MAX, OwnRuns
+from robot_client.runner import Condition
 
 TRIP_S = 0.03
 IDLE = Told()
@@ -241,13 +242,16 @@ def test_an_answer_settles_those_before_it() -> None:
     assert heartbeat.condition(9.0).queue == 0, "an answer that is not waited for"
 
 
-def test_a_lost_connection_leaves_nothing() -> None:
-    """After stop nothing is due or known, and an old answer is nobody's; a start begins afresh."""
+def test_a_lost_connection_leaves_its_round_trip_alone() -> None:
+    """After stop nothing is due, and an old answer is nobody's; the next connection is not taken for no way
+    at all until its first heartbeat is answered."""
     heartbeat = beating(2.0, queue=4)
     old = heartbeat.beat(2.1)
     heartbeat.stop()
     assert heartbeat.due_s == float("inf")
-    assert heartbeat.condition(9.0) == Heartbeat(0.0).condition(0.0)
+    assert heartbeat.condition(9.0) == Condition(pytest.approx(TRIP_S))
     heartbeat.start(10.0)
     heartbeat.answer(old, 10.1, Told(9))
-    assert heartbeat.condition(10.1).round_trip_s is None
+    assert heartbeat.condition(10.1) == Condition(pytest.approx(TRIP_S))
+    heartbeat.answer(heartbeat.beat(10.2), 10.4, IDLE)
+    assert heartbeat.condition(10.5).round_trip_s == pytest.approx(0.2)
