@@ -49,8 +49,8 @@ class Conformal:
         """Take what came of a prediction."""
         if self._count:
             score = (seconds - predicted_s) / self._unit(predicted_s)
-            if self.known:
-                low, high = self._interval()
+            if len(self._sorted) >= SCORES_MIN:
+                low, high = self._ends or self._interval()
                 self._adapt(missed=not low <= score <= high)
             self._add(score)
         self._count = min(self._count + 1, SCORES_MAX)
@@ -63,11 +63,11 @@ class Conformal:
 
     def interval(self, predicted_s: float, spread_s: float | None) -> tuple[float, float] | None:
         """Lower and upper end of the COVERAGE interval; None while nothing tells."""
-        if not self.known:
+        if len(self._sorted) < SCORES_MIN:
             if spread_s is None:
                 return None
             return max(0.0, predicted_s - NORMAL_90 * spread_s), predicted_s + NORMAL_90 * spread_s
-        unit, (low, high) = self._unit(predicted_s), self._interval()
+        unit, (low, high) = self._unit(predicted_s), self._ends or self._interval()
         low_s = predicted_s + unit * low if low < 0 else predicted_s
         high_s = predicted_s + unit * high if high > 0 else predicted_s
         return (low_s if low_s > 0 else 0.0), (high_s if high_s > 0 else 0.0)
@@ -124,8 +124,7 @@ class Conformal:
         self._ends = self._tail = None
 
     def _interval(self) -> tuple[float, float]:
-        if self._ends is None:
-            self._ends = _shortest(self._sorted, 1 - self._outside)
+        self._ends = _shortest(self._sorted, 1 - self._outside)
         return self._ends
 
 

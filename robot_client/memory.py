@@ -7,7 +7,7 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from common.errors import Overtaken, TaskError
 from common.tasks import Kind
@@ -198,7 +198,7 @@ class SiteMemory:
         """But for what others take of a server's CPU, and what `model` knows of loads."""
         if condition.server_load <= LOADED or not self._server_under_load.known:
             return _foretold(model, amount, self.age + 1, self._seen(condition))
-        found = _foretold(model, amount, self.age + 1, self._seen(replace(condition, server_load=0.0)))
+        found = _foretold(model, amount, self.age + 1, self._seen(condition._replace(server_load=0.0)))
         if found is None:
             return None
         way_s = condition.round_trip_s or 0.0
@@ -282,12 +282,12 @@ class SiteMemory:
             self._conformal.miss()
         if self._conditional is None:
             self.predictor.learn(one.amount, one.seconds)
-        elif len(self.predictor) >= LOADED_FROM and one.condition.load > LOADED:
+        elif one.condition.load > LOADED and len(self.predictor) >= LOADED_FROM:
             found = self._unloaded(self._conditional, one.amount, self._quiet(one.condition))
             if found is not None:
                 self._under_load.learn(found.seconds, one.seconds)
-        elif len(self.predictor) >= LOADED_FROM and one.condition.server_load > LOADED:
-            alone, way_s = replace(one.condition, server_load=0.0), one.condition.round_trip_s or 0.0
+        elif one.condition.server_load > LOADED and len(self.predictor) >= LOADED_FROM:
+            alone, way_s = one.condition._replace(server_load=0.0), one.condition.round_trip_s or 0.0
             found = _foretold(self._conditional, one.amount, 1, self._seen(alone))
             if found is not None:
                 alone_s, took_s = (max(0.0, seconds - way_s) for seconds in (found.seconds, one.seconds))
@@ -299,12 +299,12 @@ class SiteMemory:
 
     def _quiet(self, condition: Condition) -> Condition:
         """What it would be without the load."""
-        return replace(condition, load=0.0, round_trip_s=self._round_trip_s or condition.round_trip_s)
+        return condition._replace(load=0.0, round_trip_s=self._round_trip_s or condition.round_trip_s)
 
     def _seen(self, condition: Condition) -> Condition:
         """By the predictors, to which a site's load is that of its own CPU."""
         load = condition.load if self._site == ONBOARD else condition.server_load
-        return condition if condition.load == load else replace(condition, load=load)
+        return condition if condition.load == load else condition._replace(load=load)
 
     def _use(self, moved: float, cpu_s: float | None) -> None:
         self._bytes.add(moved)

@@ -2,8 +2,8 @@
 
 import json
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from common import VERSION as SOFTWARE
@@ -41,9 +41,13 @@ def encode(kinds: Mapping[str, KeptKind]) -> bytes:
     whole = {
         "v": FORMAT,
         "software": SOFTWARE,
-        "kinds": {name: asdict(kind) for name, kind in kinds.items()},
+        "kinds": {name: asdict(kind, dict_factory=_plain) for name, kind in kinds.items()},
     }
     return json.dumps(whole, separators=(",", ":")).encode() + b"\n"
+
+
+def _plain(fields: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    return {name: one._asdict() if isinstance(one, Condition) else one for name, one in fields}
 
 
 def decode(text: bytes) -> dict[str, KeptKind]:
@@ -93,7 +97,7 @@ def _observation(given: Any) -> Observation:
 
 
 def _condition(given: Any) -> Condition:
-    unknown = given.keys() - {field.name for field in fields(Condition)}
+    unknown = given.keys() - set(Condition._fields)
     if unknown:
         raise ValueError(f"condition {sorted(unknown)[0]!r} is not known")
     return Condition(

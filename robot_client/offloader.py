@@ -383,10 +383,10 @@ class Offloader:
         """Onboard runs one task at a time; a server's queue may not know yet of what was sent to it."""
         flights = self._flights[site].values()
         if site != ONBOARD:
-            return replace(condition, queue=max(condition.queue, len(flights)))
+            return condition._replace(queue=max(condition.queue, len(flights)))
         now_s = self._clock.now_s()
         left_s = [one.left_s(now_s) for one in flights]
-        return replace(condition, wait_s=sum(left_s))
+        return condition._replace(wait_s=sum(left_s))
 
     def _decide(
         self, kind: Kind, forecast: Forecast, absent: dict[str, str], where: str | None, policy: Policy
@@ -425,13 +425,13 @@ class Offloader:
         if not memory.site(site).conditional:
             return UNMEASURED
         condition = self._measured(site)
-        return replace(condition, queue=max(0, condition.queue - own))
+        return condition._replace(queue=max(0, condition.queue - own))
 
     def _measured(self, site: str) -> Condition:
         """Of a server too the load of the robot, where that is what its times tell of."""
         condition = self._runners[site].condition()
         if site != ONBOARD and (load := self._load(site)):
-            return replace(condition, load=load)
+            return condition._replace(load=load)
         return condition
 
     def _check_where(self, kind: Kind, where: str) -> None:
@@ -517,9 +517,9 @@ class Offloader:
         self._flights[site].pop(asked.task.id, None)
         if self._closed:  # what was given up at the end says nothing of the site
             return
-        self._allowance.spend(
-            execution.bytes_out + execution.bytes_in if site != ONBOARD else 0, memory.joules(execution)
-        )
+        if self._allowance.capped:
+            moved = 0 if site == ONBOARD else execution.bytes_out + execution.bytes_in
+            self._allowance.spend(moved, memory.joules(execution))
         silent = not execution.ok and memory.conditional and self._held_up(site)
         amount = asked.amount if work is None else work
         outlook = asked.forecast.sites.get(site)
@@ -556,7 +556,7 @@ class Offloader:
             capacity = min(capacity, now) if later else max(capacity, now)
         if (load, capacity) == (before.load, before.capacity):
             return outlook
-        return replace(outlook, condition=replace(before, load=load, capacity=capacity))
+        return replace(outlook, condition=before._replace(load=load, capacity=capacity))
 
     def _as_the_server_says(self, site: str, outlook: Outlook, *, later: bool) -> Outlook:
         """In its answer to what was late, or early."""
@@ -564,7 +564,7 @@ class Offloader:
         worse, better = (max, min) if later else (min, max)
         load = worse(before.server_load, now.server_load)
         capacity = better(before.capacity, now.capacity)
-        return replace(outlook, condition=replace(before, server_load=load, capacity=capacity))
+        return replace(outlook, condition=before._replace(server_load=load, capacity=capacity))
 
     def _load(self, site: str) -> float:
         """Of the robot; of a server only where its times tell of that."""

@@ -2,7 +2,7 @@
 
 import re
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from common.errors import ConfigError, OffloadError
 
@@ -69,8 +69,7 @@ class Execution:
         return None if self.failure is None else f"{type(self.failure).__name__}: {self.failure}"
 
 
-@dataclass(frozen=True, slots=True)
-class Condition:
+class Condition(NamedTuple):
     """What is measured of a site beside the times of its tasks: the features of a prediction.
 
     `round_trip_s` is that of its heartbeats (None: it has none); `silent`: they go unanswered; `queue`: tasks

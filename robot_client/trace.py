@@ -82,9 +82,9 @@ class Record:
     started_at: datetime = field(default_factory=lambda: datetime.now(UTC))
 
 
-_CONDITION_FIELDS, _DECISION_FIELDS, _LATE_FIELDS, _REGRET_FIELDS = (
+_DECISION_FIELDS, _LATE_FIELDS, _REGRET_FIELDS = (
     tuple("reason" if one.name == "why" else one.name for one in fields(of))
-    for of in (Condition, Decision, Late, Regret)
+    for of in (Decision, Late, Regret)
 )
 
 
@@ -167,7 +167,7 @@ def features(record: Record) -> dict[str, float]:
         found["work"] = record.amount
     for site, outlook in record.sites.items():
         if outlook.condition is not UNMEASURED:
-            for name, value in _values(outlook.condition, _CONDITION_FIELDS).items():
+            for name, value in zip(Condition._fields, outlook.condition, strict=True):
                 if value is not None:
                     found[f"{site}.{name}"] = value
     return found

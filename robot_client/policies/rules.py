@@ -118,6 +118,8 @@ def _compared(predicted: Mapping[str, float], site: str) -> str:
 
 def warm_up(forecast: Forecast, policy: str) -> Decision | None:
     """All sites but silent ones, while one of them has too few observations."""
+    if all(one.count >= WARM_UP for one in forecast.sites.values()):
+        return None
     heard = {site: one for site, one in forecast.sites.items() if not one.condition.silent}
     cold = [site for site, one in heard.items() if one.count < WARM_UP and not (one.full or one.in_flight)]
     if not cold or len(heard) == 1:

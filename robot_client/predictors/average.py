@@ -71,7 +71,7 @@ class Average(Conditional):
             self._exceed(seconds - high, high - low)
 
     def _learn(self, size: float, seconds: float, condition: Condition) -> None:
-        if len(self):
+        if len(self._seen):
             self._judge(self._each(size, condition), seconds)
         self._seen.learn(size, seconds)
         rest = max(0.0, seconds - (condition.round_trip_s or 0.0))
@@ -120,15 +120,15 @@ class Average(Conditional):
         unit = unit or scale.deviation
         if not unit:
             return
-        a, b, c = (min(abs(seconds - expected) / unit, ERROR_MAX) for expected in each)
-        x, y, z = self._errors
+        (a, b, c), (x, y, z) = each, self._errors
         x, y, z = self._errors = (
-            MEMORY * x + (1 - MEMORY) * a,
-            MEMORY * y + (1 - MEMORY) * b,
-            MEMORY * z + (1 - MEMORY) * c,
+            MEMORY * x + (1 - MEMORY) * min(abs(seconds - a) / unit, ERROR_MAX),
+            MEMORY * y + (1 - MEMORY) * min(abs(seconds - b) / unit, ERROR_MAX),
+            MEMORY * z + (1 - MEMORY) * min(abs(seconds - c) / unit, ERROR_MAX),
         )
         least = min(x, y, z)  # so that one weight is 1, and their sum never 0
-        x, y, z = (math.exp(SHARPNESS * (least - one)) for one in (x, y, z))
+        exp = math.exp
+        x, y, z = exp(SHARPNESS * (least - x)), exp(SHARPNESS * (least - y)), exp(SHARPNESS * (least - z))
         self._shares = x / (x + y + z), y / (x + y + z), z / (x + y + z)
 
     def _exceed(self, beyond_s: float, clip: float) -> None:
