@@ -25,6 +25,7 @@ from robot_client.under_load import UnderLoad
 AMOUNT_RATE = 0.1  # of the bytes and CPU seconds that a task usually takes
 OBSERVATIONS_MAX = 200  # of a site, kept for `store`
 LOADED = 0.3  # of the robot's CPU, or a server's, taken by others: from there on times tell of that
+SMALL = 0.5  # of the least that a site ran: below it a prediction is a guess
 LOADED_FROM = 10  # times of a site: the first ones are all learnt as one
 
 log = logging.getLogger(__name__)
@@ -141,6 +142,7 @@ class SiteMemory:
         self._server_under_load = UnderLoad(onboard=True)
         self._site = site
         self._round_trip_s: float | None = None  # the last one without load
+        self._least = math.inf  # amount that it ran
         self._failures = 0
         self._conformal = Conformal()
         self._objective = objective
@@ -183,6 +185,7 @@ class SiteMemory:
             joules,
             condition,
             self._conformal,
+            amount is not None and amount < SMALL * self._least,
         )
 
     def _foresee(self, model: Conditional, amount: float, condition: Condition) -> Prediction | None:
@@ -275,6 +278,7 @@ class SiteMemory:
 
     def _take(self, one: Observation) -> None:
         self.observations.append(one)
+        self._least = min(self._least, one.amount)
         self._use(one.bytes, one.cpu_s)
         if one.predicted_s is not None and one.ok:
             self._conformal.learn(one.predicted_s, one.seconds + one.waited_s)

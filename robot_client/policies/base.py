@@ -21,7 +21,7 @@ class Outlook:
     rests on; `low_s`, `high_s`: its 90 % interval; `error_s`: the standard error of the prediction itself;
     `cost`: what the objective makes of it (None: nothing learnt); `in_flight`: tasks of any kind there now;
     `bytes` and `joules`: what running there is expected to take; `condition`: what was measured; `errors`:
-    those of the predictions so far.
+    those of the predictions so far; `smallest`: the site ran no task nearly as small as this one.
     """
 
     predicted_s: float | None
@@ -39,6 +39,7 @@ class Outlook:
     joules: float = 0.0
     condition: Condition = UNMEASURED
     errors: Conformal | None = None
+    smallest: bool = False
 
     def overdue_s(self, worth_s: float) -> float | None:
         """When a task that has not come back is expected to need more than `worth_s` still."""

@@ -22,7 +22,8 @@ class Probe:
 
     The first answer is used, and both times are learnt: nobody waits for what is only tried. A site whose
     heartbeats go unanswered is not tried: the first one that is answered says more. Onboard, where a run
-    takes the time of the tasks beside it, is tried more seldom, the more so the slower it is expected to be.
+    takes the time of the tasks beside it, is tried more seldom, the more so the slower it is expected to be;
+    but at once with a task that is far smaller than all it ran, which is soon over and not to be foretold.
     """
 
     def __init__(self, inner: Policy) -> None:
@@ -32,18 +33,19 @@ class Probe:
         decision = self._inner.decide(forecast)
         if decision.both or decision.second or forecast.duplicates < 1 + RESERVED:
             return decision
-        ages = {
-            site: one.age
-            for site, one in forecast.sites.items()
-            if one.age >= PROBE_EVERY
-            and site != decision.site
-            and one.age >= _probe_after(site, one, forecast.sites[decision.site])
-            and not one.in_flight
-            and not one.condition.silent
-        }
-        if not ages:
+        stalest, age = "", 0
+        for site, one in forecast.sites.items():
+            if (
+                one.age > age
+                and (one.age >= PROBE_EVERY or one.smallest)
+                and site != decision.site
+                and one.age >= _probe_after(site, one, forecast.sites[decision.site])
+                and not one.in_flight
+                and not one.condition.silent
+            ):
+                stalest, age = site, one.age
+        if not stalest:
             return decision
-        stalest = max(ages, key=ages.__getitem__)
         return replace(
             decision, second=stalest, second_after_s=0.0, why=f"{decision.reason}; {stalest} is probed"
         )
@@ -135,6 +137,8 @@ def _fits(forecast: Forecast, sites: Collection[str]) -> bool:
 
 def _probe_after(site: str, one: Outlook, chosen: Outlook) -> float:
     """Tasks without news of this site."""
+    if site == ONBOARD and one.smallest:
+        return 0.0
     if site != ONBOARD or not one.predicted_s or not chosen.predicted_s:
         return PROBE_EVERY
     return PROBE_EVERY * min(MEASURED * max(1.0, one.predicted_s / chosen.predicted_s), SELDOM_MAX)

@@ -153,6 +153,16 @@ def test_what_was_heard_beside_an_own_run_is_a_bound(
     assert outlook(one).predicted_s == pytest.approx(learnt_s, rel=0.05)
 
 
+def test_half_of_the_least_that_a_site_ran_is_no_guess() -> None:
+    """Only what is smaller is; nothing is too small for a site that ran such a task, or none."""
+    site = memory().site(CLOUD)
+    for ran, asked, smallest in ((None, 0.1, False), (1.0, 0.5, False), (1.0, 0.4, True), (0.4, 0.4, False)):
+        if ran is not None:
+            site.learn(ran, Execution(CLOUD, 0.2), None, silent=False, size=ran)
+        found = site.outlook(asked, UNMEASURED, in_flight=0, timeout_s=2.0)
+        assert found.smallest == smallest, (ran, asked)
+
+
 def test_own_runs_do_not_explain_what_is_far_later() -> None:
     """Beyond LATE_MAX times as long as expected it is learnt."""
     one = known()

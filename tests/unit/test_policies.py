@@ -172,6 +172,14 @@ def test_a_slow_robot_is_probed_more_seldom(onboard_s: float, after: float) -> N
         assert (decide("probe:greedy", sites).second == ONBOARD) == probed
 
 
+def test_a_task_smaller_than_all_it_ran_probes_the_robot() -> None:
+    """At once, however slow it is expected to be; a server is tried no sooner for that."""
+    onboard, cloud = known(0.3, age=1, smallest=True), known(0.1)
+    assert decide("probe:greedy", {ONBOARD: onboard, CLOUD: cloud}).second == ONBOARD
+    onboard, cloud = known(0.1), known(0.3, age=1, smallest=True)
+    assert decide("probe:greedy", {ONBOARD: onboard, CLOUD: cloud}).second is None
+
+
 def test_a_probe_leaves_a_second_run_to_hedges() -> None:
     """With one second run left a stale site is not probed, and the task may still be hedged."""
     sites = {ONBOARD: known(0.1), CLOUD: known(0.2, age=500)}
