@@ -27,6 +27,7 @@ OBSERVATIONS_MAX = 200  # of a site, kept for `store`
 LOADED = 0.3  # of the robot's CPU, or a server's, taken by others: from there on times tell of that
 SMALL = 0.5  # of the least that a site ran: below it a prediction is a guess
 LOADED_FROM = 10  # times of a site: the first ones are all learnt as one
+WAY_LEAST_OF = 4  # answers: the one that was on its way for the shortest tells how long the way is
 
 log = logging.getLogger(__name__)
 
@@ -143,6 +144,7 @@ class SiteMemory:
         self._site = site
         self._round_trip_s: float | None = None  # the last one without load
         self._least = math.inf  # amount that it ran
+        self._ways: deque[float] = deque(maxlen=WAY_LEAST_OF)  # seconds beyond round trip, queue and run
         self._failures = 0
         self._conformal = Conformal()
         self._objective = objective
@@ -246,11 +248,14 @@ class SiteMemory:
         behind = self.conditional and self._site == ONBOARD and outlook is not None and outlook.in_flight > 0
         waited_s = (execution.queue_s or 0.0) if behind else 0.0
         if beside and self._conditional is not None and amount is not None and condition.load <= LOADED:
-            bound_s = _bound_s(self._unloaded(self._conditional, amount, condition), execution, condition)
-            if bound_s is None:
+            found = self._unloaded(self._conditional, amount, condition)
+            alone_s = self._alone_s(found, execution, condition)
+            if alone_s is None:
                 self._use(moved, cpu_s)
                 return
-            seconds = bound_s
+            seconds = alone_s
+        elif execution.ok and condition.round_trip_s is not None:
+            self._ways.append(seconds - _least_s(execution, condition))
         held_up = condition.silent or (self._site != ONBOARD and condition.wait_s > 0)
         past = outlook is not None and outlook.high_s is not None and seconds > outlook.high_s
         interval = (execution.ok or (execution.censored and past)) and not held_up and not beside
@@ -268,6 +273,25 @@ class SiteMemory:
                 cpu_s,
             )
         )
+
+    def _alone_s(self, found: Prediction | None, execution: Execution, condition: Condition) -> float | None:
+        """What an execution would have taken had the robot not computed meanwhile; None: nobody knows.
+
+        By the shortest of the last ways there and back, as clocks are set by (RFC 5905, clock filter), unless
+        it took so long that it was late for another reason. Without heartbeats it is a bound.
+        """
+        seconds, least_s = execution.seconds, _least_s(execution, condition)
+        if not execution.ok:
+            return seconds
+        if condition.round_trip_s is not None:
+            self._ways.append(seconds - least_s)
+        if found is not None and not may_be_late(seconds, found.seconds):
+            return seconds
+        if condition.round_trip_s is not None:
+            return least_s + max(0.0, min(self._ways))
+        if found is None or seconds < found.seconds:
+            return seconds
+        return None if least_s <= found.seconds else least_s
 
     def recall(self, observations: Iterable[Observation], *, age: int) -> None:
         """Learn again what was learnt before, oldest first; it is as old as `age` tasks."""
@@ -327,17 +351,9 @@ class SiteMemory:
         return self._energy.remote_j(seconds, self._bytes.value)
 
 
-def _bound_s(found: Prediction | None, execution: Execution, condition: Condition) -> float | None:
-    """What to learn of a time that the robot's own runs may have made too long; None: nothing.
-
-    It took no longer than that, and no less than the server's part and a round trip. Of all times between
-    these bounds (interval censoring) the one that changes least of what is expected is learnt.
-    """
-    if not execution.ok or found is None or not may_be_late(execution.seconds, found.seconds):
-        return execution.seconds
-    least_s = (condition.round_trip_s or 0.0) + (execution.queue_s or 0.0) + (execution.run_s or 0.0)
-    bound_s = min(max(found.seconds, least_s), execution.seconds)
-    return None if bound_s == found.seconds else bound_s
+def _least_s(execution: Execution, condition: Condition) -> float:
+    """The server's part and a round trip: no answer is there sooner."""
+    return (condition.round_trip_s or 0.0) + (execution.queue_s or 0.0) + (execution.run_s or 0.0)
 
 
 def _foretold(model: Conditional, amount: float, ahead: int, condition: Condition) -> Prediction | None:

@@ -525,7 +525,7 @@ class Offloader:
         outlook = asked.forecast.sites.get(site)
         if memory.conditional and outlook is not None:
             outlook = self._in_hindsight(outlook, execution)
-        beside = site == decision.second and decision.site == ONBOARD
+        beside = site != ONBOARD and decision.site == ONBOARD and (decision.both or decision.second == site)
         memory.learn(
             amount, execution, outlook, silent=silent, size=asked.task.size, work=work, beside=beside
         )

@@ -48,14 +48,14 @@ def offloader(policy: str) -> Offloader:
     )
 
 
-@pytest.mark.timeout(30)  # traced, it takes some seconds
+@pytest.mark.timeout(60)  # traced, it takes some seconds
 @pytest.mark.parametrize("policy", ["paper", policies.DEFAULT])
 def test_memory_does_not_grow_with_the_tasks(policy: str) -> None:
-    """After 4,000 tasks as much is held as after 1,500."""
+    """After 7,500 tasks as much is held as after 5,000, when a site seldom used has all kept of it."""
     random, held = Random(1), []
     with offloader(policy) as offload:
         tracemalloc.start()
-        for count in (1_500, 2_500):
+        for count in (5_000, 2_500):
             for _ in range(count):
                 offload(footed, random.uniform(1, 5))
             gc.collect()

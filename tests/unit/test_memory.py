@@ -9,7 +9,7 @@ from common.errors import CloudBroken, CloudBusy, CloudError, CloudTimeout, Over
 from common.tasks import kind_of, task
 from robot_client import objectives, predictors
 from robot_client.energy import Energy
-from robot_client.memory import KindMemory
+from robot_client.memory import WAY_LEAST_OF, KindMemory
 from robot_client.own_runs import LATE_MAX
 from robot_client.policies import Outlook
 from robot_client.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
@@ -151,6 +151,17 @@ def test_what_was_heard_beside_an_own_run_is_a_bound(
         learn(one, Execution(CLOUD, seconds, run_s=run_s), beside=True)
         assert one.site(CLOUD).age == 0
     assert outlook(one).predicted_s == pytest.approx(learnt_s, rel=0.05)
+
+
+def test_probes_heard_late_lower_what_was_too_high() -> None:
+    """To the server's part, the round trip and the shortest of the last ways, though most were held up."""
+    one, near = memory(), Condition(round_trip_s=0.03)
+    for _ in range(20):
+        learn(one, Execution(CLOUD, 0.05, run_s=0.003), condition=near)
+    for n in range(40):
+        seconds = 0.055 if n % WAY_LEAST_OF else 0.035
+        learn(one, Execution(CLOUD, seconds, run_s=0.003), condition=near, beside=True)
+    assert outlook(one, condition=near).predicted_s == pytest.approx(0.035, rel=0.05)
 
 
 def test_half_of_the_least_that_a_site_ran_is_no_guess() -> None:
