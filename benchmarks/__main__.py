@@ -8,7 +8,7 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
-TABLES = ("planner", "decision", "wire", "load", "attacks", "start")
+TABLES = ("planner", "decision", "bounds", "wire", "load", "attacks", "start")
 
 
 def main() -> int:

@@ -46,6 +46,6 @@ def test_a_wrong_name_is_one_line() -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert (
-        "table 'planer' is not one of planner, decision, wire, load, attacks, start"
+        "table 'planer' is not one of planner, decision, bounds, wire, load, attacks, start"
         in done.stderr.splitlines()[-1]
     )

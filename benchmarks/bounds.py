@@ -1,0 +1,100 @@
+"""What no rule can beat in two simulated scenarios, whatever it knows of sites but not of what is drawn."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.measure import Table
+from loadgen.outcome import Reference
+from loadgen.scenario import find_scenario, read_scenario
+from loadgen.simulation.batch import Batch
+from robot_client import policies
+from robot_client.runner import CLOUD, ONBOARD
+
+SEEDS, TASKS, FROM_TASK = 6, 500, 20
+ALLOWANCES = (0.0, 0.05, 0.1, 0.2)  # second runs a task
+PRICES_S = np.linspace(0.0, 0.3, 61)  # of a second run
+STARTS = 40  # instants at which the second site may start, over all that the first one may take
+DRAWS = 400  # of what the way there and back takes
+PERCENTILE = 95
+
+Column = NDArray[np.float64]
+
+
+def tables() -> list[Table]:
+    return [_mean_of_lossy(), _tail_of_heavy_tail()]
+
+
+def _played(scenario: str, *names: str) -> dict[str, list[Reference]]:
+    one = read_scenario(find_scenario(scenario)).changed(tasks=TASKS)
+    seeds = [replace(one, seed=one.seed + n) for n in range(SEEDS)]
+    with Batch(1) as batch:
+        played = batch.play(seeds, {name: {"policy": name} for name in names})
+    return {
+        name: [one for run in runs for one in run.references if one.i >= FROM_TASK]
+        for name, runs in played.items()
+    }
+
+
+def _mean_of_lossy() -> Table:
+    """The dual of: least mean time of a plan for each task, with so many second runs in the mean.
+
+    A plan is a first site, and when the other one starts if it has not answered; the robot knows what each
+    task takes of its own CPU and of the server's, and how the rest, the way there and back, is distributed.
+    """
+    found = _played("lossy", ONBOARD)[ONBOARD]
+    both = [one.seconds for one in found if CLOUD in one.seconds]
+    onboard, cloud = (np.array([seconds[site] for seconds in both]) for site in (ONBOARD, CLOUD))
+    server = read_scenario(find_scenario("lossy")).robot.cpus * onboard  # of a whole CPU there
+    way = np.quantile(cloud - server, (np.arange(DRAWS) + 0.5) / DRAWS)
+    plans = _plans(onboard, server, way)
+    oracle_s = float(np.minimum(onboard, cloud).mean())
+    rows = []
+    for allowance in ALLOWANCES:
+        dual = [
+            np.min([seconds + price_s * runs for seconds, runs in plans], axis=0).mean() - price_s * allowance
+            for price_s in PRICES_S
+        ]
+        rows.append([f"{allowance:.0%}", f"{max(dual) / oracle_s:.3f}"])
+    rows.append(["always onboard", f"{onboard.mean() / oracle_s:.3f}"])
+    return Table("lossy: mean time over the oracle's, at the least", ("second runs", "time/oracle"), rows)
+
+
+def _plans(onboard: Column, server: Column, way: Column) -> list[tuple[Column, Column]]:
+    """Expected seconds and second runs of each task, by plan."""
+    cloud = server[:, np.newaxis] + way
+    plans = [(onboard, np.zeros(len(onboard))), (cloud.mean(axis=1), np.zeros(len(onboard)))]
+    for start_s in np.linspace(0.0, float(max(onboard.max(), cloud.max())), STARTS):
+        late = cloud > start_s
+        hedged = np.where(late, np.minimum(cloud, start_s + onboard[:, np.newaxis]), cloud)
+        plans.append((hedged.mean(axis=1), late.mean(axis=1)))
+        late_onboard = onboard > start_s
+        helped = np.minimum(onboard[:, np.newaxis], start_s + cloud).mean(axis=1)
+        plans.append((np.where(late_onboard, helped, onboard), late_onboard.astype(np.float64)))
+    return plans
+
+
+def _tail_of_heavy_tail() -> Table:
+    """A rule that knew what each task takes on each site would have this 95th percentile."""
+    names = ("paper", policies.DEFAULT)
+    played = _played("heavy-tail", *names)
+    waited = {name: [_waited_s(one) for one in found] for name, found in played.items()}
+    waited["oracle"] = [min(one.seconds.values()) for one in played["paper"]]
+    rows = [
+        [name, f"{1e3 * at:.1f}", f"{at / _percentile(waited['paper']):.3f}"]
+        for name, seconds in waited.items()
+        for at in [_percentile(seconds)]
+    ]
+    return Table("heavy-tail: the 95th percentile", ("rule", "ms", "over paper"), rows)
+
+
+def _waited_s(one: Reference) -> float:
+    seconds = one.sent_s
+    assert seconds is not None, "a simulation foresees every task"
+    return seconds
+
+
+def _percentile(seconds: Sequence[float]) -> float:
+    return float(np.percentile(seconds, PERCENTILE))
