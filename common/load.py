@@ -8,6 +8,7 @@ import contextlib
 import os
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,7 +16,9 @@ from common.cpu import QuotaGroup, parse_usage, quota_group, read_small
 
 EVERY_S = 0.5  # by a robot, and no more often: a reading costs more than a decision
 SERVER_EVERY_S = 0.1  # by a server, for all of its robots
-HURRIED_S = 0.05  # but so often where it may just have changed; what a shorter time tells is ticks
+HURRIED_S = 0.05  # but so often where it may just have changed
+TELLING_S = 0.02  # CPU seconds there were to take; of fewer one sees the kernel's ticks alone
+READINGS_MAX = 8  # remembered, to look back as far
 LOOKED_UP_EVERY = 8  # readings: how often it is looked up whether there is a quota, and how clocks are held
 FREE_MIN = 0.1  # of the CPU: where this process leaves less to others, what they take says nothing
 PROCESSES_MAX = 64  # of a group whose CPU time is the sum of theirs
@@ -48,22 +51,25 @@ class Load:
         self._group: QuotaGroup | None = None
         self._readings = 0
         self._read_at_s = -EVERY_S
-        self._others_s = self._own_s = 0.0
+        self._read_before: deque[tuple[float, float, float]] = deque(
+            maxlen=READINGS_MAX
+        )  # when, others', own
+        self._cpus = 0.0
         self._share = 0.0
 
     def share(self, every_s: float = EVERY_S) -> float:
         """From 0 to 1: what others took of the CPU that this process left; 0 where that cannot be told.
 
-        It is of the time since the last reading, which is at least `every_s` ago.
+        It is of the time since the last reading, which is at least `every_s` ago, or since one further back
+        where that was too little to tell.
         """
         now_s = time.monotonic()
-        since_s = now_s - self._read_at_s
-        if since_s >= every_s:
+        if now_s - self._read_at_s >= every_s:
             with contextlib.suppress(OSError, ValueError, IndexError):
-                self._read(now_s, since_s)
+                self._read(now_s)
         return self._share
 
-    def _read(self, now_s: float, since_s: float) -> None:
+    def _read(self, now_s: float) -> None:
         first = self._readings == 0
         if self._readings % LOOKED_UP_EVERY == 0:
             first = self._look_up() or first
@@ -72,11 +78,18 @@ class Load:
         self.capacity = self._clock * min(1.0, cpus)
         own_s = self._ours_s()
         others_s = self._total_s() - own_s
-        took_s, left_s = others_s - self._others_s, cpus * since_s - (own_s - self._own_s)
-        self._others_s, self._own_s, self._read_at_s = others_s, own_s, now_s
-        if first:
+        before = self._read_before
+        if first or cpus != self._cpus:
+            before.clear()
+        telling = (one for one in reversed(before) if cpus * (now_s - one[0]) >= TELLING_S)
+        since = next(telling, before[0] if before else None)
+        before.append((now_s, others_s, own_s))
+        self._read_at_s, self._cpus = now_s, cpus
+        if since is None:
             return
-        if left_s >= FREE_MIN * cpus * since_s:
+        then_s, others_then_s, own_then_s = since
+        took_s, left_s = others_s - others_then_s, cpus * (now_s - then_s) - (own_s - own_then_s)
+        if left_s >= FREE_MIN * cpus * (now_s - then_s):
             self._share = min(1.0, max(0.0, took_s / left_s))
 
     def _look_up(self) -> bool:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from common import load
-from common.load import EVERY_S, HURRIED_S, LOOKED_UP_EVERY, TICK_S, Load, LoadWatch
+from common.load import EVERY_S, HURRIED_S, LOOKED_UP_EVERY, READINGS_MAX, TICK_S, Load, LoadWatch
 from tests.unit.test_cpu import Machine
 
 CPUS = os.cpu_count() or 1
@@ -276,3 +276,41 @@ def test_a_watch_that_is_hurried_reads_in_the_callers_thread() -> None:
     watch.hurry()
     assert threading.current_thread() in counted.read_by
     watch.close()
+
+
+def test_a_hurried_reading_looks_back_until_it_can_tell(machine: Machine, times: Times) -> None:
+    """Under a small quota two of them may be a tick of CPU time apart: what others took is not 0 then."""
+    quota, soon_s = 0.1, 1.01 * HURRIED_S
+    point = machine.mount("", "cgroup2")
+    machine.process("", "/robot")
+    group = machine.write(point / "robot", cpu_max=f"{quota * 1e5:.0f} 100000\n")
+
+    def used(seconds: float) -> None:
+        machine.write(group, cpu_stat=f"usage_usec {round(seconds * 1e6)}\n")
+
+    used(1.0)
+    one = Load(machine.proc)
+    one.share()
+    for n in range(1, 4):
+        later(times, EVERY_S)
+        used(1.0 + n * quota * EVERY_S)
+        assert one.share() == pytest.approx(1.0, abs=0.01)
+    later(times, soon_s)  # the kernel has not counted yet what ran since
+    assert one.share(HURRIED_S) == pytest.approx(EVERY_S / (EVERY_S + soon_s), abs=0.01)
+    for _ in range(READINGS_MAX):
+        later(times, soon_s)
+        share = one.share(HURRIED_S)
+    assert share == 0.0, "for so long nobody ran"
+
+
+def test_a_new_quota_is_not_held_against_what_was_before(machine: Machine, times: Times) -> None:
+    """Others who took half of what there was are a load of a half, also once there is less."""
+    point = machine.mount("", "cgroup2")
+    machine.process("", "/robot")
+    group = machine.write(point / "robot", cpu_max="100000 100000\n", cpu_stat="usage_usec 1000000\n")
+    one = Load(machine.proc)
+    one.share()
+    for used_us, quota in ((1_250_000, 100_000), (1_500_000, 25_000), (1_562_500, 25_000)):
+        later(times, EVERY_S)
+        machine.write(group, cpu_max=f"{quota} 100000\n", cpu_stat=f"usage_usec {used_us}\n")
+        assert one.share() == pytest.approx(0.5, abs=0.01)
