@@ -37,7 +37,8 @@ class Observation:
     """What one execution taught its site, and all that is needed to teach it again.
 
     `amount`: what the predictor learnt `seconds` for, the size, or the work, which `work` is where a result
-    told it; `waited_s` of the run's time were left out of them; `predicted_s`: what the interval learnt from.
+    told it; `waited_s` of the run's time were left out of them; `predicted_s`: what the interval learnt from;
+    `ahead`: so many tasks after the one before.
     """
 
     size: float
@@ -50,6 +51,7 @@ class Observation:
     waited_s: float = 0.0
     bytes: float = 0.0
     cpu_s: float | None = None
+    ahead: int = 1
 
 
 class KindMemory:
@@ -116,6 +118,7 @@ class KindMemory:
         """One more task of this kind, wherever it runs."""
         for memory in self.sites.values():
             memory.age += 1
+            memory.untold += 1
 
 
 class SiteMemory:
@@ -136,6 +139,7 @@ class SiteMemory:
     ) -> None:
         predictor = self.predictor = make()
         self.age = 0
+        self.untold = 0  # tasks since the last observation
         self.observations: deque[Observation] = deque(maxlen=OBSERVATIONS_MAX)
         self._conditional = predictor if isinstance(predictor, Conditional) else None
         self.conditional = self._conditional is not None
@@ -202,8 +206,8 @@ class SiteMemory:
     def _unloaded(self, model: Conditional, amount: float, condition: Condition) -> Prediction | None:
         """But for what others take of a server's CPU, and what `model` knows of loads."""
         if condition.server_load <= LOADED or not self._server_under_load.known:
-            return _foretold(model, amount, self.age + 1, self._seen(condition))
-        found = _foretold(model, amount, self.age + 1, self._seen(condition._replace(server_load=0.0)))
+            return _foretold(model, amount, self.untold + 1, self._seen(condition))
+        found = _foretold(model, amount, self.untold + 1, self._seen(condition._replace(server_load=0.0)))
         if found is None:
             return None
         way_s = condition.round_trip_s or 0.0
@@ -271,6 +275,7 @@ class SiteMemory:
                 waited_s,
                 moved,
                 cpu_s,
+                max(1, self.untold),
             )
         )
 
@@ -302,6 +307,7 @@ class SiteMemory:
 
     def _take(self, one: Observation) -> None:
         self.observations.append(one)
+        self.untold = 0
         self._least = min(self._least, one.amount)
         self._use(one.bytes, one.cpu_s)
         if one.predicted_s is not None and one.ok:
@@ -323,7 +329,7 @@ class SiteMemory:
         else:
             held_s = max(0.0, one.seconds - (one.condition.round_trip_s or 0.0))  # to that capacity
             seconds = one.seconds - held_s * (1.0 - one.condition.capacity)
-            self._conditional.learn(one.amount, seconds, self._seen(one.condition))
+            self._conditional.learn(one.amount, seconds, self._seen(one.condition), one.ahead)
 
     def _quiet(self, condition: Condition) -> Condition:
         """What it would be without the load."""

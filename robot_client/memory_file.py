@@ -93,6 +93,7 @@ def _observation(given: Any) -> Observation:
         waited_s=_number(given["waited_s"]),
         bytes=_number(given["bytes"]),
         cpu_s=_maybe(given["cpu_s"]),
+        ahead=int(_number(given.get("ahead", 1))),  # unknown to earlier versions
     )
 
 

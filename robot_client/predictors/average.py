@@ -16,6 +16,8 @@ START = 10  # observations, of which none may lie further than CLIP deviations f
 START_CLIP_FROM = 5  # fewer have no outliers
 EXCESS_RATE = 0.05  # of the mean of what was clipped
 EXCESS_MAX = 8.0  # clips that count of it, at most: hedges bound what is waited for
+FEARED = 20  # tasks without news that it outlasts: so often a site is tried that is not slow
+FADING = 0.97  # with each one more
 
 Three = tuple[float, float, float]  # a value of each model
 
@@ -30,7 +32,8 @@ class Average(Conditional):
     looked at.
 
     The first START observations are held to a line that bears outliers; what was clipped off any counts in
-    the mean, as times do that nobody can foretell.
+    the mean, as times do that nobody can foretell. Where no news come that fades: bad luck at the start would
+    else keep a site from ever being chosen again.
     """
 
     def __init__(self, window: int, seed: int = 0, *, blind: bool = False) -> None:
@@ -56,11 +59,12 @@ class Average(Conditional):
     def __len__(self) -> int:
         return len(self._seen)
 
-    def learn(self, size: float, seconds: float, condition: Condition = UNMEASURED) -> None:
+    def learn(self, size: float, seconds: float, condition: Condition = UNMEASURED, ahead: int = 1) -> None:
         check_observation(size, seconds)
         if self._blind:
             condition = UNMEASURED
         if len(self._first) == START:
+            self._excess = self._feared(ahead)
             self._learn(size, seconds, condition)
             return
         self._first.append((size, seconds, condition))
@@ -84,14 +88,14 @@ class Average(Conditional):
     def predict(
         self,
         size: float,
-        ahead: int = 1,  # noqa: ARG002
+        ahead: int = 1,
         condition: Condition = UNMEASURED,
     ) -> Prediction | None:
         if not self._first:
             return None
         each = self._each(size, UNMEASURED if self._blind else condition)
         return Prediction(
-            self._mean(each) + self._excess,
+            self._mean(each) + self._feared(ahead),
             self._scale.deviation if self._scale.count > 1 else None,
         )
 
@@ -135,6 +139,10 @@ class Average(Conditional):
         """What was clipped at `clip` was so much more."""
         excess = min(beyond_s, EXCESS_MAX * clip) if beyond_s > 0 else 0.0
         self._excess += EXCESS_RATE * (excess - self._excess)
+
+    def _feared(self, ahead: int) -> float:
+        """What counts of what was clipped, `ahead` tasks after the last one learnt."""
+        return self._excess if ahead <= FEARED else self._excess * FADING ** (ahead - FEARED)
 
     def _learn_gains(self, size: float, rest: float, condition: Condition) -> None:
         """From the error of the model that uses them."""

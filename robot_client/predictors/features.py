@@ -22,7 +22,8 @@ class Conditional(ABC):
     def __len__(self) -> int: ...
 
     @abstractmethod
-    def learn(self, size: float, seconds: float, condition: Condition = UNMEASURED) -> None: ...
+    def learn(self, size: float, seconds: float, condition: Condition = UNMEASURED, ahead: int = 1) -> None:
+        """`ahead`, as for `predict`: so many tasks after the one learnt before."""
 
     @abstractmethod
     def predict(
@@ -69,7 +70,13 @@ class Measured(Conditional):
     def __len__(self) -> int:
         return len(self._base)
 
-    def learn(self, size: float, seconds: float, condition: Condition = UNMEASURED) -> None:
+    def learn(
+        self,
+        size: float,
+        seconds: float,
+        condition: Condition = UNMEASURED,
+        ahead: int = 1,  # noqa: ARG002
+    ) -> None:
         check_observation(size, seconds)
         rest = max(0.0, seconds - (condition.round_trip_s or 0.0))
         if condition.queue or condition.load:

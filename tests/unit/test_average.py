@@ -4,7 +4,7 @@ from random import Random
 
 import pytest
 
-from robot_client.predictors.average import START, Average, blind_average
+from robot_client.predictors.average import FEARED, START, Average, blind_average
 from robot_client.runner import UNMEASURED, Condition
 
 
@@ -56,6 +56,27 @@ def test_what_is_clipped_counts_in_the_mean() -> None:
     for n in range(300):
         one.learn(rng.uniform(1, 5), rng.uniform(0.9, 1.1) * (10 if n % 10 == 9 else 1))
     assert 1.2 < predicted(one) < 1.9
+
+
+def test_what_was_clipped_fades_without_news() -> None:
+    """While a site is tried as usual it does not; later ever more, and for good once a time is learnt."""
+
+    def after(tasks: int) -> float:
+        found = one.predict(2.0, 1 + tasks)
+        assert found is not None
+        return found.seconds
+
+    one, rng = blind_average(50), Random(1)
+    for n in range(26):
+        one.learn(rng.uniform(1, 5), rng.uniform(0.9, 1.1) * (20 if n in (3, 8, 23, 25) else 1))
+    feared = after(0)
+    assert feared > 1.5
+    assert after(FEARED - 1) == feared
+    faded = [after(tasks) for tasks in (40, 60, 80, 1_000)]
+    assert faded == sorted(faded, reverse=True)
+    assert faded[-1] == pytest.approx(1.0, abs=0.2)
+    one.learn(2.0, 1.0, ahead=81)
+    assert after(0) == pytest.approx(faded[2], abs=0.1)
 
 
 def test_before_they_have_erred_all_count_alike() -> None:
