@@ -139,7 +139,7 @@ class SiteMemory:
     ) -> None:
         predictor = self.predictor = make()
         self.age = 0
-        self.untold = 0  # tasks since the last observation
+        self.untold = 0  # the same, of this process alone: what is recalled is stale, but not feared the less
         self.observations: deque[Observation] = deque(maxlen=OBSERVATIONS_MAX)
         self._conditional = predictor if isinstance(predictor, Conditional) else None
         self.conditional = self._conditional is not None
@@ -237,7 +237,7 @@ class SiteMemory:
         if overtaken and execution.seconds <= (expected_s or 0.0):
             self._use(execution.bytes_out + execution.bytes_in, execution.cpu_s)
             return  # stopped before it was due: as little is known of the site as before
-        self.age = 0
+        ahead, self.untold, self.age = max(1, self.untold), 0, 0
         if isinstance(execution.failure, TaskError):
             return
         if not overtaken:  # whoever lost a race did not fail
@@ -275,7 +275,7 @@ class SiteMemory:
                 waited_s,
                 moved,
                 cpu_s,
-                max(1, self.untold),
+                ahead,
             )
         )
 
@@ -307,7 +307,6 @@ class SiteMemory:
 
     def _take(self, one: Observation) -> None:
         self.observations.append(one)
-        self.untold = 0
         self._least = min(self._least, one.amount)
         self._use(one.bytes, one.cpu_s)
         if one.predicted_s is not None and one.ok:
