@@ -16,7 +16,7 @@ from robot_client.runner import CLOUD, ONBOARD
 SEEDS, TASKS, FROM_TASK = 6, 500, 20
 ALLOWANCES = (0.0, 0.05, 0.1, 0.2)  # second runs a task
 PRICES_S = np.linspace(0.0, 0.3, 61)  # of a second run
-STARTS = 40  # instants at which the second site may start, over all that the first one may take
+STARTS = 250  # instants at which the second site may start: most where most answers come
 DRAWS = 400  # of what the way there and back takes
 PERCENTILE = 95
 
@@ -66,7 +66,8 @@ def _plans(onboard: Column, server: Column, way: Column) -> list[tuple[Column, C
     """Expected seconds and second runs of each task, by plan."""
     cloud = server[:, np.newaxis] + way
     plans = [(onboard, np.zeros(len(onboard))), (cloud.mean(axis=1), np.zeros(len(onboard)))]
-    for start_s in np.linspace(0.0, float(max(onboard.max(), cloud.max())), STARTS):
+    answers = np.concatenate([onboard, cloud[:: len(cloud) // DRAWS + 1].ravel()])
+    for start_s in [0.0, *np.quantile(answers, np.linspace(0.0, 1.0, STARTS))]:
         late = cloud > start_s
         hedged = np.where(late, np.minimum(cloud, start_s + onboard[:, np.newaxis]), cloud)
         plans.append((hedged.mean(axis=1), late.mean(axis=1)))

@@ -51,9 +51,8 @@ class Load:
         self._group: QuotaGroup | None = None
         self._readings = 0
         self._read_at_s = -EVERY_S
-        self._read_before: deque[tuple[float, float, float]] = deque(
-            maxlen=READINGS_MAX
-        )  # when, others', own
+        # When, and CPU seconds of others and of our own until then.
+        self._read_before: deque[tuple[float, float, float]] = deque(maxlen=READINGS_MAX)
         self._cpus = 0.0
         self._share = 0.0
 
