@@ -9,7 +9,7 @@ from robot_client.runner import ONBOARD
 
 PROBE_EVERY = 20  # tasks without news of a site
 MEASURED = 2.0  # times more seldom is onboard tried: its load and its capacity are measured
-SELDOM_MAX = 4.0  # times more seldom, at most
+SELDOM_MAX = 8.0  # times more seldom, at most
 STALE = round(PROBE_EVERY * SELDOM_MAX)  # tasks without news after which every site is tried
 RESERVED = 1  # second runs that are left for hedges
 HEDGE_MIN_S = 1e-3  # a wait of 0 is a probe
@@ -22,8 +22,9 @@ class Probe:
 
     The first answer is used, and both times are learnt: nobody waits for what is only tried. A site whose
     heartbeats go unanswered is not tried: the first one that is answered says more. Onboard, where a run
-    takes the time of the tasks beside it, is tried more seldom, the more so the slower it is expected to be;
-    but at once with a task that is far smaller than all it ran, which is soon over and not to be foretold.
+    takes the time of the tasks beside it, is tried more seldom, by the square of how much slower it is
+    expected to be: a run takes the longer, and is the less likely to show that it is the better site; but at
+    once with a task that is far smaller than all it ran, which is soon over and not to be foretold.
     """
 
     def __init__(self, inner: Policy) -> None:
@@ -141,7 +142,7 @@ def _probe_after(site: str, one: Outlook, chosen: Outlook) -> float:
         return 0.0
     if site != ONBOARD or not one.predicted_s or not chosen.predicted_s:
         return PROBE_EVERY
-    return PROBE_EVERY * min(MEASURED * max(1.0, one.predicted_s / chosen.predicted_s), SELDOM_MAX)
+    return PROBE_EVERY * min(MEASURED * max(1.0, one.predicted_s / chosen.predicted_s) ** 2, SELDOM_MAX)
 
 
 def _broken(failures: int, age: int) -> bool:

@@ -15,6 +15,7 @@ from robot_client.allowance import DUPLICATES_MAX
 from robot_client.config import RobotConfig
 from robot_client.energy import Energy
 from robot_client.objectives import Mean, TimeAndEnergy
+from robot_client.policies.wrappers import STALE
 
 
 @dataclass(frozen=True)
@@ -385,7 +386,7 @@ def test_a_command_keeps_and_uses_its_memory(tmp_path: Path) -> None:
     records = list(trace.read(tmp_path / "trace.jsonl"))
     assert records[0]["sites"]["onboard"]["predicted_s"] is None
     assert records[8]["sites"]["onboard"]["predicted_s"] is not None
-    assert (records[8]["i"], records[8]["sites"]["onboard"]["age"]) == (0, 80)
+    assert (records[8]["i"], records[8]["sites"]["onboard"]["age"]) == (0, STALE)
     command = [sys.executable, "-m", "robot_client", *flags.replace("memory.json", ".").split(), "1"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=30, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (2, "robot-client: memory .: is a folder\n")

@@ -19,6 +19,7 @@ from robot_client.policies.wrappers import (
     MEASURED,
     PROBE_EVERY,
     SELDOM_MAX,
+    STALE,
 )
 from robot_client.runner import CLOUD, ONBOARD
 from tests import policy_checks
@@ -163,10 +164,10 @@ def test_a_site_without_news_is_probed_at_once(age: int, probed: bool) -> None:
 
 
 @pytest.mark.parametrize(
-    ("onboard_s", "after"), [(0.11, 1.1 * MEASURED), (0.15, 1.5 * MEASURED), (2.0, SELDOM_MAX)]
+    ("onboard_s", "after"), [(0.11, 1.1**2 * MEASURED), (0.15, 1.5**2 * MEASURED), (2.0, SELDOM_MAX)]
 )
 def test_a_slow_robot_is_probed_more_seldom(onboard_s: float, after: float) -> None:
-    """By as much as it is slower than the chosen site, up to SELDOM_MAX: a probe takes its tasks' time."""
+    """By the square of how much slower it is than the chosen site, up to SELDOM_MAX."""
     for age, probed in ((PROBE_EVERY * after - 1, False), (PROBE_EVERY * after + 1, True)):
         sites = {ONBOARD: known(onboard_s, age=age), CLOUD: known(0.1)}
         assert (decide("probe:greedy", sites).second == ONBOARD) == probed
@@ -220,7 +221,7 @@ def test_what_is_not_known_cannot_be_hedged(sites: dict[str, Outlook]) -> None:
 
 def test_a_probe_goes_before_a_hedge() -> None:
     """In either order a stale site is probed at once and not hedged to later."""
-    sites = {ONBOARD: known(0.5, age=100), CLOUD: known(0.2)}
+    sites = {ONBOARD: known(0.5, age=STALE), CLOUD: known(0.2)}
     for name in ("hedge:probe:greedy", "probe:hedge:greedy"):
         decision = decide(name, sites)
         assert decision.second == ONBOARD
