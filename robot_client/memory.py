@@ -99,14 +99,9 @@ class KindMemory:
             log.exception("the work of a result of task %s cannot be told", self.kind.name)
             return None
 
-    def learn_work(self, size: float, executions: Iterable[Execution]) -> float | None:
-        """Once a task; the work it was, where a result says so."""
-        for execution in executions:
-            work = self.work_of(execution)
-            if work is not None:
-                self.learn_size(size, work)
-                return work
-        return None
+    def work_told(self, executions: Iterable[Execution]) -> float | None:
+        """The work that a task was, where a result of it says so."""
+        return next((work for one in executions if (work := self.work_of(one)) is not None), None)
 
     def learn_size(self, size: float, work: float) -> None:
         """A task of this size was so much work."""
@@ -214,6 +209,11 @@ class SiteMemory:
         alone_s = max(0.0, found.seconds - way_s)
         return found._replace(seconds=way_s + self._server_under_load.expect(alone_s))
 
+    def told(self) -> int:
+        """The site ran a task; so many after the one before."""
+        ahead, self.untold, self.age = max(1, self.untold), 0, 0
+        return ahead
+
     def learn(
         self,
         amount: float | None,
@@ -224,6 +224,7 @@ class SiteMemory:
         size: float,
         work: float | None = None,
         beside: bool = False,
+        ahead: int | None = None,
     ) -> None:
         """Take an execution; `outlook` is what was expected of it, `amount` as for `outlook`.
 
@@ -231,13 +232,15 @@ class SiteMemory:
         predictor of measured features it says that the time is longer: a refusal at once says nothing, nor
         does any failure where the site's heartbeats go unanswered (`silent`). `beside`: the robot ran the
         same task itself, and may have heard late of this site: to such a predictor the time is a bound.
+        `ahead`: what `told` said when it ended, where that was before.
         """
         expected_s = outlook.predicted_s if outlook else None
         overtaken = isinstance(execution.failure, Overtaken)
         if overtaken and execution.seconds <= (expected_s or 0.0):
             self._use(execution.bytes_out + execution.bytes_in, execution.cpu_s)
             return  # stopped before it was due: as little is known of the site as before
-        ahead, self.untold, self.age = max(1, self.untold), 0, 0
+        if ahead is None:
+            ahead = self.told()
         if isinstance(execution.failure, TaskError):
             return
         if not overtaken:  # whoever lost a race did not fail

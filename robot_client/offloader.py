@@ -9,7 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -23,13 +23,13 @@ from robot_client.allowance import Allowance
 from robot_client.batch import Batch, Placed, arguments
 from robot_client.clock import Clock, SystemClock
 from robot_client.energy import Energy
-from robot_client.memory import LOADED, KindMemory
+from robot_client.learning import Asked, Learning
+from robot_client.memory import KindMemory
 from robot_client.objectives import Objective
 from robot_client.onboard import OnboardRunner
 from robot_client.policies import PINNED, Decision, Forecast, Outlook, Policy
 from robot_client.predictors import Predictor
 from robot_client.race import Plan, Race, answer_of
-from robot_client.regret import RegretEstimate
 from robot_client.runner import CLOUD, ONBOARD, TIMEOUT_S, UNMEASURED, Condition, Execution, Runner
 from robot_client.store import Store
 from robot_client.trace import Late, Record
@@ -39,22 +39,9 @@ BOTH = "both"
 TIMEOUT_MAX_S = 24 * 3600.0
 POLL_S = 0.01
 LATE_MAX = 64  # executions that ended after their task, kept for the next record
-FREED = 0.5  # of the time that was expected: a robot that is so quick may have got its CPU back
 OVERDUE = 0.5  # of the time it took so far: what a task that should be done is taken to need still
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(eq=False, slots=True)
-class _Asked:
-    """A task under way, and what was known when it was asked."""
-
-    task: Task
-    id: str
-    forecast: Forecast
-    amount: float | None  # what the predictors were asked with
-    decision: Decision
-    seconds: dict[str, float] = field(default_factory=dict)  # of the sites that answered
 
 
 @dataclass(slots=True)
@@ -112,7 +99,7 @@ class Offloader:
         self._store = store
         self._memories: dict[str, KindMemory] = {}
         self._flights: dict[str, dict[int, _Flight]] = {site: {} for site in self._runners}
-        self._regret = RegretEstimate()
+        self._learning = Learning(self._runners, self._allowance)
         self._late: deque[Late] = deque(maxlen=LATE_MAX)
         self._crossed: set[str] = set()  # kinds whose values are known to cross the wire
         self._lock = threading.Lock()
@@ -253,6 +240,8 @@ class Offloader:
     def close(self) -> None:
         """Safe to call twice."""
         with self._lock:
+            if not self._closed:
+                self._learning.catch_up()
             last = None if self._closed or self._store is None else self._store.snapshot(self._memories)
             self._closed = True
         for runner in self._runners.values():
@@ -296,8 +285,9 @@ class Offloader:
         with self._lock:
             self._learn(asked, executions)
             if self._store is not None and not self._closed and self._store.due(self._clock.now_s()):
+                self._learning.catch_up()
                 self._store.save_soon(self._store.snapshot(self._memories))
-            late, regret = tuple(self._late), self._regret.estimate()
+            late, regret = tuple(self._late), self._learning.regret.estimate()
             self._late.clear()
         record = Record(
             i=number,
@@ -335,7 +325,7 @@ class Offloader:
         where: str | None,
         timeout_s: float,
         placed: Placed | None,
-    ) -> _Asked:
+    ) -> Asked:
         """Predict and decide."""
         self._allowance.begin(self._clock.now_s())
         memory = self._memory(task.kind)
@@ -351,7 +341,7 @@ class Offloader:
             if memory.last_site is not None:
                 log.info("%s moves to %s: %s", task.kind.name, decision.site, decision.reason)
             memory.last_site = decision.site
-        return _Asked(task, id, forecast, amount, decision)
+        return Asked(task, id, memory, forecast, amount, decision)
 
     def _forecast(
         self, kind: Kind, memory: KindMemory, size: float, outlooks: Mapping[str, Outlook]
@@ -373,11 +363,6 @@ class Offloader:
             if flights:
                 condition = self._behind_own(site, condition)
         return here.outlook(amount, condition, in_flight=len(flights), timeout_s=timeout_s)
-
-    def _held_up(self, site: str) -> bool:
-        """Whether a server does not answer, or may not."""
-        condition = self._runners[site].condition()
-        return condition.silent or condition.wait_s > 0
 
     def _behind_own(self, site: str, condition: Condition) -> Condition:
         """Onboard runs one task at a time; a server's queue may not know yet of what was sent to it."""
@@ -430,7 +415,7 @@ class Offloader:
     def _measured(self, site: str) -> Condition:
         """Of a server too the load of the robot, where that is what its times tell of."""
         condition = self._runners[site].condition()
-        if site != ONBOARD and (load := self._load(site)):
+        if site != ONBOARD and (load := self._learning.load(site)):
             return condition._replace(load=load)
         return condition
 
@@ -449,7 +434,7 @@ class Offloader:
             return Decision(ONBOARD, False, f"pinned to {where}, which cannot take it", PINNED)
         return Decision(where, False, "pinned by the caller", PINNED)
 
-    def _execute(self, asked: _Asked, timeout_s: float, call: "Future[str] | None") -> tuple[Execution, ...]:
+    def _execute(self, asked: Asked, timeout_s: float, call: "Future[str] | None") -> tuple[Execution, ...]:
         decision, sites = asked.decision, asked.forecast.sites
         race = Race(
             asked.task,
@@ -459,6 +444,7 @@ class Offloader:
             begun=partial(self._begun, asked),
             allowed=self._take_duplicate,
             late=partial(self._ended_late, asked),
+            meanwhile=self._meanwhile,
         )
         first: tuple[str, ...] = (decision.site,)
         if decision.both:
@@ -475,7 +461,7 @@ class Offloader:
                     flights.pop(asked.task.id, None)
             raise
 
-    def _begun(self, asked: _Asked, site: str) -> None:
+    def _begun(self, asked: Asked, site: str) -> None:
         outlook = asked.forecast.sites.get(site)
         predicted_s = (outlook.predicted_s if outlook else None) or 0.0
         with self._lock:
@@ -494,82 +480,27 @@ class Offloader:
                 self._allowance.duplicate()
             return allowed
 
-    def _learn(self, asked: _Asked, executions: Sequence[Execution]) -> None:
+    def _learn(self, asked: Asked, executions: Sequence[Execution]) -> None:
         """What has ended by now."""
-        memory = self._memory(asked.task.kind)
-        memory.pass_by()
-        ended = [one for one in executions if not isinstance(one.failure, Overtaken)]
-        work = memory.learn_work(asked.task.size, ended)
-        for execution in ended:
-            self._learn_one(asked, execution, work)
+        for one in executions:
+            if not isinstance(one.failure, Overtaken):
+                self._flights[one.site].pop(asked.task.id, None)
+        if not self._closed:  # what was given up at the end says nothing of the site
+            self._learning.learn(asked, executions)
 
-    def _ended_late(self, asked: _Asked, site: str, execution: Execution) -> None:
+    def _ended_late(self, asked: Asked, site: str, execution: Execution) -> None:
         """A run that came second has ended; called in any thread."""
         with self._lock:
             self._late.append(Late(asked.id, site, execution.seconds, execution.ok, execution.censored))
-            if execution.started:
-                self._learn_one(asked, execution, self._memory(asked.task.kind).work_of(execution))
             self._flights[site].pop(asked.task.id, None)
+            if execution.started and not self._closed:
+                self._learning.learn_late(asked, execution)
 
-    def _learn_one(self, asked: _Asked, execution: Execution, work: float | None) -> None:
-        site, decision = execution.site, asked.decision
-        memory = self._memory(asked.task.kind).site(site)
-        self._flights[site].pop(asked.task.id, None)
-        if self._closed:  # what was given up at the end says nothing of the site
-            return
-        if self._allowance.capped:
-            moved = 0 if site == ONBOARD else execution.bytes_out + execution.bytes_in
-            self._allowance.spend(moved, memory.joules(execution))
-        silent = not execution.ok and memory.conditional and self._held_up(site)
-        amount = asked.amount if work is None else work
-        outlook = asked.forecast.sites.get(site)
-        if memory.conditional and outlook is not None:
-            outlook = self._in_hindsight(outlook, execution)
-        beside = site != ONBOARD and decision.site == ONBOARD and (decision.both or decision.second == site)
-        memory.learn(
-            amount, execution, outlook, silent=silent, size=asked.task.size, work=work, beside=beside
-        )
-        if execution.ok and decision.second is not None and decision.second_after_s == 0:
-            asked.seconds[site] = execution.seconds
-            if len(asked.seconds) == 2:
-                self._regret.learn(asked.seconds[decision.site], asked.seconds[decision.second])
-
-    def _in_hindsight(self, outlook: Outlook, execution: Execution) -> Outlook:
-        """With loads and capacities as they are now, where the time tells that they changed."""
-        if not execution.ok or outlook.low_s is None or outlook.high_s is None:
-            return outlook
-        home = execution.site == ONBOARD
-        later, sooner = execution.seconds > outlook.high_s, execution.seconds < outlook.low_s
-        if not home and (later or sooner):
-            outlook = self._as_the_server_says(execution.site, outlook, later=later)
-        before = outlook.condition
-        odd = later if before.load <= LOADED else sooner
-        freed = home and sooner and execution.seconds < FREED * (outlook.predicted_s or 0.0)
-        if not (odd or freed):
-            return outlook
-        self._runners[ONBOARD].hurry()
-        load, capacity = before.load, before.capacity
-        if odd:
-            load = self._load(execution.site)
-        if home:
-            now = self._runners[ONBOARD].condition().capacity
-            capacity = min(capacity, now) if later else max(capacity, now)
-        if (load, capacity) == (before.load, before.capacity):
-            return outlook
-        return replace(outlook, condition=before._replace(load=load, capacity=capacity))
-
-    def _as_the_server_says(self, site: str, outlook: Outlook, *, later: bool) -> Outlook:
-        """In its answer to what was late, or early."""
-        before, now = outlook.condition, self._runners[site].condition()
-        worse, better = (max, min) if later else (min, max)
-        load = worse(before.server_load, now.server_load)
-        capacity = better(before.capacity, now.capacity)
-        return replace(outlook, condition=before._replace(server_load=load, capacity=capacity))
-
-    def _load(self, site: str) -> float:
-        """Of the robot; of a server only where its times tell of that."""
-        load = self._runners[ONBOARD].condition().load
-        return load if site == ONBOARD or load > LOADED else 0.0
+    def _meanwhile(self) -> None:
+        """A task is under way."""
+        with self._lock:
+            if not self._closed:
+                self._learning.between()
 
     def _memory(self, kind: Kind) -> KindMemory:
         if kind.name not in self._memories:

@@ -31,7 +31,7 @@ class Plan:
 class Race:
     """Runs one task. `begun` is told of every site that starts; `allowed` is asked before a second one does,
     but not before one in place of those that failed; `late` gets, in any thread, what comes of a run that was
-    still under way when the answer was there."""
+    still under way when the answer was there; `meanwhile` is called once the first ones have started."""
 
     def __init__(
         self,
@@ -43,6 +43,7 @@ class Race:
         begun: Callable[[str], None],
         allowed: Callable[[], bool],
         late: Callable[[str, Execution], None],
+        meanwhile: Callable[[], None],
     ) -> None:
         self._task = task
         self._runners = runners
@@ -51,12 +52,14 @@ class Race:
         self._begun = begun
         self._allowed = allowed
         self._late = late
+        self._meanwhile = meanwhile
         self._runs: dict[str, tuple[Future[Execution], float]] = {}  # and when it began
 
     def run(self, plan: Plan) -> tuple[Execution, ...]:
         """All executions in the order in which they began; those still under way as overtaken."""
         for site in plan.first:
             self._start(site)
+        self._meanwhile()
         if plan.all:
             self._wait_for_all()
         else:

@@ -231,11 +231,10 @@ def test_work_is_told_by_results_and_shared() -> None:
     """One result on any site tells all of them what a size is; a failed run tells nothing."""
     one = memory(shared_work=True)
     assert one.amount(3.0) is None
-    assert one.learn_work(3.0, [lost(CloudTimeout("late"), 2.0)]) is None
-    assert (
-        one.learn_work(3.0, [lost(CloudTimeout("late"), 2.0), Execution(ONBOARD, 0.1, {"work": 30.0})])
-        == 30.0
-    )
+    assert one.work_told([lost(CloudTimeout("late"), 2.0)]) is None
+    told = one.work_told([lost(CloudTimeout("late"), 2.0), Execution(ONBOARD, 0.1, {"work": 30.0})])
+    assert told == 30.0
+    one.learn_size(3.0, told)
     assert one.amount(3.0) == 30.0
     assert memory().amount(3.0) == 3.0
 
@@ -243,7 +242,7 @@ def test_work_is_told_by_results_and_shared() -> None:
 def test_a_work_function_that_fails_costs_no_answer(caplog: pytest.LogCaptureFixture) -> None:
     """It is the user's own: logged, and the work unknown."""
     one = memory(shared_work=True)
-    assert one.learn_work(3.0, [Execution(ONBOARD, 0.1, {})]) is None
+    assert one.work_told([Execution(ONBOARD, 0.1, {})]) is None
     assert "cannot be told" in caplog.text
 
 

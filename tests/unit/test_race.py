@@ -32,6 +32,7 @@ class Course:
         self.sites = {site: VirtualRunner(site, self.clock) for site in (ONBOARD, CLOUD, EDGE)}
         self.begun: list[tuple[str, float]] = []
         self.late: list[tuple[str, Execution]] = []
+        self.meanwhile: list[list[str]] = []  # the sites that had begun by then
         self.allowed = True
 
     def run(self, plan: Plan, function: Callable[[int], int] = race_echo) -> tuple[Execution, ...]:
@@ -43,6 +44,7 @@ class Course:
             begun=lambda site: self.begun.append((site, self.clock.now_s())),
             allowed=lambda: self.allowed,
             late=lambda site, execution: self.late.append((site, execution)),
+            meanwhile=lambda: self.meanwhile.append([site for site, _ in self.begun]),
         )
         return race.run(plan)
 
@@ -105,6 +107,14 @@ def test_of_a_hedge_the_first_answer_counts_and_the_other_is_given_up(
     assert lost.seconds == pytest.approx(waited_s - (0.4 if loser == ONBOARD else 0.0))
     assert [one.args for one in course.sites[loser].cancelled] == [(7,)]
     assert not course.sites[used].cancelled
+
+
+def test_what_is_done_meanwhile_is_done_once_the_first_have_begun(course: Course) -> None:
+    """Before anything is waited for, and before a second site begins."""
+    course.take(onboard=1.0, cloud=0.2)
+    course.run(Plan((ONBOARD,), CLOUD, 0.1))
+    assert course.meanwhile == [[ONBOARD]]
+    assert [site for site, _ in course.begun] == [ONBOARD, CLOUD]
 
 
 def test_whoever_is_late_is_asked_whether_it_is_there(course: Course) -> None:

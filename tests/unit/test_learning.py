@@ -1,0 +1,150 @@
+"""When executions are learnt: news at once, what went as expected together while a task is under way."""
+
+from collections.abc import Callable
+from random import Random
+
+import pytest
+
+from common.errors import CloudTimeout, OffloadError
+from common.tasks import task
+from robot_client import policies, predictors
+from robot_client.allowance import Allowance
+from robot_client.learning import TOGETHER
+from robot_client.memory import SiteMemory
+from robot_client.offloader import BOTH, Offloader
+from robot_client.predictors import AVERAGE, LEAST_SQUARES
+from robot_client.runner import CLOUD, ONBOARD
+from tests.virtual import VirtualClock, VirtualRunner
+
+ONBOARD_S, CLOUD_S = 0.1, 0.05  # a unit of size
+WARM = 40
+
+
+@task("learning_echo", size=lambda number: number)
+def learning_echo(number: float) -> float:
+    return number
+
+
+class Scene:
+    """A robot that knows both sites; tasks are pinned to a site, and each next one has another size."""
+
+    def __init__(self, predictor: str = AVERAGE, allowance: Allowance | None = None) -> None:
+        self.clock = VirtualClock()
+        self.sites = {site: VirtualRunner(site, self.clock) for site in (ONBOARD, CLOUD)}
+        self.random = Random(1)
+        self.offload = Offloader(
+            list(self.sites.values()),
+            policy=policies.make("greedy"),
+            predictor=lambda: predictors.make(predictor, 20),
+            allowance=allowance,
+            clock=self.clock,
+        )
+        for _ in range(WARM):
+            self.ask(ONBOARD)
+            self.ask(CLOUD)
+        self.offload._learning.catch_up()
+
+    def ask(self, where: str = CLOUD, times: float = 1.0, failure: OffloadError | None = None) -> None:
+        """A task that takes so many times as long as it should."""
+        size = self.random.uniform(1.0, 2.0)
+        for site, seconds in ((ONBOARD, ONBOARD_S), (CLOUD, CLOUD_S)):
+            noise = self.random.uniform(0.98, 1.02)
+            fails = failure if site == CLOUD else None
+            self.sites[site].scripts.append((seconds * size * noise * times, fails))
+        self.offload(learning_echo, size, where=where)
+        for runner in self.sites.values():
+            runner.scripts.clear()
+
+    def site(self, name: str = CLOUD) -> SiteMemory:
+        return self.offload._memories["learning_echo"].site(name)
+
+    def learnt(self, name: str = CLOUD) -> int:
+        return len(self.site(name).observations) - WARM
+
+
+def test_what_goes_as_expected_is_learnt_together_while_the_next_task_is_under_way() -> None:
+    """TOGETHER tasks wait; the next one has been sent when they are learnt, before its answer is there."""
+    scene = Scene()
+    for _ in range(TOGETHER):
+        scene.ask()
+    assert scene.learnt() == 0
+    seen: list[tuple[int, int]] = []
+    scene.clock.after(1e-6, lambda: seen.append((len(scene.sites[CLOUD].tasks), scene.learnt())))
+    scene.ask()
+    assert seen == [(WARM + TOGETHER + 1, TOGETHER)]
+    assert scene.learnt() == TOGETHER
+
+
+@pytest.mark.parametrize(
+    "news",
+    [
+        pytest.param(lambda scene: scene.ask(times=3.0), id="late"),
+        pytest.param(lambda scene: scene.ask(times=0.3), id="early"),
+        pytest.param(lambda scene: scene.ask(BOTH), id="both sites"),
+        pytest.param(lambda scene: scene.ask(failure=CloudTimeout("late"), times=9.0), id="failed"),
+    ],
+)
+def test_news_are_learnt_at_once_and_after_what_waited(news: Callable[[Scene], None]) -> None:
+    """A run that failed, was late or early, or came with another site's, is known to the next decision."""
+    scene = Scene()
+    scene.ask(), scene.ask()
+    assert scene.learnt() == 0
+    news(scene)
+    assert scene.learnt() == 3
+    sizes = [one.size for one in scene.site().observations]
+    assert sizes[-3:] == [one.size for one in scene.sites[CLOUD].tasks[-3:]]
+
+
+def test_a_site_that_comes_into_use_again_is_learnt_at_once() -> None:
+    """However well it was foretold, it is the first that was heard of it for a while."""
+    scene = Scene()
+    for _ in range(2 * TOGETHER):
+        scene.ask(ONBOARD)
+    scene.ask(CLOUD)
+    assert scene.learnt(CLOUD) == 1
+
+
+def test_the_published_rule_learns_each_task_before_the_next() -> None:
+    """As in the paper's Algorithm 1: its windows wait for nothing."""
+    scene = Scene(LEAST_SQUARES)
+    for n in range(1, TOGETHER + 3):
+        scene.ask()
+        assert scene.learnt() == n
+
+
+def test_waiting_changes_neither_what_is_learnt_nor_how_old_it_is() -> None:
+    """Together or one by one: the same observations, predictions and ages."""
+    waiting, prompt = Scene(), Scene()
+    for n in range(5 * TOGETHER + 1):
+        where = ONBOARD if n % 7 == 0 else CLOUD
+        for scene in (waiting, prompt):
+            scene.ask(where)
+        prompt.offload._learning.catch_up()
+        for site in (ONBOARD, CLOUD):
+            assert waiting.site(site).age == prompt.site(site).age
+    waiting.offload._learning.catch_up()
+    for site in (ONBOARD, CLOUD):
+        one, other = waiting.site(site), prompt.site(site)
+        assert [(o.seconds, o.ahead) for o in one.observations] == [
+            (o.seconds, o.ahead) for o in other.observations
+        ]
+        assert one.predictor.predict(1.5, 1) == other.predictor.predict(1.5, 1)
+
+
+def test_what_waits_is_learnt_at_the_end() -> None:
+    """The memory file of a robot that ends holds all of its tasks."""
+    scene = Scene()
+    scene.ask()
+    assert scene.learnt() == 0
+    scene.offload.close()
+    assert scene.learnt() == 1
+
+
+def test_bytes_are_counted_at_once() -> None:
+    """A cap holds for the next task, whenever this one is learnt."""
+    scene = Scene(allowance=Allowance(bytes_a_minute=1e6))
+    scene.sites[CLOUD].fields = {"bytes_out": 1000, "bytes_in": 0}
+    before = scene.offload._allowance.bytes_left
+    scene.ask()
+    assert scene.learnt() == 0
+    assert scene.offload._allowance.bytes_left < before
