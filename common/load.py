@@ -14,7 +14,9 @@ from pathlib import Path
 
 from common.cpu import QuotaGroup, parse_usage, quota_group, read_small
 
+LOADED = 0.3  # of the CPU, taken by others: from there on times tell of that
 EVERY_S = 0.5  # by a robot, and no more often: a reading costs more than a decision
+LOADED_EVERY_S = 1.5  # by one that is LOADED, and waits for the CPU as its tasks do
 SERVER_EVERY_S = 0.1  # by a server, for all of its robots
 HURRIED_S = 0.05  # but so often where it may just have changed
 TELLING_S = 0.02  # CPU seconds there were to take; of fewer one sees the kernel's ticks alone
@@ -129,15 +131,18 @@ class Load:
 
 
 class LoadWatch:
-    """Reads a load at the first look at it, and from then on every `every_s` in a thread of its own.
+    """Reads a load at the first look at it, and from then on in a thread of its own.
+
+    Every `every_s`; every `loaded_every_s`, if that is given, while the CPU is LOADED.
 
     A process that asks for its CPU time is charged what it owes, and waits there for its quota: a thread that
     decides must not be the one to ask.
     """
 
-    def __init__(self, load: Load, every_s: float = EVERY_S) -> None:
+    def __init__(self, load: Load, every_s: float = EVERY_S, loaded_every_s: float | None = None) -> None:
         self._load = load
         self._every_s = every_s
+        self._loaded_every_s = every_s if loaded_every_s is None else loaded_every_s
         self._latest = (0.0, 1.0)
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="load", daemon=True)
@@ -165,7 +170,7 @@ class LoadWatch:
         self._closed.set()
 
     def _run(self) -> None:
-        while not self._closed.wait(self._every_s):
+        while not self._closed.wait(self._loaded_every_s if self._latest[0] > LOADED else self._every_s):
             with self._reading:
                 self._read()
 

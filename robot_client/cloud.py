@@ -36,8 +36,8 @@ from common.errors import (
 from common.guard import on_loopback
 from common.keys import RobotKeys
 from common.tasks import Kind, Task, kinds
-from robot_client.heartbeat import Heartbeat, Told
-from robot_client.own_runs import OWN_RUNS
+from robot_client.heartbeat import ALONG_S, Heartbeat, Told
+from robot_client.own_cpu import OWN_CPU
 from robot_client.runner import CLOUD, Condition, Execution, check_endpoint
 from robot_client.turns import Answer, Turns
 from robot_client.uploads import Uploads
@@ -100,7 +100,7 @@ class CloudRunner:
     ) -> None:
         check_endpoint(site, endpoint)
         self.site = site
-        self._heartbeat = Heartbeat(heartbeat_s, seed, OWN_RUNS)
+        self._heartbeat = Heartbeat(heartbeat_s, seed, OWN_CPU)
         self._endpoint = endpoint
         self._absent: str | None = f"no answer from {endpoint} yet"
         self._remote: dict[str, str] = {}
@@ -109,7 +109,13 @@ class CloudRunner:
         self._pending: dict[int, _Pending] = {}
         self._unwanted: deque[int] = deque()
         self._asked = False  # to find out whether the server is there
-        self._turns = Turns(self._tend, self._receive, expected=self._expected, wake=self._wake)
+        self._turns = Turns(
+            self._tend,
+            self._receive,
+            asked=self._pending.__len__,
+            expected=self._expected,
+            wake=self._wake,
+        )
         self._looks_s = -math.inf  # when whoever waits for messages looks again, whatever happens
         self._handshake_failure = ""  # the last one's, until one succeeds
         self._given_up = False  # by libzmq, after such a failure
@@ -162,6 +168,7 @@ class CloudRunner:
                 pending.future.cancel()
                 return pending.future
             self._pending[task.id] = pending
+            self._beat(early_s=ALONG_S)
             self._send_first(pending)
             if pending.deadline < self._looks_s:
                 self._channel.wake()
@@ -187,8 +194,8 @@ class CloudRunner:
         future.set_result(Execution(self.site, 0.0, failure=failure, started=False))
         return future
 
-    def _expected(self) -> int:
-        return len(self._pending) + self._heartbeat.unanswered
+    def _expected(self) -> bool:
+        return bool(self._pending or self._heartbeat.unanswered)
 
     def _wake(self) -> None:
         self._channel.wake()
@@ -260,12 +267,12 @@ class CloudRunner:
             self._socket.disconnect(self._endpoint)
         self._socket.connect(self._endpoint)
 
-    def _beat(self) -> None:
+    def _beat(self, early_s: float = 0.0) -> None:
         now_s = time.perf_counter()
         if self._asked:
             self._asked = False
             self._heartbeat.hurry(now_s)
-        if self._heartbeat.due_s <= now_s:
+        if self._heartbeat.due_s <= now_s + early_s:
             self._send(wire.Ping(self._heartbeat.beat(now_s)))
 
     def _give_up(self, request_id: int) -> None:

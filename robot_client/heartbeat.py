@@ -7,11 +7,15 @@ from collections import deque
 from random import Random
 from typing import NamedTuple
 
-from robot_client.own_runs import OwnRuns, may_be_late
+from robot_client.own_cpu import OwnCpu, may_be_late
 from robot_client.runner import Condition
 
 EVERY_S = 0.5
+LOADED_SLOWER = (
+    3  # times as rarely from a loaded robot: its tasks wait for the CPU, its round trips tell of that
+)
 JITTER = 0.2  # each comes up to this share earlier or later: robots of a fleet do not beat together
+ALONG_S = 0.1  # so much earlier one goes ahead of a task, whose answer is waited for anyway
 SILENT_S = 0.25  # unanswered for longer than this, and longer than round trips vary: the site is silent
 SLACK_S = 0.02  # beyond the usual round trip, if they vary no more: so much later an answer is late
 UNANSWERED_MAX = 16  # remembered; while so many are out they come SLOWER times as rarely
@@ -30,11 +34,11 @@ class Told(NamedTuple):
 
 
 class Heartbeat:
-    """Of one connection. `every_s` 0: none are sent, and nothing is known. `own_runs`: of the robot."""
+    """Of one connection. `every_s` 0: none are sent, and nothing is known. `own_cpu`: of the robot."""
 
-    def __init__(self, every_s: float, seed: int = 0, own_runs: OwnRuns | None = None) -> None:
+    def __init__(self, every_s: float, seed: int = 0, own_cpu: OwnCpu | None = None) -> None:
         self._every_s = every_s
-        self._own_runs = own_runs or OwnRuns()
+        self._own_cpu = own_cpu or OwnCpu()
         self._random = Random(seed)
         self._next_id = 0
         self._round_trip_s: float | None = None
@@ -74,6 +78,8 @@ class Heartbeat:
         self._sent[self._next_id] = now_s
         self._oldest_s = min(self._oldest_s, now_s)
         pause_s = self._every_s * (1 + JITTER * self._random.uniform(-1, 1))
+        if self._own_cpu.loaded:
+            pause_s *= LOADED_SLOWER
         if len(self._sent) > UNANSWERED_MAX:
             del self._sent[next(iter(self._sent))]
             pause_s *= SLOWER
@@ -94,7 +100,7 @@ class Heartbeat:
         if sent_s < self._back_s:
             self.hurry(now_s)  # it was held up by what made the site silent, and says nothing of the link now
         else:
-            self._measure(now_s - sent_s, beside=self._own_runs.since(sent_s))
+            self._measure(now_s - sent_s, beside=self._own_cpu.since(sent_s))
         self.hear(now_s, told)
 
     def _measure(self, round_trip_s: float, *, beside: bool) -> None:

@@ -9,9 +9,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from common.errors import Overtaken
+from common.load import LOADED
 from common.tasks import Task
 from robot_client.allowance import Allowance
-from robot_client.memory import LOADED, KindMemory
+from robot_client.memory import KindMemory
 from robot_client.policies import Decision, Forecast, Outlook
 from robot_client.regret import RegretEstimate
 from robot_client.runner import ONBOARD, Execution, Runner

@@ -10,11 +10,12 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from common.errors import Overtaken, TaskError
+from common.load import LOADED
 from common.tasks import Kind
 from robot_client.conformal import Conformal
 from robot_client.energy import Energy
 from robot_client.objectives import Expected, Objective
-from robot_client.own_runs import may_be_late
+from robot_client.own_cpu import may_be_late
 from robot_client.policies.base import Outlook
 from robot_client.predictors import Prediction, Predictor
 from robot_client.predictors.features import Conditional
@@ -24,7 +25,6 @@ from robot_client.under_load import UnderLoad
 
 AMOUNT_RATE = 0.1  # of the bytes and CPU seconds that a task usually takes
 OBSERVATIONS_MAX = 200  # of a site, kept for `store`
-LOADED = 0.3  # of the robot's CPU, or a server's, taken by others: from there on times tell of that
 SMALL = 0.5  # of the least that a site ran: below it a prediction is a guess
 LOADED_FROM = 10  # times of a site: the first ones are all learnt as one
 WAY_LEAST_OF = 4  # answers: the one that was on its way for the shortest tells how long the way is

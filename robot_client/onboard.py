@@ -11,11 +11,11 @@ from queue import SimpleQueue
 from common import cpu
 from common.cpu import SELF
 from common.errors import OffloadError, Overtaken, TaskFailed, describe
-from common.load import Load, LoadWatch
+from common.load import EVERY_S, LOADED, LOADED_EVERY_S, Load, LoadWatch
 from common.tasks import Kind, Task
 from common.threads import join_all
 from common.wanted import call_while
-from robot_client.own_runs import OWN_RUNS
+from robot_client.own_cpu import OWN_CPU
 from robot_client.runner import ONBOARD, Condition, Execution
 
 ASIDE_MAX = 4  # runs that nobody waits for any more and that still go on
@@ -52,7 +52,7 @@ class OnboardRunner:
         self._aside = 0
         self._closed = False
         self._lock = threading.Lock()
-        self._load = LoadWatch(Load(SELF))
+        self._load = LoadWatch(Load(SELF), EVERY_S, LOADED_EVERY_S)
         self._condition = Condition()
 
     def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - onboard always exists
@@ -90,6 +90,7 @@ class OnboardRunner:
         found, (load, capacity) = self._condition, self._load.latest()
         if found.load != load or found.capacity != capacity:
             found = self._condition = Condition(load=load, capacity=capacity)
+            OWN_CPU.loaded = load > LOADED
         return found
 
     def close(self) -> None:
@@ -141,7 +142,7 @@ class OnboardRunner:
 def _run(run: _Run) -> Execution:
     cpu_before_s, started = cpu.used_s(), time.perf_counter()
     value, failure = None, None
-    OWN_RUNS.begin()
+    OWN_CPU.begin()
     try:
         value = call_while(lambda: not run.aside, run.task.kind.function, run.task.args)
     except BaseException as error:  # noqa: BLE001 - whatever a user's function raises is the task's failure
@@ -151,7 +152,7 @@ def _run(run: _Run) -> Execution:
     # Asked for its CPU time the kernel charges this thread, and under a quota stops it until what it overdrew
     # is paid: the caller waits for that too.
     now = time.perf_counter()
-    OWN_RUNS.end(now)
+    OWN_CPU.end(now)
     return Execution(
         ONBOARD,
         now - run.published,

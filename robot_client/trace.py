@@ -15,7 +15,7 @@ from robot_client.policies import Decision, Outlook
 from robot_client.regret import Regret
 from robot_client.runner import UNMEASURED, Condition, Execution
 
-WRITE_EVERY_S = 0.2
+WRITE_EVERY_S = 1.0
 WAITING_MAX = 1000  # records not yet written; whoever brings one more writes them
 
 _FIELDS = (

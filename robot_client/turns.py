@@ -11,7 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import TypeVar
 
-LINGER_S = 0.1  # for which the thread leaves the reading to callers after one has read
+LINGER_S = 0.5  # for which the thread leaves the reading to callers after one has read
 
 T = TypeVar("T")
 
@@ -46,7 +46,8 @@ class Answer(Future[T]):
 class Turns:
     """A turn is `tend`, which does what is due, and `read`, which waits at most so many seconds for messages.
 
-    One thread at a time has it. `expected`: how many messages are; `wake` makes a `read` under way return.
+    One thread at a time has it. `asked`: how many answers are waited for; `expected`: whether any message is;
+    `wake` makes a `read` under way return.
     """
 
     def __init__(
@@ -54,11 +55,13 @@ class Turns:
         tend: Callable[[], None],
         read: Callable[[float], None],
         *,
-        expected: Callable[[], int],
+        asked: Callable[[], int],
+        expected: Callable[[], bool],
         wake: Callable[[], None],
     ) -> None:
         self._tend = tend
         self._read = read
+        self._asked = asked
         self._expected = expected
         self._wake = wake
         self.taken = threading.Lock()  # by whoever has the turn
@@ -78,7 +81,7 @@ class Turns:
 
     def attend(self, answer: "Future[T]", until_s: float | None) -> None:
         """Take turns until there is an answer; returns early where somebody else reads."""
-        if self._expected() > 1:
+        if self._asked() > 1:
             self.leave()
             return
         self._read_s = time.perf_counter()

@@ -15,8 +15,8 @@ from loadgen.simulation.server import BUSY, NEED_BLOB, Key, Reply, Server
 from loadgen.simulation.truth import Truth, number_of
 from loadgen.testbed import ROBOT
 from robot_client.cloud import PENDING_MAX
-from robot_client.heartbeat import Heartbeat, Told
-from robot_client.own_runs import OwnRuns
+from robot_client.heartbeat import ALONG_S, Heartbeat, Told
+from robot_client.own_cpu import OwnCpu
 from robot_client.runner import CLOUD, Condition, Execution
 
 TASK, BEAT, CANCEL, BLOB = "task", "beat", "cancel", "blob"  # sorts of messages
@@ -52,7 +52,7 @@ class SimulatedCloud:
         link: Link,
         seed: int,
         heartbeat_s: float,
-        own_runs: OwnRuns,
+        own_cpu: OwnCpu,
     ) -> None:
         self.connection = Connection(
             clock, server, link, seed, on_up=self._start_beating, on_lost=self._fail_all
@@ -62,7 +62,7 @@ class SimulatedCloud:
         self._robot = robot
         self._truth = truth
         self._pending: dict[int, _Pending] = {}
-        self._heartbeat = Heartbeat(heartbeat_s, seed, own_runs)
+        self._heartbeat = Heartbeat(heartbeat_s, seed, own_cpu)
         self._start_beating()
 
     def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - the server knows every kind
@@ -77,6 +77,8 @@ class SimulatedCloud:
             self._end(pending, CloudBusy(f"{PENDING_MAX} tasks are in flight"), started=False)
         else:
             self._pending[task.id] = pending
+            if self._heartbeat.due_s <= now_s + ALONG_S:
+                self._say_beat()
             self._clock.after(self.sending_s, partial(self._send, pending))
             self._clock.at(pending.deadline_s, partial(self._expire, pending))
         return pending.future
@@ -205,8 +207,10 @@ class SimulatedCloud:
         self._plan_beat()
 
     def _beat(self, due_s: float) -> None:
-        if self._heartbeat.due_s != due_s:  # another connection beats by now
-            return
+        if self._heartbeat.due_s == due_s:  # else it was sent with a task, or another connection beats by now
+            self._say_beat()
+
+    def _say_beat(self) -> None:
         number = self._heartbeat.beat(self._clock.now_s())
         self.connection.say(BEAT_BYTES, BEAT, number, partial(self._beat_back, number))
         self._plan_beat()

@@ -1,6 +1,6 @@
 """What others take of a simulated CPU quota, as a robot and a server read it."""
 
-from common.load import EVERY_S, FREE_MIN
+from common.load import FREE_MIN
 from loadgen.simulation.clock import VirtualClock
 from loadgen.simulation.processor import Processor
 
@@ -14,7 +14,7 @@ class SimulatedLoad:
         self._read_at_s = self._own_s = self._others_s = self.latest = 0.0
         self.capacity = min(1.0, processor.cpus)
 
-    def share(self, every_s: float = EVERY_S) -> float:
+    def share(self, every_s: float) -> float:
         since_s = self._clock.now_s() - self._read_at_s
         if since_s >= every_s:
             self._processor.settle()

@@ -5,14 +5,14 @@ from concurrent.futures import Future
 from functools import partial
 
 from common.errors import Overtaken
-from common.load import HURRIED_S
+from common.load import EVERY_S, HURRIED_S, LOADED, LOADED_EVERY_S
 from common.tasks import Kind, Task
 from loadgen.simulation.clock import VirtualClock
 from loadgen.simulation.load import SimulatedLoad
 from loadgen.simulation.processor import Processor, Run
 from loadgen.simulation.truth import Truth
 from loadgen.testbed import ROBOT
-from robot_client.own_runs import OwnRuns
+from robot_client.own_cpu import OwnCpu
 from robot_client.runner import ONBOARD, Condition, Execution
 
 
@@ -27,7 +27,7 @@ class SimulatedOnboard:
         self._truth = truth
         self._runs: dict[int, tuple[Run, Future[Execution]]] = {}
         self._load = SimulatedLoad(clock, processor)
-        self.own_runs = OwnRuns()
+        self.own_cpu = OwnCpu()
 
     def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - onboard always exists
         return None
@@ -37,7 +37,7 @@ class SimulatedOnboard:
         cpu_s = self._truth.cpu_s(ONBOARD, task)
         run = self._processor.add(cpu_s, partial(self._ended, task, cpu_s), owner=ROBOT)
         self._runs[task.id] = run, future
-        self.own_runs.begin()
+        self.own_cpu.begin()
         return future
 
     def cancel(self, task: Task) -> None:
@@ -45,7 +45,7 @@ class SimulatedOnboard:
         run, future = self._runs.pop(task.id, (None, None))
         if run is not None and future is not None:
             self._processor.stop(run)
-            self.own_runs.end(self._clock.now_s())
+            self.own_cpu.end(self._clock.now_s())
             failure, seconds = Overtaken("another site answered first"), self._clock.now_s() - run.added_s
             started = run.begun_s < math.inf
             future.set_result(Execution(ONBOARD, seconds, failure=failure, censored=True, started=started))
@@ -54,7 +54,9 @@ class SimulatedOnboard:
         self._load.share(HURRIED_S)
 
     def condition(self) -> Condition:
-        return Condition(load=self._load.share(), capacity=self._load.capacity)
+        load = self._load.share(LOADED_EVERY_S if self._load.latest > LOADED else EVERY_S)
+        self.own_cpu.loaded = load > LOADED
+        return Condition(load=load, capacity=self._load.capacity)
 
     def close(self) -> None:
         pass
@@ -62,7 +64,7 @@ class SimulatedOnboard:
     def _ended(self, task: Task, cpu_s: float, run: Run) -> None:
         _, future = self._runs.pop(task.id)
         now_s = self._clock.now_s()
-        self.own_runs.end(now_s)
+        self.own_cpu.end(now_s)
         future.set_result(
             Execution(
                 ONBOARD,

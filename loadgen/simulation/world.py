@@ -55,7 +55,7 @@ class World:
             self._link,
             seed,
             heartbeat_s,
-            self.onboard.own_runs,
+            self.onboard.own_cpu,
         )
         self._others: dict[str, OtherRobot] = {}
         for n, name in enumerate(scenario.robots()[1:], 1):

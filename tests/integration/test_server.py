@@ -24,8 +24,8 @@ from cloud_server.server import Server
 from cloud_server.web import Web, create_app
 from common import VERSION, wire
 from common.errors import ConfigError
+from common.load import LOADED
 from common.wire import Blob, Cancel, Hello, Ping, Pong, Reply, Request
-from robot_client.memory import LOADED
 
 pytestmark = pytest.mark.integration
 

@@ -6,6 +6,7 @@ from robot_client.heartbeat import (
     BESIDE_LEAST_OF,
     EVERY_S,
     JITTER,
+    LOADED_SLOWER,
     SILENT_S,
     SLACK_S,
     SLOWER,
@@ -13,7 +14,7 @@ from robot_client.heartbeat import (
     Heartbeat,
     Told,
 )
-from robot_client.own_runs import LATE_MAX, OwnRuns
+from robot_client.own_cpu import LATE_MAX, OwnCpu
 from robot_client.runner import Condition
 
 TRIP_S = 0.03
@@ -21,10 +22,10 @@ IDLE = Told()
 
 
 def beating(
-    until_s: float, trip_s: float = TRIP_S, queue: int = 0, own_runs: OwnRuns | None = None
+    until_s: float, trip_s: float = TRIP_S, queue: int = 0, own_cpu: OwnCpu | None = None
 ) -> Heartbeat:
     """Answered ones from 0 on."""
-    heartbeat = Heartbeat(EVERY_S, seed=1, own_runs=own_runs)
+    heartbeat = Heartbeat(EVERY_S, seed=1, own_cpu=own_cpu)
     heartbeat.start(0.0)
     while heartbeat.due_s < until_s:
         now_s = heartbeat.due_s
@@ -76,6 +77,18 @@ def test_they_come_in_jittered_intervals() -> None:
     assert pauses != others
 
 
+def test_they_come_rarer_while_the_robot_is_loaded() -> None:
+    """LOADED_SLOWER times as late each, and as before once the others are gone."""
+    own_cpu = OwnCpu()
+    heartbeat = beating(2.0, own_cpu=own_cpu)
+    for loaded, least, most in ((True, LOADED_SLOWER, LOADED_SLOWER), (False, 1, 1)):
+        own_cpu.loaded = loaded
+        now_s = heartbeat.due_s
+        heartbeat.answer(heartbeat.beat(now_s), now_s + TRIP_S, IDLE)
+        pause = (heartbeat.due_s - now_s) / EVERY_S
+        assert (1 - JITTER) * least <= pause <= (1 + JITTER) * most
+
+
 def test_round_trip_and_queue_are_told() -> None:
     """As the last answers told them."""
     condition = beating(2.0, queue=4).condition(2.0)
@@ -94,9 +107,9 @@ def test_one_stalled_answer_is_no_slow_link() -> None:
 
 def test_beside_an_own_run_a_round_trip_is_one_of_many() -> None:
     """Only BESIDE_LEAST_OF longer ones in a row are believed, and one that is shorter again at once."""
-    own_runs = OwnRuns()
-    heartbeat = beating(2.0, own_runs=own_runs)
-    own_runs.begin()
+    own_cpu = OwnCpu()
+    heartbeat = beating(2.0, own_cpu=own_cpu)
+    own_cpu.begin()
     for count in range(1, BESIDE_LEAST_OF + 1):
         at_s = heartbeat.due_s
         heartbeat.answer(heartbeat.beat(at_s), at_s + 1.5 * TRIP_S, IDLE)
@@ -108,9 +121,9 @@ def test_beside_an_own_run_a_round_trip_is_one_of_many() -> None:
 
 def test_own_runs_do_not_explain_a_link_that_is_far_slower() -> None:
     """Beyond LATE_MAX times as long as known, two in a row are believed, whatever the robot computes."""
-    own_runs = OwnRuns()
-    heartbeat = beating(2.0, own_runs=own_runs)
-    own_runs.begin()
+    own_cpu = OwnCpu()
+    heartbeat = beating(2.0, own_cpu=own_cpu)
+    own_cpu.begin()
     for at_s in (2.0, 2.5):
         heartbeat.answer(heartbeat.beat(at_s), at_s + 1.1 * LATE_MAX * TRIP_S, IDLE)
     assert heartbeat.condition(2.6).round_trip_s == pytest.approx(1.1 * LATE_MAX * TRIP_S)
@@ -118,11 +131,11 @@ def test_own_runs_do_not_explain_a_link_that_is_far_slower() -> None:
 
 def test_a_link_that_got_slow_is_so_beside_own_runs_too() -> None:
     """What was quick before two slow answers in a row is forgotten."""
-    own_runs = OwnRuns()
-    heartbeat = beating(2.0, own_runs=own_runs)
+    own_cpu = OwnCpu()
+    heartbeat = beating(2.0, own_cpu=own_cpu)
     for at_s in (2.0, 2.3):
         heartbeat.answer(heartbeat.beat(at_s), at_s + 0.2, IDLE)
-    own_runs.begin()
+    own_cpu.begin()
     heartbeat.answer(heartbeat.beat(2.6), 2.9, IDLE)
     assert heartbeat.condition(2.9).round_trip_s == pytest.approx(0.2)
 
@@ -130,10 +143,10 @@ def test_a_link_that_got_slow_is_so_beside_own_runs_too() -> None:
 def test_a_run_that_ended_after_the_question_was_beside_it() -> None:
     """Runs that ended before it was sent are not."""
     for ended_s, known_s in ((1.9, 1.5 * TRIP_S), (2.1, TRIP_S)):
-        own_runs = OwnRuns()
-        heartbeat = beating(2.0, own_runs=own_runs)
-        own_runs.begin()
-        own_runs.end(ended_s)
+        own_cpu = OwnCpu()
+        heartbeat = beating(2.0, own_cpu=own_cpu)
+        own_cpu.begin()
+        own_cpu.end(ended_s)
         for at_s in (2.0, 2.05):
             heartbeat.answer(heartbeat.beat(at_s), at_s + 1.5 * TRIP_S, IDLE)
         assert heartbeat.condition(2.3).round_trip_s == pytest.approx(known_s)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from common import load
-from common.load import EVERY_S, HURRIED_S, LOOKED_UP_EVERY, READINGS_MAX, TICK_S, Load, LoadWatch
+from common.load import EVERY_S, HURRIED_S, LOADED, LOOKED_UP_EVERY, READINGS_MAX, TICK_S, Load, LoadWatch
 from tests.unit.test_cpu import Machine
 
 CPUS = os.cpu_count() or 1
@@ -247,6 +247,16 @@ def test_a_watch_reads_in_a_thread_of_its_own() -> None:
     watch.close()
     second.join(10)
     assert not second.is_alive()
+
+
+def test_a_watch_reads_a_loaded_robot_more_seldom() -> None:
+    """Every `loaded_every_s` from the first reading above LOADED on."""
+    counted = Counted(Path("/proc/self"))
+    watch = LoadWatch(counted, every_s=0.001, loaded_every_s=60.0)
+    assert watch.latest()[0] == 1 > LOADED
+    time.sleep(0.05)
+    assert watch.latest()[0] == 1
+    watch.close()
 
 
 def test_who_hurries_reads_at_once_and_not_too_often(tmp_path: Path, times: Times) -> None:

@@ -10,7 +10,7 @@ from common.tasks import kind_of, task
 from robot_client import objectives, predictors
 from robot_client.energy import Energy
 from robot_client.memory import WAY_LEAST_OF, KindMemory
-from robot_client.own_runs import LATE_MAX
+from robot_client.own_cpu import LATE_MAX
 from robot_client.policies import Outlook
 from robot_client.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
 

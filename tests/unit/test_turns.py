@@ -18,8 +18,15 @@ class Line:
     """Messages that arrive, each for one answer, and who read them."""
 
     def __init__(self) -> None:
-        self.turns = Turns(self.tend, self.read, expected=lambda: len(self.waiting), wake=self.wake)
         self.waiting: dict[int, Answer[int]] = {}
+        self.unasked = 0  # messages that are expected, and that nobody waits for
+        self.turns = Turns(
+            self.tend,
+            self.read,
+            asked=self.waiting.__len__,
+            expected=lambda: bool(self.waiting or self.unasked),
+            wake=self.wake,
+        )
         self.read_by: list[str] = []
         self.tended = 0
         self._arrived: deque[int] = deque()
@@ -93,6 +100,20 @@ def test_the_thread_reads_for_several(line: Line) -> None:
     line.arrive_later(2)
     assert first.exception(LONG_S) is None
     assert line.read_by[2:] == ["thread", "thread"]
+
+
+def test_who_waits_alone_reads_what_nobody_waits_for_too(line: Line) -> None:
+    """As the answer to a heartbeat; where that comes later than his own the thread reads it."""
+    line.answered(0), line.answered(1)
+    line.unasked = 1
+    assert line.answered(2) == 2
+    assert line.read_by[2:] == [ME]
+    line.waiting[3] = unasked = Answer[int](line.turns)
+    heard = threading.Event()
+    unasked.add_done_callback(lambda _: heard.set())
+    line.arrive(3)
+    assert heard.wait(LONG_S)
+    assert line.read_by[3:] == ["thread"]
 
 
 def test_the_thread_reads_for_who_waits_for_anything_else_too(line: Line) -> None:

@@ -1,4 +1,4 @@
-"""What this process computes itself: it is slow to hear of other sites meanwhile.
+"""What takes the CPU of this process: it is slow to hear of other sites meanwhile.
 
 All of its threads share the interpreter's lock and, under a quota, its CPU time. What it measures of a server
 then is too long, by 10 to 50 ms on a tenth of a CPU.
@@ -14,10 +14,14 @@ def may_be_late(seconds: float, expected_s: float | None) -> bool:
     return expected_s is not None and seconds <= LATE_MAX * expected_s
 
 
-class OwnRuns:
-    """Whether any run was under way since some time, on the clock of `time.perf_counter`."""
+class OwnCpu:
+    """Whether any run was under way since some time, on the clock of `time.perf_counter`.
+
+    `loaded`: others take so much of the CPU that what is measured tells of them.
+    """
 
     def __init__(self) -> None:
+        self.loaded = False
         self._running = 0
         self._ended_s = float("-inf")
         self._lock = threading.Lock()
@@ -36,4 +40,4 @@ class OwnRuns:
         return self._running > 0 or self._ended_s >= at_s
 
 
-OWN_RUNS = OwnRuns()  # of this process
+OWN_CPU = OwnCpu()  # of this process

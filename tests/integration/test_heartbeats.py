@@ -1,0 +1,79 @@
+"""When a client sends its heartbeats, seen from the server's end of the socket."""
+
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+
+import pytest
+import zmq
+
+from common import wire
+from common.tasks import Task, kind_of, kinds, task
+from common.wire import Hello, Message, Ping, Pong, Reply, Request
+from robot_client import cloud
+from robot_client.cloud import CloudRunner
+from robot_client.turns import LINGER_S
+
+pytestmark = pytest.mark.integration
+
+WAIT_S = 8.0
+HARDLY_EVER_S = 1000.0
+
+
+@task("nothing", size=lambda: 0.0)
+def nothing() -> None:
+    pass
+
+
+class Peer:
+    """The far end; it says what it is told to."""
+
+    def __init__(self, socket: "zmq.Socket[bytes]") -> None:
+        self.endpoint = f"tcp://127.0.0.1:{socket.bind_to_random_port('tcp://127.0.0.1')}"
+        self._socket = socket
+        self._client = b""
+
+    def hear(self, wait_s: float = WAIT_S) -> Message | None:
+        if not self._socket.poll(round(wait_s * 1e3)):
+            return None
+        self._client, *frames = self._socket.recv_multipart()
+        return wire.unpack(frames)
+
+    def say(self, message: Message) -> None:
+        self._socket.send_multipart([self._client, *wire.pack(message)])
+
+
+@contextmanager
+def met(heartbeat_s: float) -> Iterator[tuple[CloudRunner, Peer]]:
+    """A client whose first heartbeat was answered."""
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as socket:
+        socket.linger = 0
+        peer = Peer(socket)
+        with closing(CloudRunner(peer.endpoint, heartbeat_s=heartbeat_s)) as runner:
+            assert isinstance(peer.hear(), Hello)
+            peer.say(Hello({kind.name: kind.source_hash for kind in kinds()}, "0", 2**20))
+            first = peer.hear()
+            assert isinstance(first, Ping)
+            peer.say(Pong(first.id))
+            yield runner, peer
+
+
+def test_one_that_is_due_soon_goes_ahead_of_a_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its answer comes while somebody waits for the task's, and is read by him."""
+    monkeypatch.setattr(cloud, "ALONG_S", 2 * HARDLY_EVER_S)
+    with met(HARDLY_EVER_S) as (runner, peer):
+        answer = runner.submit(Task(kind_of(nothing), (), 0.0), WAIT_S)
+        ping, request = peer.hear(), peer.hear()
+        assert isinstance(ping, Ping)
+        assert isinstance(request, Request)
+        peer.say(Pong(ping.id, queue_depth=7))
+        peer.say(Reply(request.id, "ok", body=wire.encode(None, (), blobs=False).frames, queue_depth=7))
+        assert answer.result(WAIT_S).ok
+        assert runner.condition().queue == 7
+
+
+def test_one_that_is_not_due_waits() -> None:
+    """A task alone brings none forward."""
+    with met(HARDLY_EVER_S) as (runner, peer):
+        runner.submit(Task(kind_of(nothing), (), 0.0), WAIT_S)
+        assert isinstance(peer.hear(), Request)
+        assert peer.hear(2 * LINGER_S) is None
