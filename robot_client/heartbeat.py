@@ -11,9 +11,7 @@ from robot_client.own_cpu import OwnCpu, may_be_late
 from robot_client.runner import Condition
 
 EVERY_S = 0.5
-LOADED_SLOWER = (
-    3  # times as rarely from a loaded robot: its tasks wait for the CPU, its round trips tell of that
-)
+LOADED_SLOWER = 3  # times as rarely from a loaded robot, whose tasks wait for the CPU
 JITTER = 0.2  # each comes up to this share earlier or later: robots of a fleet do not beat together
 ALONG_S = 0.1  # so much earlier one goes ahead of a task, whose answer is waited for anyway
 SILENT_S = 0.25  # unanswered for longer than this, and longer than round trips vary: the site is silent
