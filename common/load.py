@@ -16,7 +16,6 @@ from common.cpu import QuotaGroup, parse_usage, quota_group, read_small
 
 LOADED = 0.3  # of the CPU, taken by others: from there on times tell of that
 EVERY_S = 0.5  # by a robot, and no more often: a reading costs more than a decision
-LOADED_EVERY_S = 1.5  # by one that is LOADED, and waits for the CPU as its tasks do
 SERVER_EVERY_S = 0.1  # by a server, for all of its robots
 HURRIED_S = 0.05  # but so often where it may just have changed
 TELLING_S = 0.02  # CPU seconds there were to take; of fewer one sees the kernel's ticks alone

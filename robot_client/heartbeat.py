@@ -11,7 +11,6 @@ from robot_client.own_cpu import OwnCpu, may_be_late
 from robot_client.runner import Condition
 
 EVERY_S = 0.5
-LOADED_SLOWER = 3  # times as rarely from a loaded robot, whose tasks wait for the CPU
 JITTER = 0.2  # each comes up to this share earlier or later: robots of a fleet do not beat together
 ALONG_S = 0.1  # so much earlier one goes ahead of a task, whose answer is waited for anyway
 SILENT_S = 0.25  # unanswered for longer than this, and longer than round trips vary: the site is silent
@@ -75,9 +74,7 @@ class Heartbeat:
         self._next_id += 1
         self._sent[self._next_id] = now_s
         self._oldest_s = min(self._oldest_s, now_s)
-        pause_s = self._every_s * (1 + JITTER * self._random.uniform(-1, 1))
-        if self._own_cpu.loaded:
-            pause_s *= LOADED_SLOWER
+        pause_s = self._own_cpu.pause_s(self._every_s) * (1 + JITTER * self._random.uniform(-1, 1))
         if len(self._sent) > UNANSWERED_MAX:
             del self._sent[next(iter(self._sent))]
             pause_s *= SLOWER

@@ -11,11 +11,11 @@ from queue import SimpleQueue
 from common import cpu
 from common.cpu import SELF
 from common.errors import OffloadError, Overtaken, TaskFailed, describe
-from common.load import EVERY_S, LOADED, LOADED_EVERY_S, Load, LoadWatch
+from common.load import EVERY_S, LOADED, Load, LoadWatch
 from common.tasks import Kind, Task
 from common.threads import join_all
 from common.wanted import call_while
-from robot_client.own_cpu import OWN_CPU
+from robot_client.own_cpu import LOADED_SLOWER, OWN_CPU
 from robot_client.runner import ONBOARD, Condition, Execution
 
 ASIDE_MAX = 4  # runs that nobody waits for any more and that still go on
@@ -52,7 +52,7 @@ class OnboardRunner:
         self._aside = 0
         self._closed = False
         self._lock = threading.Lock()
-        self._load = LoadWatch(Load(SELF), EVERY_S, LOADED_EVERY_S)
+        self._load = LoadWatch(Load(SELF), EVERY_S, LOADED_SLOWER * EVERY_S)
         self._condition = Condition()
 
     def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - onboard always exists

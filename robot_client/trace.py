@@ -11,11 +11,12 @@ from typing import Any
 
 from robot_client import lines
 from robot_client.lines import VERSION, Lines
+from robot_client.own_cpu import OWN_CPU
 from robot_client.policies import Decision, Outlook
 from robot_client.regret import Regret
 from robot_client.runner import UNMEASURED, Condition, Execution
 
-WRITE_EVERY_S = 1.0
+WRITE_EVERY_S = 0.2
 WAITING_MAX = 1000  # records not yet written; whoever brings one more writes them
 
 _FIELDS = (
@@ -91,8 +92,8 @@ _DECISION_FIELDS, _LATE_FIELDS, _REGRET_FIELDS = (
 class Trace(Lines):
     """Appends records to a file, in order; a line that cannot be written is logged and tasks go on.
 
-    A thread makes the lines, some at a time, every WRITE_EVERY_S: where a robot has a tenth of a CPU, a line
-    between two tasks takes the time that the next one needs. A crash loses what was not written yet.
+    A thread makes the lines, some at a time, every WRITE_EVERY_S, more seldom on a loaded robot: where a robot
+    has a tenth of a CPU, a line between two tasks takes the time that the next one needs. A crash loses what was not written yet.
     """
 
     def __init__(self, path: Path) -> None:
@@ -126,7 +127,7 @@ class Trace(Lines):
                 self.append(record.i, as_dict(record))
 
     def _run(self) -> None:
-        while not self._closing.wait(WRITE_EVERY_S):
+        while not self._closing.wait(OWN_CPU.pause_s(WRITE_EVERY_S)):
             self.flush()
 
 

@@ -11,7 +11,9 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import TypeVar
 
-LINGER_S = 0.5  # for which the thread leaves the reading to callers after one has read
+from robot_client.own_cpu import OWN_CPU
+
+LINGER_S = 0.1  # for which the thread leaves the reading to callers after one has read
 
 T = TypeVar("T")
 
@@ -115,12 +117,13 @@ class Turns:
         self.call()
 
     def _left_to_callers(self) -> bool:
-        """Whether callers read for now; the thread then rests until it is called, or for LINGER_S."""
+        """Whether callers read for now; the thread then rests until it is called, or for a while."""
         self._resting = True  # before it looks: whoever expects something from now on calls
         idle_s = time.perf_counter() - self._read_s
-        rests = self.taken.locked() or (idle_s < LINGER_S and not self._expected())
+        linger_s = OWN_CPU.pause_s(LINGER_S)
+        rests = self.taken.locked() or (idle_s < linger_s and not self._expected())
         if rests and not self._called.is_set():
-            self._called.wait(LINGER_S)
+            self._called.wait(linger_s)
             return True
         self._resting = False
         self._called.clear()

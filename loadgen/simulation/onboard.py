@@ -5,7 +5,7 @@ from concurrent.futures import Future
 from functools import partial
 
 from common.errors import Overtaken
-from common.load import EVERY_S, HURRIED_S, LOADED, LOADED_EVERY_S
+from common.load import EVERY_S, HURRIED_S, LOADED
 from common.tasks import Kind, Task
 from loadgen.simulation.clock import VirtualClock
 from loadgen.simulation.load import SimulatedLoad
@@ -54,7 +54,7 @@ class SimulatedOnboard:
         self._load.share(HURRIED_S)
 
     def condition(self) -> Condition:
-        load = self._load.share(LOADED_EVERY_S if self._load.latest > LOADED else EVERY_S)
+        load = self._load.share(self.own_cpu.pause_s(EVERY_S))
         self.own_cpu.loaded = load > LOADED
         return Condition(load=load, capacity=self._load.capacity)
 

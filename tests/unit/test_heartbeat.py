@@ -6,7 +6,6 @@ from robot_client.heartbeat import (
     BESIDE_LEAST_OF,
     EVERY_S,
     JITTER,
-    LOADED_SLOWER,
     SILENT_S,
     SLACK_S,
     SLOWER,
@@ -14,7 +13,7 @@ from robot_client.heartbeat import (
     Heartbeat,
     Told,
 )
-from robot_client.own_cpu import LATE_MAX, OwnCpu
+from robot_client.own_cpu import LATE_MAX, LOADED_SLOWER, OwnCpu
 from robot_client.runner import Condition
 
 TRIP_S = 0.03
