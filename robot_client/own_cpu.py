@@ -28,7 +28,7 @@ class OwnCpu:
         self._lock = threading.Lock()
 
     def pause_s(self, usual_s: float) -> float:
-        """Until what is done again and again beside the tasks is done again: it takes the CPU they wait for."""
+        """Until what is done again and again beside the tasks, whose CPU it takes, is done again."""
         return LOADED_SLOWER * usual_s if self.loaded else usual_s
 
     def begin(self) -> None:

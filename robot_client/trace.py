@@ -92,8 +92,9 @@ _DECISION_FIELDS, _LATE_FIELDS, _REGRET_FIELDS = (
 class Trace(Lines):
     """Appends records to a file, in order; a line that cannot be written is logged and tasks go on.
 
-    A thread makes the lines, some at a time, every WRITE_EVERY_S, more seldom on a loaded robot: where a robot
-    has a tenth of a CPU, a line between two tasks takes the time that the next one needs. A crash loses what was not written yet.
+    A thread makes the lines, some at a time, every WRITE_EVERY_S, more seldom on a loaded robot: where a
+    robot has a tenth of a CPU, a line between two tasks takes the time that the next one needs. A crash
+    loses what was not written yet.
     """
 
     def __init__(self, path: Path) -> None:
