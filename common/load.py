@@ -130,18 +130,20 @@ class Load:
 
 
 class LoadWatch:
-    """Reads a load at the first look at it, and from then on in a thread of its own.
+    """Reads a load at the first look at it, and from then on every `every_s` in a thread of its own.
 
-    Every `every_s`; every `loaded_every_s`, if that is given, while the CPU is LOADED.
+    `pause_s` makes of that how long it waits for the next reading.
 
     A process that asks for its CPU time is charged what it owes, and waits there for its quota: a thread that
     decides must not be the one to ask.
     """
 
-    def __init__(self, load: Load, every_s: float = EVERY_S, loaded_every_s: float | None = None) -> None:
+    def __init__(
+        self, load: Load, every_s: float = EVERY_S, pause_s: Callable[[float], float] = float
+    ) -> None:
         self._load = load
         self._every_s = every_s
-        self._loaded_every_s = every_s if loaded_every_s is None else loaded_every_s
+        self._pause_s = pause_s
         self._latest = (0.0, 1.0)
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="load", daemon=True)
@@ -169,7 +171,7 @@ class LoadWatch:
         self._closed.set()
 
     def _run(self) -> None:
-        while not self._closed.wait(self._loaded_every_s if self._latest[0] > LOADED else self._every_s):
+        while not self._closed.wait(self._pause_s(self._every_s)):
             with self._reading:
                 self._read()
 

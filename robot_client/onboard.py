@@ -11,11 +11,11 @@ from queue import SimpleQueue
 from common import cpu
 from common.cpu import SELF
 from common.errors import OffloadError, Overtaken, TaskFailed, describe
-from common.load import EVERY_S, LOADED, Load, LoadWatch
+from common.load import LOADED, Load, LoadWatch
 from common.tasks import Kind, Task
 from common.threads import join_all
 from common.wanted import call_while
-from robot_client.own_cpu import LOADED_SLOWER, OWN_CPU
+from robot_client.own_cpu import OWN_CPU
 from robot_client.runner import ONBOARD, Condition, Execution
 
 ASIDE_MAX = 4  # runs that nobody waits for any more and that still go on
@@ -52,7 +52,7 @@ class OnboardRunner:
         self._aside = 0
         self._closed = False
         self._lock = threading.Lock()
-        self._load = LoadWatch(Load(SELF), EVERY_S, LOADED_SLOWER * EVERY_S)
+        self._load = LoadWatch(Load(SELF), pause_s=OWN_CPU.pause_s)
         self._condition = Condition()
 
     def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - onboard always exists
@@ -88,9 +88,9 @@ class OnboardRunner:
 
     def condition(self) -> Condition:
         found, (load, capacity) = self._condition, self._load.latest()
+        OWN_CPU.loaded = load > LOADED
         if found.load != load or found.capacity != capacity:
             found = self._condition = Condition(load=load, capacity=capacity)
-            OWN_CPU.loaded = load > LOADED
         return found
 
     def close(self) -> None:
@@ -100,6 +100,7 @@ class OnboardRunner:
                 return
             self._closed = True
             self._load.close()
+            OWN_CPU.loaded = False  # nobody reads it any more
             waiting = [run for run in self._runs.values() if run.thread is None]
             for run in waiting:
                 del self._runs[run.task.id]

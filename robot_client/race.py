@@ -85,17 +85,17 @@ class Race:
         self._runs[site] = self._runners[site].submit(self._task, self._timeout_s), began_s
 
     def _start_second(self, site: str, after_s: float) -> None:
-        runs = {first: run for first, (run, _) in self._runs.items()}
+        late: list[str] = []
         if after_s > 0:
-            if not any(run.done() for run in runs.values()):
-                self._clock.wait(list(runs.values()), after_s)
-            if any(run.done() for run in runs.values()):
+            late, runs = list(self._runs), [run for run, _ in self._runs.values()]
+            if not any(run.done() for run in runs):
+                self._clock.wait(runs, after_s)
+            if any(run.done() for run in runs):
                 return
         if self._allowed():
             self._start(site)
-        if after_s > 0:
-            for first in runs:  # after the start: a robot that is late may be so for want of CPU
-                self._runners[first].hurry()
+        for first in late:  # after the start: a robot may be late for want of CPU
+            self._runners[first].hurry()
 
     def _wait_for_answer(self, call: "Future[str] | None") -> None:
         while True:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from common import load
-from common.load import EVERY_S, HURRIED_S, LOADED, LOOKED_UP_EVERY, READINGS_MAX, TICK_S, Load, LoadWatch
+from common.load import EVERY_S, HURRIED_S, LOOKED_UP_EVERY, READINGS_MAX, TICK_S, Load, LoadWatch
 from tests.unit.test_cpu import Machine
 
 CPUS = os.cpu_count() or 1
@@ -249,13 +249,22 @@ def test_a_watch_reads_in_a_thread_of_its_own() -> None:
     assert not second.is_alive()
 
 
-def test_a_watch_reads_a_loaded_robot_more_seldom() -> None:
-    """Every `loaded_every_s` from the first reading above LOADED on."""
-    counted = Counted(Path("/proc/self"))
-    watch = LoadWatch(counted, every_s=0.001, loaded_every_s=60.0)
-    assert watch.latest()[0] == 1 > LOADED
+def test_a_watch_asks_how_long_to_wait() -> None:
+    """Before each reading but the first, with its interval."""
+    counted, asked, done = Counted(Path("/proc/self")), [], threading.Event()
+
+    def pause_s(usual_s: float) -> float:
+        asked.append(usual_s)
+        if len(asked) == 3:
+            done.set()
+            return 60.0
+        return 0.001
+
+    watch = LoadWatch(counted, 7.0, pause_s)
+    watch.latest()
+    assert done.wait(10)
     time.sleep(0.05)
-    assert watch.latest()[0] == 1
+    assert (asked, watch.latest()[0]) == ([7.0, 7.0, 7.0], 3)
     watch.close()
 
 

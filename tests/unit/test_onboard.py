@@ -11,6 +11,7 @@ from common.tasks import Task, kind_of, task
 from common.wanted import check_wanted
 from robot_client import onboard
 from robot_client.onboard import ASIDE_MAX, ASIDE_NICE, OnboardRunner
+from robot_client.own_cpu import LOADED_SLOWER, OWN_CPU
 
 WAIT_S = 5.0
 
@@ -187,3 +188,22 @@ def test_so_many_workers_run_at_a_time() -> None:
     assert [future.result(WAIT_S).value for future in futures] == list(range(6))
     assert sorted(gate.begun) == list(range(6))
     many.close()
+
+
+def test_a_load_is_forgotten_with_the_runner_that_read_it(
+    runner: OnboardRunner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While it lasts pauses are longer, in the whole process; the next runner begins without."""
+    monkeypatch.setattr(runner._load, "latest", lambda: (0.9, 1.0))
+    runner.condition()
+    assert OWN_CPU.pause_s(1.0) == LOADED_SLOWER
+    runner.close()
+    assert OWN_CPU.pause_s(1.0) == 1.0
+
+
+def test_a_load_is_over_when_none_is_read(runner: OnboardRunner, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever read it: a look that finds what it found before tells too."""
+    monkeypatch.setattr(runner._load, "latest", lambda: (0.0, 1.0))
+    monkeypatch.setattr(OWN_CPU, "loaded", True)
+    runner.condition()
+    assert OWN_CPU.pause_s(1.0) == 1.0

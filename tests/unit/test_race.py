@@ -127,6 +127,19 @@ def test_whoever_is_late_is_asked_whether_it_is_there(course: Course) -> None:
     assert course.sites[ONBOARD].hurried_s == []
 
 
+def test_the_second_starts_before_the_late_one_is_asked(
+    course: Course, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To ask takes CPU, for want of which the first may be late."""
+    begun_by_then: list[list[str]] = []
+    monkeypatch.setattr(
+        course.sites[ONBOARD], "hurry", lambda: begun_by_then.append([site for site, _ in course.begun])
+    )
+    course.take(onboard=0.5, cloud=0.1)
+    course.run(Plan((ONBOARD,), CLOUD, 0.2))
+    assert begun_by_then == [[ONBOARD, CLOUD]]
+
+
 def test_what_comes_of_an_overtaken_run_is_told_once(course: Course) -> None:
     """A server's run ends at once, censored; one onboard, which cannot be stopped, when it is done."""
     course.take(onboard=0.2, cloud=1.0)
