@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+from loadgen.containers import RUN
+
 ROOT = Path(__file__).parents[2]
 PROJECT = "offboard-test"
 HTTP_PORT, WAN_HTTP_PORT = "18000", "18001"
@@ -82,6 +84,15 @@ def docker(*args: str) -> str:
     done = subprocess.run(["docker", *args], cwd=ROOT, capture_output=True, text=True, timeout=COMMAND_S)
     assert done.returncode == 0, f"docker {' '.join(args)}:\n{done.stderr[-3000:]}"
     return done.stdout.strip()
+
+
+def made_by_docker(run: str | None = None) -> list[str]:
+    """Containers and networks of a testbed's run, or of any."""
+    mine = ("--filter", f"label={RUN}" if run is None else f"label={RUN}={run}", "--format")
+    return [
+        *docker("ps", "--all", *mine, "{{.Names}}").split(),
+        *docker("network", "ls", *mine, "{{.Name}}").split(),
+    ]
 
 
 def engine_problem() -> str | None:

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from common.errors import ConfigError
-from loadgen.containers import OWNER, RUN, DockerTestbed
+from loadgen.containers import OWNER, DockerTestbed
 from loadgen.testbed import Setup
-from tests.compose.conftest import ROOT, docker
+from tests.compose.conftest import ROOT, docker, made_by_docker
 from tests.testbeds import CONTRACT, Bench, setups, start
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600), pytest.mark.usefixtures("engine")]
@@ -58,7 +58,7 @@ def bench(engine: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Be
             return docker("top", name(bed, part), "-eo", "pid,args").count(HOG)
 
         yield Bench(bed, partial(cpu, bed), hogs)
-    assert left_over(bed.run) == []
+    assert made_by_docker(bed.run) == []
 
 
 @pytest.fixture
@@ -75,19 +75,10 @@ def host(tmp_path: Path) -> Iterator[Callable[[], tuple[subprocess.Popen[str], s
             stack.callback(process.kill)
             assert process.stdout is not None
             run = process.stdout.readline().strip()
-            assert len(left_over(run)) == 4, "a container and three networks"
+            assert len(made_by_docker(run)) == 4, "a container and three networks"
             return process, run
 
         yield run_host
-
-
-def left_over(run: str) -> list[str]:
-    """What is there of a testbed's containers and networks."""
-    mine = ("--filter", f"label={RUN}={run}", "--format")
-    return [
-        *docker("ps", "--all", *mine, "{{.Names}}").split(),
-        *docker("network", "ls", *mine, "{{.Name}}").split(),
-    ]
 
 
 def name(bed: DockerTestbed, part: str) -> str:
@@ -108,7 +99,7 @@ def test_an_unknown_flag_is_the_parts_own_line(tmp_path: Path, monkeypatch: pyte
         pytest.raises(ConfigError, match=r"^loadgen wan: unrecognized arguments: --dely-ms=1.0 "),
     ):
         bed.start("wan")
-    assert left_over(bed.run) == []
+    assert made_by_docker(bed.run) == []
 
 
 def test_a_robot_reaches_the_relay_and_nothing_else(bench: Bench) -> None:
@@ -168,7 +159,7 @@ def test_an_interrupted_testbed_leaves_nothing(host: Callable[..., tuple], stop:
     process.send_signal(stop)
     process.send_signal(stop)
     process.wait(END_S)
-    assert left_over(run) == []
+    assert made_by_docker(run) == []
 
 
 def test_a_killed_testbed_is_cleared_away_by_the_next(
@@ -178,11 +169,11 @@ def test_a_killed_testbed_is_cleared_away_by_the_next(
     killed, left = host()
     killed.kill()
     killed.wait(END_S)
-    assert left_over(left) != []
+    assert made_by_docker(left) != []
     monkeypatch.chdir(ROOT)
     with DockerTestbed(tmp_path / "first") as first:
-        assert left_over(left) == []
+        assert made_by_docker(left) == []
         with DockerTestbed(tmp_path / "second"):
-            assert len(left_over(first.run)) == 3, "its networks"
+            assert len(made_by_docker(first.run)) == 3, "its networks"
             assert docker("network", "ls", "--filter", f"label={OWNER}", "--quiet").split()
-    assert left_over(first.run) == []
+    assert made_by_docker(first.run) == []
