@@ -12,6 +12,7 @@ RUN python3 -m venv /opt/offboard \
 FROM base AS wheel
 WORKDIR /src
 COPY pyproject.toml README.md LICENSE ./
+COPY offboard offboard
 COPY common common
 COPY robot_client robot_client
 COPY cloud_server cloud_server

@@ -23,12 +23,12 @@ import msgpack
 import numpy as np
 import zmq
 
-from common import wire
-from common.keys import ROBOT, make_keys, robot_keys
-from common.maps import GridMap
-from common.planner import Point, Pose, Scan, plan_path
-from common.tasks import kind_of
-from robot_client.runner import CLOUD
+from offboard.common.planning.maps import GridMap
+from offboard.common.planning.planner import Point, Pose, Scan, plan_path
+from offboard.common.security.keys import ROBOT, make_keys, robot_keys
+from offboard.common.tasks import kind_of
+from offboard.common.wire import messages as wire
+from offboard.robot_client.sites.runner import CLOUD
 
 SHARE = 0.5  # of a core
 SEND_S = 0.05  # longest wait for the server to read
@@ -36,7 +36,7 @@ CONNECTIONS = 200  # held open by who is slow
 IDLE = 5_000  # connections
 PART_BYTES = 1 << 20
 SEED = 1
-EXT_BLOB, EXT_DATACLASS = 2, 3  # msgpack extensions of common.values
+EXT_BLOB, EXT_DATACLASS = 2, 3  # msgpack extensions of offboard.common.wire.values
 PLAIN_GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)  # ZMTP 3.0
 READY = b"\x04\x1c\x05READY\x0bSocket-Type\x00\x00\x00\x06DEALER"
 

@@ -13,11 +13,11 @@ from benchmarks.keyring import Keys
 from benchmarks.measure import Bar, Table, each_of
 from benchmarks.servers import READY_S, cloud_server, running
 from benchmarks.tasks import nothing
-from common import planner
-from common.maps import free_pairs, read_map
-from common.planner import Point, Pose, plan_path
-from robot_client.offloader import Offloader
-from robot_client.runner import CLOUD
+from offboard.common.planning import planner
+from offboard.common.planning.maps import free_pairs, read_map
+from offboard.common.planning.planner import Point, Pose, plan_path
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.sites.runner import CLOUD
 
 MAP = Path(__file__).parents[1] / "maps/willow-full-0.05.yaml"
 MIB = 1 << 20
@@ -55,7 +55,7 @@ def beside(keys: Keys, plans: int, attacks: dict[str, object]) -> Table:
     }
     rows, quiet, attacked = [], _Phase(), _Phase()
     with (
-        cloud_server("common.planner", CLOUD_KEYS=str(keys.server), **sizes) as server,
+        cloud_server("offboard.common.planning.planner", CLOUD_KEYS=str(keys.server), **sizes) as server,
         Offloader.connect(server.endpoint, policy=CLOUD, keys=good, timeout_s=READY_S) as offload,
     ):
         plan = _plans(offload, plans)

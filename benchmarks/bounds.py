@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.measure import Table
-from loadgen.outcome import Reference
-from loadgen.scenario import find_scenario, read_scenario
-from loadgen.simulation.batch import Batch
-from robot_client import policies
-from robot_client.runner import CLOUD, ONBOARD
+from offboard.loadgen.scenario.outcome import Reference
+from offboard.loadgen.scenario.scenario import find_scenario, read_scenario
+from offboard.loadgen.simulation.batch import Batch
+from offboard.robot_client import policies
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 SEEDS, TASKS, FROM_TASK = 6, 500, 20
 ALLOWANCES = (0.0, 0.05, 0.1, 0.2)  # second runs a task

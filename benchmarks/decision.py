@@ -8,11 +8,11 @@ from concurrent.futures import Future
 import numpy as np
 
 from benchmarks.measure import Bar, Table, each_of
-from common.tasks import Kind, Task, kind_of, task
-from robot_client import policies, predictors
-from robot_client.offloader import Offloader
-from robot_client.policies import Policy
-from robot_client.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
+from offboard.common.tasks import Kind, Task, kind_of, task
+from offboard.robot_client import policies, predictors
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import Policy
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
 
 CALLS = 2_000
 RUN = "a run that is over at once"

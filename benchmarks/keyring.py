@@ -3,7 +3,7 @@
 import shutil
 from pathlib import Path
 
-from common.keys import ROBOT, SERVER, make_keys
+from offboard.common.security.keys import ROBOT, SERVER, make_keys
 
 
 class Keys:

@@ -13,12 +13,12 @@ import numpy as np
 
 from benchmarks.measure import Bar, Table
 from benchmarks.servers import cloud_server, running, serve
-from common import planner
-from common.maps import free_pairs, read_map
-from common.planner import Point, Pose
-from common.tasks import Task, kind_of
-from robot_client.cloud import CloudRunner
-from robot_client.runner import Execution
+from offboard.common.planning import planner
+from offboard.common.planning.maps import free_pairs, read_map
+from offboard.common.planning.planner import Point, Pose
+from offboard.common.tasks import Task, kind_of
+from offboard.robot_client.sites.cloud import CloudRunner
+from offboard.robot_client.sites.runner import Execution
 
 ROBOTS = (1, 10, 100, 1_000)
 PROCESSES, IN_FLIGHT = 4, 32  # of the robots; tasks of all of them
@@ -120,7 +120,7 @@ def _loaded() -> Table:
     ]
     tasks = [Task(kind, kind.bind((grid, None, *ends), {}), 0.0) for ends in goals]
     with (
-        cloud_server("common.planner", CLOUD_WORKERS="1") as server,
+        cloud_server("offboard.common.planning.planner", CLOUD_WORKERS="1") as server,
         contextlib.closing(CloudRunner(server.endpoint)) as runner,
     ):
         while runner.unavailable(kind):

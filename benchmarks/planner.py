@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.measure import Bar, Table, interleaved
-from common import planner
-from common.maps import GridMap, free_pairs, largest_component, passable, read_map
-from common.planner import Point, Pose, Scan
-from common.planners import ASTAR, JPS
-from common.search import Cell, Field, Route
+from offboard.common.planning import planner
+from offboard.common.planning.maps import GridMap, free_pairs, largest_component, passable, read_map
+from offboard.common.planning.planner import Point, Pose, Scan
+from offboard.common.planning.planner_names import ASTAR, JPS
+from offboard.common.planning.search import Cell, Field, Route
 
 ROOT = Path(__file__).parents[1]
 BERLIN = ROOT.parent / "shared/maps/movingai/Berlin_1_1024.map"

@@ -14,9 +14,9 @@ import zmq
 
 from benchmarks.servers import READY_S
 from benchmarks.tasks import nothing
-from common import wire
-from common.tasks import Task, kind_of
-from robot_client.cloud import CloudRunner
+from offboard.common.tasks import Task, kind_of
+from offboard.common.wire import messages as wire
+from offboard.robot_client.sites.cloud import CloudRunner
 
 BUDGET_S = 60.0
 

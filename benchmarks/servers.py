@@ -41,7 +41,7 @@ def running(command: Sequence[str], **environ: str) -> Iterator["subprocess.Pope
 def cloud_server(tasks: str = "benchmarks.tasks", **environ: str) -> Iterator[Server]:
     """The real one, on loopback; a robot may send what it can, unless `environ` bounds it."""
     endpoint, http = f"tcp://127.0.0.1:{free_port()}", f"127.0.0.1:{free_port()}"
-    command = [sys.executable, "-m", "cloud_server", "--listen", endpoint, "--tasks", tasks]
+    command = [sys.executable, "-m", "offboard.cloud_server", "--listen", endpoint, "--tasks", tasks]
     began = time.perf_counter()
     unbounded = {"CLOUD_ROBOT_MIB_S": "65536"}
     with running([*command, "--http", http, "--log", "error"], **(unbounded | environ)) as process:

@@ -13,7 +13,7 @@ import zmq
 
 from benchmarks.measure import Bar, Table, interleaved
 from benchmarks.servers import READY_S, Server, cloud_server, running
-from common import wire
+from offboard.common.wire import messages as wire
 
 COMMANDS = {"robot-client": "robot_client", "cloud-server": "cloud_server", "loadgen": "loadgen"}
 ROBOTS = 500  # that are connected and idle
@@ -24,8 +24,8 @@ TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 # A robot that has planned once, and now waits.
 ROBOT = """
 import sys
-from robot_client import Offloader
-from common import planner
+from offboard import Offloader
+from offboard.common.planning import planner
 planner.warm()
 with Offloader.connect(sys.argv[1], policy="hedge:probe:greedy") as offload:
     offload.wait_for_sites(planner.plan_path, 30.0)
@@ -42,13 +42,15 @@ def _help() -> Table:
     python = [sys.executable]
     cases: dict[str, Callable[[], object]] = {"python -c pass": lambda: _run([*python, "-c", "pass"])}
     for name, package in COMMANDS.items():
-        cases[f"{name} --help"] = lambda package=package: _run([*python, "-m", package, "--help"])
+        cases[f"{name} --help"] = lambda package=package: _run(
+            [*python, "-m", f"offboard.{package}", "--help"]
+        )
     seconds = interleaved(cases)
     least = seconds["python -c pass"]
     rows = [[name, f"{each * 1e3:.0f}", f"{each / least:.1f}"] for name, each in seconds.items()]
     bars = [Bar(f"{name} over nothing", each / least, 6.0) for name, each in seconds.items() if each != least]
     for name, package in COMMANDS.items():
-        said = _run([*python, "-X", "importtime", "-m", package, "--help"])
+        said = _run([*python, "-X", "importtime", "-m", f"offboard.{package}", "--help"])
         loaded = [heavy for heavy in HEAVY if f"| {heavy}\n" in said.replace(" " * 2, "")]
         bars.append(Bar(f"heavy libraries that {name} --help loads", len(loaded), 0))
     return Table("--help", ("command", "ms", "over nothing"), rows, bars)
@@ -61,9 +63,9 @@ def _run(command: list[str]) -> str:
 def _rest() -> Table:
     with contextlib.ExitStack() as stack:
         cache = stack.enter_context(tempfile.TemporaryDirectory())
-        with cloud_server("common.planner", NUMBA_CACHE_DIR=cache) as cold:
+        with cloud_server("offboard.common.planning.planner", NUMBA_CACHE_DIR=cache) as cold:
             pass
-        server = stack.enter_context(cloud_server("common.planner", NUMBA_CACHE_DIR=cache))
+        server = stack.enter_context(cloud_server("offboard.common.planning.planner", NUMBA_CACHE_DIR=cache))
         robot = stack.enter_context(running([sys.executable, "-c", ROBOT, server.endpoint]))
         assert robot.stdout is not None
         robot.stdout.readline()

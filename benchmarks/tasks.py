@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from common.tasks import task
+from offboard.common.tasks import task
 
 
 @task("nothing", size=lambda: 0.0)

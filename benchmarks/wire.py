@@ -14,9 +14,9 @@ from benchmarks.measure import Bar, Table, each_of
 from benchmarks.robots import request_frames
 from benchmarks.servers import READY_S, cloud_server, serve
 from benchmarks.tasks import length, nothing
-from common.errors import describe
-from robot_client.offloader import Offloader
-from robot_client.runner import CLOUD
+from offboard.common.errors import describe
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.sites.runner import CLOUD
 
 CALLS, MEGABYTE_CALLS = 200, 20
 MEGABYTE = 1_000_000

@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cloud_server.config import ROBOTS, ServerConfig
-from common.config import as_dict, load, run_command
-from common.errors import ConfigError
+from offboard.cloud_server.config import ROBOTS, ServerConfig
+from offboard.common.config import as_dict, load, run_command
+from offboard.common.errors import ConfigError
 
 DESCRIPTION = (
     "Runs tasks for robots over ZMQ; /health, /ready, /metrics, /config, /tasks and /docs over HTTP. "
@@ -20,7 +20,7 @@ DESCRIPTION = (
 
 SWITCH_S = 0.0005  # in which a thread that computes lets others in: a reply shall not wait for a flood
 
-log = logging.getLogger("cloud_server")
+log = logging.getLogger("offboard.cloud_server")
 
 
 def main() -> int:
@@ -30,7 +30,7 @@ def main() -> int:
 
 def make_keys(argv: Sequence[str], environ: Mapping[str, str]) -> int:
     """`cloud-server keys`: the server's own, and the folder for those of robots."""
-    from common.keys import SERVER, run_keys
+    from offboard.common.security.keys import SERVER, run_keys
 
     folder = run_keys(SERVER, argv[1:], prog="cloud-server keys", prefix="CLOUD_KEYS", environ=environ)
     robots = folder / ROBOTS
@@ -50,13 +50,13 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
     logging.basicConfig(level=config.log.upper(), format="%(asctime)s %(levelname)s %(message)s")
     sys.path.insert(0, str(Path.cwd()))  # as `python -m` does, so that --tasks finds the user's modules
     # Heavy libraries come after the settings are known to be right, and not for --help.
-    from cloud_server.executors import EXECUTORS
-    from cloud_server.metrics import Metrics
-    from cloud_server.server import Server
-    from cloud_server.web import Web, create_app
-    from common.guard import read_token, warn_each_minute
-    from common.keys import server_keys
-    from common.tasks import kinds, load_modules
+    from offboard.cloud_server.executors import EXECUTORS
+    from offboard.cloud_server.http_api import Web, create_app
+    from offboard.cloud_server.metrics import Metrics
+    from offboard.cloud_server.server import Server
+    from offboard.common.security.guard import read_token, warn_each_minute
+    from offboard.common.security.keys import server_keys
+    from offboard.common.tasks import kinds, load_modules
 
     sys.setswitchinterval(SWITCH_S)
     files_max = raise_file_limit()

@@ -5,9 +5,9 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from common.config import check, setting
-from common.errors import ConfigError
-from common.guard import OPEN_REMEDY, on_loopback
+from offboard.common.config import check, setting
+from offboard.common.errors import ConfigError
+from offboard.common.security.guard import OPEN_REMEDY, on_loopback
 
 MIB = 1024 * 1024
 ROBOTS = "robots"  # the folder of robots in that of --keys
@@ -53,7 +53,7 @@ class ServerConfig:
         len(os.sched_getaffinity(0)), "tasks that run at the same time", minimum=1, maximum=1024, metavar="W"
     )
     tasks: tuple[str, ...] = setting(
-        ("common.planner",),
+        ("offboard.common.planning.planner",),
         "modules that register tasks, comma-separated",
         metavar="MODULE,MODULE",
     )

@@ -15,13 +15,13 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Protocol
 
-from cloud_server.outcome import Blobs, Outcome, run_task, warm_kinds
-from cloud_server.workers import Call, Died, Setup, Worker
-from common.blobs import Buffer
-from common.cpu import process_s
-from common.errors import CloudBroken
-from common.threads import join_all
-from common.wanted import always
+from offboard.cloud_server.outcome import Blobs, Outcome, run_task, warm_kinds
+from offboard.cloud_server.worker_pool import Call, Died, Setup, Worker
+from offboard.common.errors import CloudBroken
+from offboard.common.host.cpu import process_s
+from offboard.common.threads import join_all
+from offboard.common.wanted import always
+from offboard.common.wire.blobs import Buffer
 
 __all__ = ["EXECUTORS", "Executor", "Outcome", "Processes", "Threads"]
 
@@ -31,7 +31,7 @@ SPARES = 1  # worker processes beyond those that run tasks: a start takes longer
 
 Done = Callable[["Future[Outcome]"], None]
 
-log = logging.getLogger("cloud_server")
+log = logging.getLogger("offboard.cloud_server")
 
 
 class Executor(Protocol):

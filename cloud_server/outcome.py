@@ -4,11 +4,12 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from common import cpu, tasks
-from common.blobs import Buffer, StoredBlob
-from common.errors import ProtocolError, Unwanted, describe
-from common.values import decode, encode
-from common.wanted import always, call_while
+from offboard.common import tasks
+from offboard.common.errors import ProtocolError, Unwanted, describe
+from offboard.common.host import cpu
+from offboard.common.wanted import always, call_while
+from offboard.common.wire.blobs import Buffer, StoredBlob
+from offboard.common.wire.values import decode, encode
 
 Blobs = Mapping[bytes, StoredBlob]
 

@@ -13,22 +13,22 @@ from pathlib import Path
 
 import zmq
 
-from cloud_server.connections import Backlog, end, other_end
-from cloud_server.crew import Crew
-from cloud_server.executors import Executor, Outcome
-from cloud_server.metrics import Metrics, Status
-from cloud_server.outbox import Outbox
-from cloud_server.quota import CUT_OFF_S, Quota, Verdict
-from cloud_server.robots import ZAP_DOMAIN, Robots
-from cloud_server.waiting import CRASHES_MAX, Crashes, Waiting, Work
-from common import VERSION, tasks
-from common.blobs import BlobStore, Buffer
-from common.channel import Channel
-from common.cpu import SELF
-from common.errors import ConfigError, OffloadError, ProtocolError
-from common.keys import KeyPair
-from common.load import SERVER_EVERY_S, Load, LoadWatch
-from common.wire import (
+from offboard.cloud_server.authorisation import ZAP_DOMAIN, Robots
+from offboard.cloud_server.executors import Executor, Outcome
+from offboard.cloud_server.fair_queue import CRASHES_MAX, Crashes, Waiting, Work
+from offboard.cloud_server.metrics import Metrics, Status
+from offboard.cloud_server.rate_limit import CUT_OFF_S, Quota, Verdict
+from offboard.cloud_server.reader_threads import Crew
+from offboard.cloud_server.reply_queue import Outbox
+from offboard.cloud_server.tcp_connections import Backlog, end, other_end
+from offboard.common import VERSION, tasks
+from offboard.common.errors import ConfigError, OffloadError, ProtocolError
+from offboard.common.host.cpu import SELF
+from offboard.common.host.load import SERVER_EVERY_S, Load, LoadWatch
+from offboard.common.security.keys import KeyPair
+from offboard.common.wire.blobs import BlobStore, Buffer
+from offboard.common.wire.channel import Channel
+from offboard.common.wire.messages import (
     Blob,
     Cancel,
     Hello,
@@ -52,7 +52,7 @@ KEEPALIVE_IDLE_S, KEEPALIVE_EVERY_S, KEEPALIVE_PROBES = 60, 10, 6
 SEND_LAST_S = 1.0  # time for the last replies to leave when the server stops
 LOG_PAUSE_S = 10.0  # least time between two warnings about bad messages
 
-log = logging.getLogger("cloud_server")
+log = logging.getLogger("offboard.cloud_server")
 
 
 class Server:

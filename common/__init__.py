@@ -1,3 +1,3 @@
 """What robot and cloud must agree on, and nothing else."""
 
-VERSION = "0.1.0"
+VERSION = "0.2.0"

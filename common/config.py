@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
-from common.errors import ConfigError, DataError, OffloadError
+from offboard.common.errors import ConfigError, DataError, OffloadError
 
 C = TypeVar("C")
 

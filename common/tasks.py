@@ -1,6 +1,6 @@
 """What can be run: the `@task` decorator, the registry of kinds, loading task modules by name.
 
-Where a task runs is decided in `robot_client`; how it crosses the wire is `common.wire`.
+Where a task runs is decided in `robot_client`; how it crosses the wire is `wire.messages`.
 """
 
 import importlib
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from common.errors import BadValue, ConfigError, UnknownTask, describe
+from offboard.common.errors import BadValue, ConfigError, UnknownTask, describe
 
 F = TypeVar("F", bound=Callable[..., Any])
 

@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from common.errors import Unwanted
+from offboard.common.errors import Unwanted
 
 
 class _Here(threading.local):

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from common.config import CommandParser, RawHelp, add_flags, check, resolve, run_command, setting
-from robot_client import policies, predictors
+from offboard.common.config import CommandParser, RawHelp, add_flags, check, resolve, run_command, setting
+from offboard.robot_client import policies, predictors
 
 C = TypeVar("C")
 
@@ -63,14 +63,14 @@ def _demo(argv: Sequence[str]) -> int:
     parser = CommandParser(prog="loadgen demo", description=_demo.__doc__)
     add_flags(parser, DemoConfig, ENVIRONMENT)
     config = resolve(DemoConfig, parser.parse_args(argv), environ=os.environ, prefix=ENVIRONMENT)
-    from loadgen.play import play_demo
+    from offboard.loadgen.play.play import play_demo
 
     return play_demo(config.out)
 
 
 def _run(argv: Sequence[str]) -> int:
     """play a scenario: its trace, the truth about its link, its events and the verdict of its checks"""
-    from loadgen.scenario import find_scenario, read_scenario, shipped
+    from offboard.loadgen.scenario.scenario import find_scenario, read_scenario, shipped
 
     parser = CommandParser(prog="loadgen run", description=_run.__doc__)
     help = f"TOML file, or a shipped one: {', '.join(shipped())}"
@@ -78,7 +78,7 @@ def _run(argv: Sequence[str]) -> int:
     add_flags(parser, RunConfig, ENVIRONMENT)
     flags = parser.parse_args(argv)
     config = resolve(RunConfig, flags, environ=os.environ, prefix=ENVIRONMENT)
-    from loadgen.play import play
+    from offboard.loadgen.play.play import play
 
     _find_modules_here()
     scenario = read_scenario(find_scenario(flags.scenario)).changed(
@@ -96,8 +96,8 @@ def _run(argv: Sequence[str]) -> int:
 
 def _compare(argv: Sequence[str]) -> int:
     """play scenarios once per policy and seed, in turn, and compare the policies with intervals"""
-    from loadgen.compare import CompareConfig, run_compare
-    from loadgen.scenario import shipped
+    from offboard.loadgen.compare.compare import CompareConfig, run_compare
+    from offboard.loadgen.scenario.scenario import shipped
 
     parser = CommandParser(prog="loadgen compare", description=_compare.__doc__)
     help = f"TOML files, or shipped ones: {', '.join(shipped())}"
@@ -110,21 +110,21 @@ def _compare(argv: Sequence[str]) -> int:
 
 def _table(argv: Sequence[str]) -> int:
     """the paper's Table II, and what it left out, from a trace or CSV"""
-    from loadgen.evaluate import TableConfig, run_table
+    from offboard.loadgen.table.table_two import TableConfig, run_table
 
     return run_table(*_file_and_config("table", _table.__doc__, TableConfig, argv))
 
 
 def _replay(argv: Sequence[str]) -> int:
     """what each policy would have made of the tasks of a trace or CSV"""
-    from loadgen.replay import ReplayConfig, run_replay
+    from offboard.loadgen.table.replay import ReplayConfig, run_replay
 
     return run_replay(*_file_and_config("replay", _replay.__doc__, ReplayConfig, argv))
 
 
 def _report(argv: Sequence[str]) -> int:
     """a run as one HTML page of charts and tables, and the charts as PNGs"""
-    from loadgen.report import ReportConfig, run_report
+    from offboard.loadgen.report.report import ReportConfig, run_report
 
     parser = CommandParser(prog="loadgen report", description=_report.__doc__)
     parser.add_argument("run", type=Path, metavar="DIR", help="a run's folder; or a trace or CSV file")
@@ -135,7 +135,7 @@ def _report(argv: Sequence[str]) -> int:
 
 def _dataset(argv: Sequence[str]) -> int:
     """measure a scenario's plans on both sites: NAME.csv, and how it was measured"""
-    from loadgen.dataset import DatasetConfig, run_dataset
+    from offboard.loadgen.play.dataset import DatasetConfig, run_dataset
 
     parser = CommandParser(prog="loadgen dataset", description=_dataset.__doc__)
     parser.add_argument("scenario", metavar="SCENARIO", help="TOML file, or a shipped one: paper, congested")
@@ -147,7 +147,7 @@ def _dataset(argv: Sequence[str]) -> int:
 
 def _export(argv: Sequence[str]) -> int:
     """the tasks of a trace that ran on both sites, as a CSV dataset"""
-    from loadgen.dataset import ExportConfig, run_export
+    from offboard.loadgen.play.dataset import ExportConfig, run_export
 
     return run_export(*_file_and_config("export", _export.__doc__, ExportConfig, argv))
 
@@ -170,7 +170,7 @@ def _find_modules_here() -> None:
 
 def _wan(argv: Sequence[str]) -> int:
     """the relay between robot and cloud: delay, jitter, loss, bandwidth, outage and other faults"""
-    from loadgen.relay.wan import WanConfig, run_wan
+    from offboard.loadgen.relay.wan import WanConfig, run_wan
 
     parser = CommandParser(prog="loadgen wan", description=_wan.__doc__)
     add_flags(parser, WanConfig, "WAN")

@@ -10,14 +10,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from common.config import as_dict, load, run_command
-from common.errors import ConfigError, OffloadError
-from robot_client.config import RobotConfig
-from robot_client.runner import CLOUD, ONBOARD, PORT_MAX
+from offboard.common.config import as_dict, load, run_command
+from offboard.common.errors import ConfigError, OffloadError
+from offboard.robot_client.config import RobotConfig
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, PORT_MAX
 
 if TYPE_CHECKING:
-    from robot_client.lines import Lines
-    from robot_client.trace import Record
+    from offboard.robot_client.records.lines import Lines
+    from offboard.robot_client.records.trace import Record
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -27,7 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _make_keys(argv: Sequence[str]) -> int:
-    from common.keys import ROBOT, run_keys
+    from offboard.common.security.keys import ROBOT, run_keys
 
     run_keys(ROBOT, argv[1:], prog="robot-client keys", prefix="ROBOT_KEYS", environ=os.environ)
     return 0
@@ -46,19 +46,19 @@ def _run(argv: Sequence[str]) -> int:
     import logging  # not for --help
 
     logging.basicConfig(level=config.log.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    logging.getLogger("robot_client").info("config %s", as_dict(config))
+    logging.getLogger("offboard.robot_client").info("config %s", as_dict(config))
     signal.signal(signal.SIGTERM, _interrupt)
     return _drive(config)
 
 
 def _drive(config: RobotConfig) -> int:
     # Loaded after the flags are read: --help answers without compiling anything.
-    from robot_client.answers import Answers
-    from robot_client.drive import Drive, OwnRecord
-    from robot_client.offloader import Offloader
-    from robot_client.references import References
-    from robot_client.trace import Trace, alone_path, reference_path
-    from robot_client.work import make_work
+    from offboard.robot_client.offloader import Offloader
+    from offboard.robot_client.records.trace import Trace, alone_path, reference_path
+    from offboard.robot_client.simulated.answers import Answers
+    from offboard.robot_client.simulated.drive import Drive, OwnRecord
+    from offboard.robot_client.simulated.references import References
+    from offboard.robot_client.simulated.task_source import make_work
 
     if config.task is not None:
         sys.path.insert(0, str(Path.cwd()))  # as `python -m` does, so that --task finds the user's modules
@@ -130,7 +130,7 @@ def _say_absent(doing: str, absent: Mapping[str, str]) -> None:
     import logging
 
     for site, why in absent.items():
-        logging.getLogger("robot_client").warning(
+        logging.getLogger("offboard.robot_client").warning(
             "%s without %s: %s; tasks run %s", doing, site, why, ONBOARD
         )
 
@@ -140,7 +140,7 @@ def _metrics(config: RobotConfig) -> "list[Callable[[Record], None]]":
         return []
     from prometheus_client import CollectorRegistry
 
-    from robot_client.metrics import Metrics
+    from offboard.robot_client.records.metrics import Metrics
 
     host, _, port = config.metrics.rpartition(":")
     if not host or not port.isdecimal() or int(port) > PORT_MAX:

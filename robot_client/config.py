@@ -3,16 +3,17 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from common.config import check, setting
-from common.errors import ConfigError
-from common.planners import DIJKSTRA, PLANNERS
-from robot_client import objectives, policies, predictors
-from robot_client.allowance import DUPLICATES, Allowance
-from robot_client.energy import Energy
-from robot_client.objectives import OBJECTIVES, Objective
-from robot_client.runner import CLOUD, ONBOARD, TIMEOUT_S, check_endpoint
-from robot_client.window import WINDOW
-from robot_client.workload import ARRIVALS, CLOSED, parse_sizes
+from offboard.common.config import check, setting
+from offboard.common.errors import ConfigError
+from offboard.common.planning.planner_names import DIJKSTRA, PLANNERS
+from offboard.robot_client import policies, predictors
+from offboard.robot_client.policies import objectives
+from offboard.robot_client.policies.allowance import DUPLICATES, Allowance
+from offboard.robot_client.policies.energy import Energy
+from offboard.robot_client.policies.objectives import OBJECTIVES, Objective
+from offboard.robot_client.predictors.window import WINDOW
+from offboard.robot_client.simulated.workload import ARRIVALS, CLOSED, parse_sizes
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, TIMEOUT_S, check_endpoint
 
 MEAN = OBJECTIVES[0]
 NEEDS = {

@@ -15,25 +15,34 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
-from common.errors import BadValue, ConfigError, Overtaken
-from common.tasks import Kind, Task, kind_of
-from common.values import encode
-from robot_client import heartbeat, objectives, policies, predictors
-from robot_client.allowance import Allowance
-from robot_client.batch import Batch, Placed, arguments
-from robot_client.clock import Clock, SystemClock
-from robot_client.energy import Energy
-from robot_client.learning import Asked, Learning
-from robot_client.memory import KindMemory
-from robot_client.objectives import Objective
-from robot_client.onboard import OnboardRunner
-from robot_client.policies import PINNED, Decision, Forecast, Outlook, Policy
-from robot_client.predictors import Predictor
-from robot_client.race import Plan, Race, answer_of
-from robot_client.runner import CLOUD, ONBOARD, TIMEOUT_S, UNMEASURED, Condition, Execution, Runner
-from robot_client.store import Store
-from robot_client.trace import Late, Record
-from robot_client.window import WINDOW
+from offboard.common.errors import BadValue, ConfigError, Overtaken
+from offboard.common.tasks import Kind, Task, kind_of
+from offboard.common.wire.values import encode
+from offboard.robot_client import policies, predictors
+from offboard.robot_client.execution.batch import Batch, Placed, arguments
+from offboard.robot_client.execution.race import Plan, Race, answer_of
+from offboard.robot_client.learning.kind import KindMemory
+from offboard.robot_client.learning.lessons import Asked, Learning
+from offboard.robot_client.learning.store import Store
+from offboard.robot_client.policies import PINNED, Decision, Forecast, Outlook, Policy, objectives
+from offboard.robot_client.policies.allowance import Allowance
+from offboard.robot_client.policies.energy import Energy
+from offboard.robot_client.policies.objectives import Objective
+from offboard.robot_client.predictors import Predictor
+from offboard.robot_client.predictors.window import WINDOW
+from offboard.robot_client.records.trace import Late, Record
+from offboard.robot_client.sites import heartbeat
+from offboard.robot_client.sites.clock import Clock, SystemClock
+from offboard.robot_client.sites.onboard import OnboardRunner
+from offboard.robot_client.sites.runner import (
+    CLOUD,
+    ONBOARD,
+    TIMEOUT_S,
+    UNMEASURED,
+    Condition,
+    Execution,
+    Runner,
+)
 
 BOTH = "both"
 TIMEOUT_MAX_S = 24 * 3600.0
@@ -133,8 +142,8 @@ class Offloader:
         outlives the process. Caps in the allowance put `budget` around the policy. `keys`: the folder of
         `robot-client keys` with the public key of each server, NAME.key or server.key (None: no encryption).
         """
-        from common.keys import robot_keys  # zmq is loaded only where a socket is opened
-        from robot_client.cloud import CloudRunner
+        from offboard.common.security.keys import robot_keys  # zmq is loaded only where a socket is opened
+        from offboard.robot_client.sites.cloud import CloudRunner
 
         servers = ({CLOUD: endpoint} if endpoint else {}) | (sites or {})
         if allowance is not None and allowance.capped and "budget" not in policy.split(":"):

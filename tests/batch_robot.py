@@ -8,11 +8,11 @@ import json
 import random
 import time
 
-from loadgen.work import hash_rounds
-from robot_client.offloader import Offloader
-from robot_client.policies import DEFAULT, predictor_of
-from robot_client.runner import CLOUD, ONBOARD
-from robot_client.trace import Record
+from offboard.loadgen.scenario.hash_tasks import hash_rounds
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import DEFAULT, predictor_of
+from offboard.robot_client.records.trace import Record
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 TASKS = 40
 ROUNDS = (10_000, 150_000)  # of a task, drawn evenly

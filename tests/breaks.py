@@ -10,11 +10,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from common.tasks import Kind, kinds, load_modules
-from loadgen.processes import COMMANDS, LocalTestbed
-from loadgen.scenario import Scenario
-from loadgen.testbed import CLOUD, ROBOT, Setup
-from loadgen.timeline import Event
+from offboard.common.tasks import Kind, kinds, load_modules
+from offboard.loadgen.scenario.scenario import Scenario
+from offboard.loadgen.scenario.timeline import Event
+from offboard.loadgen.testbed.processes import COMMANDS, LocalTestbed
+from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, Setup
 
 LEAK_BYTES = 300_000
 
@@ -65,7 +65,7 @@ def _break(kind: Kind, how: Callable[[Any], Any]) -> None:
 
 
 if __name__ == "__main__":
-    from cloud_server.__main__ import main
+    from offboard.cloud_server.__main__ import main
 
     how, *flags = sys.argv[1:]
     modules = next(flag for flag in flags if flag.startswith("--tasks=")).removeprefix("--tasks=")

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 
 import pytest
 
-from robot_client.predictors import Predictor
+from offboard.robot_client.predictors import Predictor
 
 Make = Callable[[], Predictor]
 Row = tuple[float, float]  # size, seconds

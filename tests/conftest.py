@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from loadgen.processes import LocalTestbed
-from loadgen.testbed import Setup
-from robot_client.offloader import Offloader
+from offboard.loadgen.testbed.processes import LocalTestbed
+from offboard.loadgen.testbed.testbed import Setup
+from offboard.robot_client.offloader import Offloader
 
 ROOT = Path(__file__).parents[1]
 # The compiled planner is kept beside the checkout, as `make` does it.

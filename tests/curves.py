@@ -14,7 +14,7 @@ from typing import Any, Self
 import zmq
 import zmq.utils.monitor
 
-from common import wire
+from offboard.common.wire import messages as wire
 
 ROOT = Path(__file__).parents[1]
 WAIT_S = 20.0
@@ -37,7 +37,7 @@ class Served:
     """
 
     def __init__(self, *flags: str, files: int | None = None) -> None:
-        command = [sys.executable, "-W", "error", "-m", "cloud_server", "--tasks", "tests.probes"]
+        command = [sys.executable, "-W", "error", "-m", "offboard.cloud_server", "--tasks", "tests.probes"]
         free = ["--listen", "tcp://127.0.0.1:0", "--http", "127.0.0.1:0", "--workers", "2"]
         limit = [] if files is None else ["prlimit", f"--nofile={files}:", "--"]
         self.process = subprocess.Popen(

@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from concurrent.futures import Future
 
-from common.tasks import Kind, Task
-from robot_client.runner import UNMEASURED, Condition, Execution
+from offboard.common.tasks import Kind, Task
+from offboard.robot_client.sites.runner import UNMEASURED, Condition, Execution
 
 
 class ScriptedRunner:

@@ -13,18 +13,24 @@ from pathlib import Path
 
 import atheris
 
-importlib.import_module("common.search")  # first: what is compiled cannot be instrumented
+importlib.import_module("offboard.common.planning.search")  # first: what is compiled cannot be instrumented
 with atheris.instrument_imports(
-    include=["msgpack", "common.wire", "common.values", "common.blobs", "common.planner"]
+    include=[
+        "msgpack",
+        "offboard.common.wire.messages",
+        "offboard.common.wire.values",
+        "offboard.common.wire.blobs",
+        "offboard.common.planning.planner",
+    ]
 ):
-    from common import wire
-    from common.blobs import BlobStore
-    from common.errors import BadValue, ProtocolError
-    from common.planner import Plan, plan_path
-    from common.tasks import kind_of
+    from offboard.common.errors import BadValue, ProtocolError
+    from offboard.common.planning.planner import Plan, plan_path
+    from offboard.common.tasks import kind_of
+    from offboard.common.wire import messages as wire
+    from offboard.common.wire.blobs import BlobStore
 
 from benchmarks.attackers import Frames, bombs, valid_messages  # noqa: E402
-from common import planner  # noqa: E402
+from offboard.common.planning import planner  # noqa: E402
 
 FRAMES_MAX = 40
 SEED_BYTES_MAX = 4096  # a larger bomb teaches nothing

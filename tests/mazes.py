@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from common import planner, search
-from common.planners import ASTAR, DIJKSTRA, JPS
+from offboard.common.planning import planner, search
+from offboard.common.planning.planner_names import ASTAR, DIJKSTRA, JPS
 
 Cell = tuple[int, int]
 # Planners, and whether on costs.

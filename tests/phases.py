@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from robot_client.runner import CLOUD, ONBOARD
-from robot_client.trace import Record
+from offboard.robot_client.records.trace import Record
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 EDGE = "edge"
 TASKS = 100  # of each phase

@@ -9,8 +9,8 @@ import random
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
-from robot_client.policies import Decision, Forecast, Outlook, Policy
-from robot_client.runner import CLOUD, ONBOARD, Condition
+from offboard.robot_client.policies import Decision, Forecast, Outlook, Policy
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition
 
 Make = Callable[[], Policy]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from common.tasks import task
+from offboard.common.tasks import task
 
 
 @task("echo", size=lambda value=None: 0.0)  # noqa: ARG005 - an empty task has no size

@@ -2,7 +2,7 @@
 
 import time
 
-from common.tasks import task
+from offboard.common.tasks import task
 
 WARM_S = 3.0
 

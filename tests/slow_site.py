@@ -2,7 +2,7 @@
 
 import hashlib
 
-from common.tasks import task
+from offboard.common.tasks import task
 
 times = 1  # as much work here
 

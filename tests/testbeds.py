@@ -15,9 +15,9 @@ from typing import Any
 
 import pytest
 
-from common.config import INTERRUPTED_EXIT
-from loadgen.testbed import Setup, Testbed
-from robot_client.trace import read
+from offboard.common.config import INTERRUPTED_EXIT
+from offboard.loadgen.testbed.testbed import Setup, Testbed
+from offboard.robot_client.records.trace import read
 
 MAP = Path(__file__).parents[1] / "maps" / "depot.yaml"
 TASKS, MEASURE = 8, 4

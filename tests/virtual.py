@@ -7,9 +7,9 @@ from collections.abc import Callable, Collection
 from concurrent.futures import Future
 from typing import Any
 
-from common.errors import CloudBroken, CloudTimeout, OffloadError, Overtaken
-from common.tasks import Kind, Task
-from robot_client.runner import ONBOARD, UNMEASURED, Condition, Execution
+from offboard.common.errors import CloudBroken, CloudTimeout, OffloadError, Overtaken
+from offboard.common.tasks import Kind, Task
+from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Execution
 
 
 class VirtualClock:

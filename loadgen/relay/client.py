@@ -5,7 +5,7 @@ import http.client
 import json
 from typing import Any
 
-from common.errors import ConfigError, OffloadError
+from offboard.common.errors import ConfigError, OffloadError
 
 ASK_S = 2.0
 

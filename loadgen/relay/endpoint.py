@@ -2,7 +2,7 @@
 
 import socket
 
-from common.errors import ConfigError
+from offboard.common.errors import ConfigError
 
 BACKLOG = 128  # connections that the kernel holds before they are accepted
 PORT_MAX = 65_535

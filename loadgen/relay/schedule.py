@@ -10,9 +10,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Protocol
 
-from common.config import line_of, read_toml, unknown
-from common.errors import ConfigError, DataError
-from loadgen.relay.link import Link, LinkConditions
+from offboard.common.config import line_of, read_toml, unknown
+from offboard.common.errors import ConfigError, DataError
+from offboard.loadgen.relay.link.link import Link, LinkConditions
 
 EVENTS_MAX = 10_000
 AT_S_MAX = 1e6

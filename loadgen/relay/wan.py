@@ -9,18 +9,18 @@ import signal
 from dataclasses import dataclass
 from pathlib import Path
 
-from common.config import setting
-from common.errors import ConfigError
-from common.guard import LOOPBACK, OPEN_REMEDY, on_loopback, read_token, warn_each_minute
-from loadgen.relay.control import ControlServer, control_app
-from loadgen.relay.endpoint import BACKLOG, address, bind, name_of
-from loadgen.relay.flags import LinkFlags
-from loadgen.relay.link import CHUNK_BYTES
-from loadgen.relay.proxies import Proxies, RelaySettings
-from loadgen.relay.relay import PreciseSelector, Relay
-from loadgen.relay.schedule import Schedule, read_schedule
-from loadgen.relay.toxiproxy import toxiproxy_app
-from loadgen.relay.truth import Truth
+from offboard.common.config import setting
+from offboard.common.errors import ConfigError
+from offboard.common.security.guard import LOOPBACK, OPEN_REMEDY, on_loopback, read_token, warn_each_minute
+from offboard.loadgen.relay.endpoint import BACKLOG, address, bind, name_of
+from offboard.loadgen.relay.http_control import ControlServer, control_app
+from offboard.loadgen.relay.link.link import CHUNK_BYTES
+from offboard.loadgen.relay.link.link_settings import LinkFlags
+from offboard.loadgen.relay.link_record import Truth
+from offboard.loadgen.relay.relay import PreciseSelector, Relay
+from offboard.loadgen.relay.schedule import Schedule, read_schedule
+from offboard.loadgen.relay.toxiproxy.proxies import Proxies, RelaySettings
+from offboard.loadgen.relay.toxiproxy.toxiproxy_api import toxiproxy_app
 
 END_S = 1.0  # for the connections to end when the relay does
 

@@ -1,1 +1,1 @@
-"""Scenarios without machines: the robot's own `Offloader` on a virtual clock; sites and link are modelled."""
+"""Scenarios in virtual time, with the robot's own `Offloader`."""

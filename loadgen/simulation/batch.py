@@ -9,12 +9,12 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from typing import Any, Self
 
-from loadgen.outcome import Outcome
-from loadgen.player import ROBOT_SEED_STEP
-from loadgen.scenario import Scenario, Workload
-from loadgen.simulation.run import simulate
-from loadgen.simulation.tasks import OTHERS_TASKS_MAX, Tasks, find_tasks
-from loadgen.testbed import ROBOT
+from offboard.loadgen.play.player import ROBOT_SEED_STEP
+from offboard.loadgen.scenario.outcome import Outcome
+from offboard.loadgen.scenario.scenario import Scenario, Workload
+from offboard.loadgen.simulation.model.simulated_tasks import OTHERS_TASKS_MAX, Tasks, find_tasks
+from offboard.loadgen.simulation.run import simulate
+from offboard.loadgen.testbed.testbed import ROBOT
 
 Wanted = tuple[Workload, int]  # whose tasks, and the seed of the robot
 

@@ -4,20 +4,20 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import partial
 
-from common.errors import CloudBroken, CloudBusy, CloudTimeout, OffloadError, Overtaken
-from common.tasks import Kind, Task
-from loadgen.relay.link import Link
-from loadgen.simulation.clock import VirtualClock
-from loadgen.simulation.connection import Connection
-from loadgen.simulation.costs import BEAT_BYTES, BEAT_REPLY_BYTES, CANCEL_BYTES, MISSING_BYTES
-from loadgen.simulation.processor import Processor
-from loadgen.simulation.server import BUSY, NEED_BLOB, Key, Reply, Server
-from loadgen.simulation.truth import Truth, number_of
-from loadgen.testbed import ROBOT
-from robot_client.cloud import PENDING_MAX
-from robot_client.heartbeat import ALONG_S, Heartbeat, Told
-from robot_client.own_cpu import OwnCpu
-from robot_client.runner import CLOUD, Condition, Execution
+from offboard.common.errors import CloudBroken, CloudBusy, CloudTimeout, OffloadError, Overtaken
+from offboard.common.tasks import Kind, Task
+from offboard.loadgen.relay.link.link import Link
+from offboard.loadgen.simulation.model.clock import VirtualClock
+from offboard.loadgen.simulation.model.costs import BEAT_BYTES, BEAT_REPLY_BYTES, CANCEL_BYTES, MISSING_BYTES
+from offboard.loadgen.simulation.model.processor import Processor
+from offboard.loadgen.simulation.model.robot_connection import Connection
+from offboard.loadgen.simulation.model.server import BUSY, NEED_BLOB, Key, Reply, Server
+from offboard.loadgen.simulation.model.true_costs import Truth, number_of
+from offboard.loadgen.testbed.testbed import ROBOT
+from offboard.robot_client.sites.cloud import PENDING_MAX
+from offboard.robot_client.sites.heartbeat import ALONG_S, Heartbeat, Told
+from offboard.robot_client.sites.own_cpu import OwnCpu
+from offboard.robot_client.sites.runner import CLOUD, Condition, Execution
 
 TASK, BEAT, CANCEL, BLOB = "task", "beat", "cancel", "blob"  # sorts of messages
 

@@ -4,16 +4,16 @@ import math
 from concurrent.futures import Future
 from functools import partial
 
-from common.errors import Overtaken
-from common.load import EVERY_S, HURRIED_S, LOADED
-from common.tasks import Kind, Task
-from loadgen.simulation.clock import VirtualClock
-from loadgen.simulation.load import SimulatedLoad
-from loadgen.simulation.processor import Processor, Run
-from loadgen.simulation.truth import Truth
-from loadgen.testbed import ROBOT
-from robot_client.own_cpu import OwnCpu
-from robot_client.runner import ONBOARD, Condition, Execution
+from offboard.common.errors import Overtaken
+from offboard.common.host.load import EVERY_S, HURRIED_S, LOADED
+from offboard.common.tasks import Kind, Task
+from offboard.loadgen.simulation.model.clock import VirtualClock
+from offboard.loadgen.simulation.model.measured_load import SimulatedLoad
+from offboard.loadgen.simulation.model.processor import Processor, Run
+from offboard.loadgen.simulation.model.true_costs import Truth
+from offboard.loadgen.testbed.testbed import ROBOT
+from offboard.robot_client.sites.own_cpu import OwnCpu
+from offboard.robot_client.sites.runner import ONBOARD, Condition, Execution
 
 
 class SimulatedOnboard:

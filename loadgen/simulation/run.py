@@ -7,20 +7,21 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from loadgen.intervals import intervals_of, late_seconds
-from loadgen.outcome import Answered, Outcome, Reference
-from loadgen.scenario import Scenario
-from loadgen.simulation.lockstep import LockstepClock
-from loadgen.simulation.tasks import Tasks
-from loadgen.simulation.world import World
-from loadgen.testbed import ROBOT
-from loadgen.timeline import Timeline
-from robot_client import heartbeat, policies, predictors
-from robot_client.drive import OwnRecord
-from robot_client.offloader import BOTH, Offloader
-from robot_client.runner import CLOUD
-from robot_client.trace import Record, as_dict
-from robot_client.workload import CLOSED, due_instants
+from offboard.loadgen.scenario.interval_coverage import intervals_of, late_seconds
+from offboard.loadgen.scenario.outcome import Answered, Outcome, Reference
+from offboard.loadgen.scenario.scenario import Scenario
+from offboard.loadgen.scenario.timeline import Timeline
+from offboard.loadgen.simulation.model.lockstep import LockstepClock
+from offboard.loadgen.simulation.model.simulated_tasks import Tasks
+from offboard.loadgen.simulation.world import World
+from offboard.loadgen.testbed.testbed import ROBOT
+from offboard.robot_client import policies, predictors
+from offboard.robot_client.offloader import BOTH, Offloader
+from offboard.robot_client.records.trace import Record, as_dict
+from offboard.robot_client.simulated.drive import OwnRecord
+from offboard.robot_client.simulated.workload import CLOSED, due_instants
+from offboard.robot_client.sites import heartbeat
+from offboard.robot_client.sites.runner import CLOUD
 
 
 @dataclass(frozen=True, slots=True)

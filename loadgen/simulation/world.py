@@ -4,25 +4,25 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from common.errors import ConfigError
-from loadgen.player import ROBOT_SEED_STEP
-from loadgen.relay.flags import LinkFlags
-from loadgen.relay.link import Link
-from loadgen.scenario import Scenario
-from loadgen.simulation import foresight
-from loadgen.simulation.clock import VirtualClock
-from loadgen.simulation.cloud import SimulatedCloud
-from loadgen.simulation.connection import Connection
-from loadgen.simulation.costs import DECIDING_CPU_S, Noise
-from loadgen.simulation.onboard import SimulatedOnboard
-from loadgen.simulation.others import OtherRobot
-from loadgen.simulation.processor import Processor
-from loadgen.simulation.server import Server
-from loadgen.simulation.tasks import Tasks
-from loadgen.simulation.truth import Truth
-from loadgen.testbed import CLOUD, ROBOT, WAN
-from loadgen.timeline import Event, absent_at_first
-from robot_client.runner import ONBOARD
+from offboard.common.errors import ConfigError
+from offboard.loadgen.play.player import ROBOT_SEED_STEP
+from offboard.loadgen.relay.link.link import Link
+from offboard.loadgen.relay.link.link_settings import LinkFlags
+from offboard.loadgen.scenario.scenario import Scenario
+from offboard.loadgen.scenario.timeline import Event, absent_at_first
+from offboard.loadgen.simulation import oracle as foresight
+from offboard.loadgen.simulation.cloud import SimulatedCloud
+from offboard.loadgen.simulation.model.clock import VirtualClock
+from offboard.loadgen.simulation.model.costs import DECIDING_CPU_S, Noise
+from offboard.loadgen.simulation.model.processor import Processor
+from offboard.loadgen.simulation.model.robot_connection import Connection
+from offboard.loadgen.simulation.model.server import Server
+from offboard.loadgen.simulation.model.simulated_tasks import Tasks
+from offboard.loadgen.simulation.model.true_costs import Truth
+from offboard.loadgen.simulation.onboard import SimulatedOnboard
+from offboard.loadgen.simulation.other_robots import OtherRobot
+from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN
+from offboard.robot_client.sites.runner import ONBOARD
 
 ENDS = ("reset_after_ms", "truncate_bytes", "slow_close_ms")  # conditions of connections, not of messages
 OF_THE_FIRST = ("cpus", "hogs", "cut", "join")  # what can happen to the robot whose policy is looked at

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from random import Random
 from typing import TYPE_CHECKING, Any
 
-from common.errors import ConfigError
+from offboard.common.errors import ConfigError
 
 if TYPE_CHECKING:
-    from robot_client.policies.base import PINNED, Decision, Forecast, Outlook, Policy
+    from offboard.robot_client.policies.forecast import PINNED, Decision, Forecast, Outlook, Policy
 
 __all__ = [
     "DEFAULT",
@@ -59,13 +59,13 @@ def __getattr__(name: str) -> Any:
     """What a policy is written with; loaded where it is first asked for."""
     if name not in __all__:
         raise AttributeError(name)
-    return getattr(importlib.import_module("robot_client.policies.base"), name)
+    return getattr(importlib.import_module("offboard.robot_client.policies.forecast"), name)
 
 
 def make(name: str, seed: int = 0) -> "Policy":
     """The policy of this name; the same seed draws the same."""
-    from robot_client.policies.rules import RULES
-    from robot_client.policies.wrappers import WRAPPERS
+    from offboard.robot_client.policies.rules import RULES
+    from offboard.robot_client.policies.wrappers import WRAPPERS
 
     check_name(name)
     *wrappers, rule = name.split(":")

@@ -4,8 +4,16 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from random import Random
 
-from robot_client.policies.base import Decision, Forecast, Policy, cheapest, costs_of, explain, home
-from robot_client.runner import CLOUD, ONBOARD
+from offboard.robot_client.policies.forecast import (
+    Decision,
+    Forecast,
+    Policy,
+    cheapest,
+    costs_of,
+    explain,
+    home,
+)
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 WARM_UP = 6  # observations of each site before anything is compared
 MARGIN = 0.1

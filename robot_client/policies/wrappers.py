@@ -4,8 +4,8 @@ import math
 from collections.abc import Callable, Collection
 from dataclasses import replace
 
-from robot_client.policies.base import Decision, Forecast, Outlook, Policy, cheapest
-from robot_client.runner import ONBOARD
+from offboard.robot_client.policies.forecast import Decision, Forecast, Outlook, Policy, cheapest
+from offboard.robot_client.sites.runner import ONBOARD
 
 PROBE_EVERY = 20  # tasks without news of a site
 MEASURED = 2.0  # times more seldom is onboard tried: its load and its capacity are measured

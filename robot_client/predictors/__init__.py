@@ -3,8 +3,8 @@
 import importlib
 from dataclasses import dataclass
 
-from common.errors import ConfigError
-from robot_client.predictors.base import Prediction, Predictor
+from offboard.common.errors import ConfigError
+from offboard.robot_client.predictors.base import Prediction, Predictor
 
 __all__ = ["LEAST_SQUARES", "Prediction", "Predictor", "check_name", "make", "names", "slow"]
 
@@ -25,8 +25,8 @@ class _Entry:
 
 
 _ENTRIES: dict[str, _Entry] = {
-    LEAST_SQUARES: _Entry("linear", "LeastSquares"),
-    "recursive-least-squares": _Entry("linear", "RecursiveLeastSquares"),
+    LEAST_SQUARES: _Entry("least_squares", "LeastSquares"),
+    "recursive-least-squares": _Entry("least_squares", "RecursiveLeastSquares"),
     "clipped-least-squares": _Entry("adaptive", "ClippedLeastSquares"),
     "bayesian-least-squares": _Entry("adaptive", "BayesianLeastSquares"),
     "kalman": _Entry("adaptive", "Kalman"),
@@ -34,10 +34,10 @@ _ENTRIES: dict[str, _Entry] = {
     AVERAGE: _Entry("average", "Average"),
     "theil-sen": _Entry("robust", "TheilSen"),
     "huber": _Entry("robust", "Huber"),
-    "random-forest": _Entry("forest", "RandomForest", slow=True),
-    "arima": _Entry("series", "Arima", slow=True),
-    "sarima": _Entry("series", "Sarima", slow=True),
-    "lstm": _Entry("lstm", "Lstm", slow=True),
+    "random-forest": _Entry("learned.random_forest", "RandomForest", slow=True),
+    "arima": _Entry("learned.arima", "Arima", slow=True),
+    "sarima": _Entry("learned.arima", "Sarima", slow=True),
+    "lstm": _Entry("learned.lstm", "Lstm", slow=True),
 }
 HELP = f"{', '.join(_ENTRIES)}, or {RIVER}MODULE.CLASS; {FEATURES}NAME: on measured features"  # for --help
 
@@ -50,15 +50,15 @@ def make(name: str, window: int, seed: int = 0) -> Predictor:
     check_name(name)
     name = name.removeprefix(WORK)
     if name.startswith(FEATURES):
-        from robot_client.predictors.features import Measured
+        from offboard.robot_client.predictors.features import Measured
 
         return Measured(make(name.removeprefix(FEATURES), window, seed))
     if name.startswith(RIVER):
-        from robot_client.predictors.online import River
+        from offboard.robot_client.predictors.learned.river_model import River
 
         return River(name.removeprefix(RIVER), window, seed)
     entry = _ENTRIES[name]
-    module = importlib.import_module(f"robot_client.predictors.{entry.module}")
+    module = importlib.import_module(f"offboard.robot_client.predictors.{entry.module}")
     made: Predictor = getattr(module, entry.name)(window, seed=seed)
     return made
 

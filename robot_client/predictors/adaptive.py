@@ -5,9 +5,9 @@ All limits are in units of the site's own running error, so that tasks of 5 ms a
 
 import math
 
-from robot_client.predictors.base import SIZE_MIN, Prediction, check_observation
-from robot_client.predictors.linear import ROUNDING, RecursiveLeastSquares, checked_forgetting
-from robot_client.window import WINDOW_MAX, checked_length
+from offboard.robot_client.predictors.base import SIZE_MIN, Prediction, check_observation
+from offboard.robot_client.predictors.least_squares import ROUNDING, RecursiveLeastSquares, checked_forgetting
+from offboard.robot_client.predictors.window import WINDOW_MAX, checked_length
 
 CLIP = 3.0  # standard deviations of the running error that one observation may pull by
 CLIP_FROM = 8  # observations: before them nothing is known to be an outlier

@@ -3,11 +3,11 @@
 import math
 from collections.abc import Sequence
 
-from robot_client.predictors.adaptive import CLIP, ClippedLeastSquares, Kalman, Paced, Scale
-from robot_client.predictors.base import Prediction, check_observation
-from robot_client.predictors.features import Conditional, Gains
-from robot_client.predictors.robust import TheilSen
-from robot_client.runner import UNMEASURED, Condition
+from offboard.robot_client.predictors.adaptive import CLIP, ClippedLeastSquares, Kalman, Paced, Scale
+from offboard.robot_client.predictors.base import Prediction, check_observation
+from offboard.robot_client.predictors.features import Conditional, Gains
+from offboard.robot_client.predictors.robust import TheilSen
+from offboard.robot_client.sites.runner import UNMEASURED, Condition
 
 SHARPNESS = 4.0  # weight of a model: exp(-SHARPNESS x its mean error in units of the average's own)
 MEMORY = 0.9  # of the mean error: so much of it is left after one more task

@@ -2,8 +2,8 @@
 
 from abc import ABC, abstractmethod
 
-from robot_client.predictors.base import Prediction, Predictor, check_observation
-from robot_client.runner import UNMEASURED, Condition
+from offboard.robot_client.predictors.base import Prediction, Predictor, check_observation
+from offboard.robot_client.sites.runner import UNMEASURED, Condition
 
 GAIN_RATE = 0.05
 GAIN_MAX = 3.0

@@ -5,8 +5,8 @@ from collections import deque
 import numpy as np
 import numpy.typing as npt
 
-from robot_client.predictors.base import Prediction, check_observation
-from robot_client.window import checked_length
+from offboard.robot_client.predictors.base import Prediction, check_observation
+from offboard.robot_client.predictors.window import checked_length
 
 Column = npt.NDArray[np.float64]
 

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.errors import ConfigError
-from robot_client.predictors.base import SIZE_MIN, Prediction
-from robot_client.predictors.refitted import Column, Refitted
+from offboard.common.errors import ConfigError
+from offboard.robot_client.predictors.base import SIZE_MIN, Prediction
+from offboard.robot_client.predictors.refitted import Column, Refitted
 
 SAMPLE = 1_000  # values that tell where the middle of many more lies
 

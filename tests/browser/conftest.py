@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, ConsoleMessage, Page, sync_playwright
 
-from loadgen.report import ReportConfig, run_report
+from offboard.loadgen.report.report import ReportConfig, run_report
 from tests.browser import chromium
 from tests.unit.test_evaluate import THOUSAND, csv_of
 from tests.unit.test_replay import trace_of

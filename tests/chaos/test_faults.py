@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from common.errors import OffloadError
-from loadgen import play as player
-from loadgen.play import Played, play
-from loadgen.player import EVENTS, TRACE
-from loadgen.scenario import CloudPart, RobotPart, Scenario, Workload
-from loadgen.testbed import CLOUD, ROBOT, WAN, Setup, Testbed
-from loadgen.timeline import Event
-from robot_client import trace
+from offboard.common.errors import OffloadError
+from offboard.loadgen.play import play as player
+from offboard.loadgen.play.play import Played, play
+from offboard.loadgen.play.player import EVENTS, TRACE
+from offboard.loadgen.scenario.scenario import CloudPart, RobotPart, Scenario, Workload
+from offboard.loadgen.scenario.timeline import Event
+from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, Setup, Testbed
+from offboard.robot_client.records import trace
 from tests.chaos.plays import ALL, FAULT_TIMES, FEW_FAULTS
 from tests.compose.conftest import made_by_docker
 

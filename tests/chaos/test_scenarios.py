@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 
-from loadgen import play as player
-from loadgen.outcome import read_lines
-from loadgen.play import play
-from loadgen.player import EVENTS, TRACE
-from loadgen.scenario import find_scenario, read_scenario
-from loadgen.timeline import Event
-from robot_client import trace
+from offboard.loadgen.play import play as player
+from offboard.loadgen.play.play import play
+from offboard.loadgen.play.player import EVENTS, TRACE
+from offboard.loadgen.scenario.outcome import read_lines
+from offboard.loadgen.scenario.scenario import find_scenario, read_scenario
+from offboard.loadgen.scenario.timeline import Event
+from offboard.robot_client.records import trace
 from tests.chaos.plays import IN_CONTAINERS, ON_LOOPBACK, SOAK_TASKS
 
 pytestmark = pytest.mark.timeout(600)

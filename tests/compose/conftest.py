@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from loadgen.containers import RUN
+from offboard.loadgen.testbed.containers import RUN
 
 ROOT = Path(__file__).parents[2]
 PROJECT = "offboard-test"

@@ -5,8 +5,8 @@ import sys
 import time
 from pathlib import Path
 
-from common.maps import read_map, resampled
-from common.planner import Point, Pose, plan_path
+from offboard.common.planning.maps import read_map, resampled
+from offboard.common.planning.planner import Point, Pose, plan_path
 
 SETTLE_S = 0.3  # whoever changed the quota is done with the CPU
 V2, V1 = Path("/sys/fs/cgroup/cpu.max"), Path("/sys/fs/cgroup/cpu")

@@ -2,7 +2,7 @@
 
 import json
 
-from robot_client import Offloader
+from offboard import Offloader
 from tests.probes import echo
 
 TASKS = 200

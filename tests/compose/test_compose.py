@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from robot_client.trace import read
+from offboard.robot_client.records.trace import read
 from tests.compose.conftest import Compose, docker
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]

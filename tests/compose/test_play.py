@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from loadgen.containers import PREFIX
-from loadgen.rows import read
+from offboard.loadgen.table.rows import read
+from offboard.loadgen.testbed.containers import PREFIX
 from tests.compose.conftest import ROOT, docker, made_by_docker
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600), pytest.mark.usefixtures("engine")]
@@ -20,7 +20,7 @@ START_S, END_S = 300, 200
 
 
 def loadgen(*args: str | Path) -> list[str]:
-    return [sys.executable, "-m", "loadgen", *map(str, args)]
+    return [sys.executable, "-m", "offboard.loadgen", *map(str, args)]
 
 
 def robot_runs(host: int) -> bool:

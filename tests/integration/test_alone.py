@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from loadgen.disturbance import measure
-from loadgen.processes import LocalTestbed
-from robot_client.offloader import Offloader
-from robot_client.policies import PINNED
-from robot_client.runner import CLOUD, ONBOARD, Execution
-from robot_client.trace import read
+from offboard.loadgen.table.disturbance import measure
+from offboard.loadgen.testbed.processes import LocalTestbed
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import PINNED
+from offboard.robot_client.records.trace import read
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.probes import burn, nap
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
@@ -78,7 +78,7 @@ def test_a_scenario_measures_plans_alone(tmp_path: Path) -> None:
     out.mkdir()
     (out / "trace.alone.jsonl").write_text("{}\n")
     done = subprocess.run(
-        [sys.executable, "-m", "loadgen", "run", scenario, "--out", out],
+        [sys.executable, "-m", "offboard.loadgen", "run", scenario, "--out", out],
         capture_output=True,
         text=True,
         timeout=100,
@@ -110,7 +110,7 @@ def test_a_cloud_that_is_away_is_a_warning(tmp_path: Path) -> None:
     flags += ["--cloud", nowhere, "--connect", "0.1", "--trace", trace]
     for runs in (1, 2):
         done = subprocess.run(
-            [sys.executable, "-m", "robot_client", *map(str, flags)],
+            [sys.executable, "-m", "offboard.robot_client", *map(str, flags)],
             capture_output=True,
             text=True,
             timeout=50,

@@ -30,14 +30,14 @@ from benchmarks.attackers import (
     valid_messages,
 )
 from benchmarks.keyring import Keys
-from cloud_server.quota import CUT_OFF_S
-from cloud_server.server import HANDSHAKE_S
-from common import wire
-from common.bounded_http import CONNECTIONS_MAX, REQUEST_S
-from common.keys import robot_keys
-from common.maps import GridMap
-from common.planner import Point, Pose, plan_path
-from robot_client.offloader import Offloader
+from offboard.cloud_server.rate_limit import CUT_OFF_S
+from offboard.cloud_server.server import HANDSHAKE_S
+from offboard.common.planning.maps import GridMap
+from offboard.common.planning.planner import Point, Pose, plan_path
+from offboard.common.security.bounded_http import CONNECTIONS_MAX, REQUEST_S
+from offboard.common.security.keys import robot_keys
+from offboard.common.wire import messages as wire
+from offboard.robot_client.offloader import Offloader
 from tests.curves import WAIT_S, Dealer, Served, until
 from tests.probes import echo
 
@@ -72,7 +72,14 @@ def good(keys: Keys) -> Path:
 def served(keys: Keys, wicked: Path, good: Path) -> Iterator[Served]:  # noqa: ARG001 - their keys come first
     """A server for all attacks: what one of them broke, the next would find."""
     unbounded = ("--robot-mib-s", "65536")  # nothing is cut off for its number
-    served = Served("--keys", str(keys.server), "--tasks", "tests.probes,common.planner", *SIZES, *unbounded)
+    served = Served(
+        "--keys",
+        str(keys.server),
+        "--tasks",
+        "tests.probes,offboard.common.planning.planner",
+        *SIZES,
+        *unbounded,
+    )
     yield served
     served.close()
     forged = [line for line in served.lines if "mallory" in line and "\\n" not in line]

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from loadgen.processes import COMMANDS, LocalTestbed
-from loadgen.testbed import Setup
+from offboard.loadgen.testbed.processes import COMMANDS, LocalTestbed
+from offboard.loadgen.testbed.testbed import Setup
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(150)]
 
@@ -19,7 +19,7 @@ FASTER = 1.5
 ATTEMPTS = 2  # others use the machine too, and may take from two parts what they leave to one
 RUN_S = 60.0
 SETUPS = {
-    "cloud": Setup({"tasks": "loadgen.work", "workers": 2}, CPUS),
+    "cloud": Setup({"tasks": "offboard.loadgen.scenario.hash_tasks", "workers": 2}, CPUS),
     "wan": Setup({"delay_ms": DELAY_MS}),
     "robot": Setup({"repeats": REPEATS}, CPUS),
 }

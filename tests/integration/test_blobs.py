@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cloud_server.executors import Threads
-from cloud_server.metrics import Metrics
-from cloud_server.server import Server
-from common.tasks import Task, kind_of, task
-from robot_client.cloud import CloudRunner
-from robot_client.runner import Execution
-from robot_client.uploads import ALONG_BYTES_MAX, ALONG_SHARE, NEW_AFTER
+from offboard.cloud_server.executors import Threads
+from offboard.cloud_server.metrics import Metrics
+from offboard.cloud_server.server import Server
+from offboard.common.tasks import Task, kind_of, task
+from offboard.robot_client.sites.cloud import CloudRunner
+from offboard.robot_client.sites.runner import Execution
+from offboard.robot_client.sites.uploads import ALONG_BYTES_MAX, ALONG_SHARE, NEW_AFTER
 
 pytestmark = pytest.mark.integration
 

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 TASKS = 80
 SCENARIO = f"""name = "small"
 [workload]
-task = "loadgen.work:hash_rounds"
+task = "offboard.loadgen.scenario.hash_tasks:hash_rounds"
 sizes = ["uniform:5000:30000"]
 tasks = {TASKS}
 reference = 10
@@ -33,7 +33,7 @@ link = {{ outage = false }}
 """
 POLICIES = ("paper", "onboard", "cloud")
 COMMAND = (
-    *(sys.executable, "-m", "loadgen", "compare", "small.toml"),
+    *(sys.executable, "-m", "offboard.loadgen", "compare", "small.toml"),
     *("--seeds", "1", "--format", "csv", "--out", "runs"),
 )
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}

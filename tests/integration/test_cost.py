@@ -5,12 +5,12 @@ from threading import Thread
 
 import pytest
 
-from cloud_server.executors import Threads
-from cloud_server.metrics import Metrics
-from cloud_server.server import Server
-from common.channel import Channel
-from common.tasks import task
-from robot_client.offloader import Offloader
+from offboard.cloud_server.executors import Threads
+from offboard.cloud_server.metrics import Metrics
+from offboard.cloud_server.server import Server
+from offboard.common.tasks import task
+from offboard.common.wire.channel import Channel
+from offboard.robot_client.offloader import Offloader
 
 pytestmark = pytest.mark.integration
 

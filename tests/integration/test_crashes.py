@@ -15,13 +15,13 @@ import httpx
 import numpy as np
 import pytest
 
-from cloud_server import workers as worker_processes
-from cloud_server.executors import Outcome, Processes
-from common.errors import CloudTimeout, TaskFailed
-from common.wire import decode, encode
-from loadgen.processes import LocalTestbed
-from robot_client.offloader import Offloader
-from robot_client.runner import CLOUD
+from offboard.cloud_server import worker_pool as worker_processes
+from offboard.cloud_server.executors import Outcome, Processes
+from offboard.common.errors import CloudTimeout, TaskFailed
+from offboard.common.wire.messages import decode, encode
+from offboard.loadgen.testbed.processes import LocalTestbed
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.sites.runner import CLOUD
 from tests import crashes
 from tests.probes import echo, nap, process_id
 
@@ -107,7 +107,7 @@ def test_a_crash_fails_its_own_task_alone(
     """It fails with the reason, the task beside it is answered, and soon there are two workers again,
     with the planner loaded, whose code is in the cache of the compiler."""
     changes: list[str] = []
-    executor = make(2, "common.planner", changes=changes)
+    executor = make(2, "offboard.common.planning.planner", changes=changes)
     beside = submit(executor, "nap", 0.5)
     outcome = run(executor, kind, *args)
     assert (outcome.status, outcome.error) == ("failed", f"the worker {how} while this task ran")

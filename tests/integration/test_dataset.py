@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from loadgen.rows import read
+from offboard.loadgen.table.rows import read
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
 
@@ -16,7 +16,11 @@ ROOT = Path(__file__).parents[2]
 
 def loadgen(*args: str, cwd: Path = ROOT) -> str:
     done = subprocess.run(
-        [sys.executable, "-m", "loadgen", *args], capture_output=True, text=True, timeout=150, cwd=cwd
+        [sys.executable, "-m", "offboard.loadgen", *args],
+        capture_output=True,
+        text=True,
+        timeout=150,
+        cwd=cwd,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from robot_client.trace import read
+from offboard.robot_client.records.trace import read
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
 
@@ -20,7 +20,7 @@ MARK = f"OFFBOARD_TEST_MARK={os.getpid()}"
 
 
 def loadgen(*args: str | Path) -> list[str]:
-    return [sys.executable, "-m", "loadgen", *map(str, args)]
+    return [sys.executable, "-m", "offboard.loadgen", *map(str, args)]
 
 
 def marked_processes() -> dict[int, str]:

@@ -10,7 +10,7 @@ import pytest
 import zmq
 
 from benchmarks.servers import cloud_server
-from common import wire
+from offboard.common.wire import messages as wire
 from tests.probes import nap
 
 pytestmark = pytest.mark.integration

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.errors import CloudTimeout
-from loadgen.processes import LocalTestbed
-from loadgen.testbed import Setup
-from robot_client.offloader import Offloader
-from robot_client.runner import CLOUD, ONBOARD
-from robot_client.trace import Record
+from offboard.common.errors import CloudTimeout
+from offboard.loadgen.testbed.processes import LocalTestbed
+from offboard.loadgen.testbed.testbed import Setup
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.records.trace import Record
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.probes import echo, mark_once, nap, process_id, total, zeros
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]

@@ -6,12 +6,12 @@ from contextlib import closing, contextmanager
 import pytest
 import zmq
 
-from common import wire
-from common.tasks import Task, kind_of, kinds, task
-from common.wire import Hello, Message, Ping, Pong, Reply, Request
-from robot_client import cloud
-from robot_client.cloud import CloudRunner
-from robot_client.turns import LINGER_S
+from offboard.common.tasks import Task, kind_of, kinds, task
+from offboard.common.wire import messages as wire
+from offboard.common.wire.messages import Hello, Message, Ping, Pong, Reply, Request
+from offboard.robot_client.sites import cloud
+from offboard.robot_client.sites.cloud import CloudRunner
+from offboard.robot_client.sites.turns import LINGER_S
 
 pytestmark = pytest.mark.integration
 

@@ -16,10 +16,11 @@ import pytest
 import zmq
 
 from benchmarks.keyring import Keys
-from common import VERSION, wire
-from common.keys import PRIVATE, make_keys, robot_keys, server_keys
-from robot_client.cloud import REFUSED, UNFIT
-from robot_client.offloader import Offloader
+from offboard.common import VERSION
+from offboard.common.security.keys import PRIVATE, make_keys, robot_keys, server_keys
+from offboard.common.wire import messages as wire
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.sites.cloud import REFUSED, UNFIT
 from tests.curves import ROOT, WAIT_S, Dealer, Served, clean_environ, recorded, says_until_closed, until
 from tests.probes import echo, mark_once, nap
 
@@ -70,7 +71,7 @@ Robot = Callable[..., Offloader]
 
 def run(*command: str, **environ: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(
-        [sys.executable, "-m", *command],
+        [sys.executable, "-m", f"offboard.{command[0]}", *command[1:]],
         cwd=ROOT,
         env=clean_environ() | environ,
         capture_output=True,
@@ -400,7 +401,7 @@ def test_insecure_is_said(serve: Serve, robot: Robot, caplog: pytest.LogCaptureF
         lambda: served.logged("--insecure: --listen: tcp://0.0.0.0:0 is beyond loopback and without --keys;")
     )
     assert httpx.get(f"{served.http}/health").json()["insecure"] is True
-    with caplog.at_level(logging.WARNING, "robot_client.cloud"):
+    with caplog.at_level(logging.WARNING, "offboard.robot_client.sites.cloud"):
         for _ in range(2):
             offload = robot(served.endpoint.replace("127.0.0.1", "0.0.0.0"), None)
             assert offload.wait_for_sites(echo, WAIT_S) == {}

@@ -8,7 +8,7 @@ import pytest
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
 
-TASK = """from common.tasks import task
+TASK = """from offboard.common.tasks import task
 
 
 @task("twice", size=float)

@@ -12,19 +12,19 @@ from typing import Any
 
 import pytest
 
-from common.errors import ConfigError, OffloadError
-from loadgen.part import Part
-from loadgen.processes import LocalTestbed
-from loadgen.quota import SignalQuota
-from loadgen.testbed import Setup
+from offboard.common.errors import ConfigError, OffloadError
+from offboard.loadgen.testbed.cpu_quota import SignalQuota
+from offboard.loadgen.testbed.part import Part
+from offboard.loadgen.testbed.processes import LocalTestbed
+from offboard.loadgen.testbed.testbed import Setup
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
 
 WAIT_S = 10.0
 WAN = """
 import sys
-from common.config import load, run_command
-from loadgen.relay.wan import WanConfig, run_wan
+from offboard.common.config import load, run_command
+from offboard.loadgen.relay.wan import WanConfig, run_wan
 settings = dict(prog="wan", description="", environ={}, prefix="WAN")
 sys.exit(run_command("wan", lambda: run_wan(load(WanConfig, sys.argv[1:], **settings))))
 """
@@ -75,9 +75,9 @@ print(1e3 * min(trip() for _ in range(15)))
 HOST = """
 import signal, sys
 from pathlib import Path
-import loadgen.processes as processes
-from loadgen.quota import SignalQuota
-from loadgen.testbed import Setup
+import offboard.loadgen.testbed.processes as processes
+from offboard.loadgen.testbed.cpu_quota import SignalQuota
+from offboard.loadgen.testbed.testbed import Setup
 from tests_commands import COMMANDS
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores Ctrl-C
 if sys.argv[2] == "stop-continue":
@@ -266,7 +266,7 @@ def test_a_command_that_does_not_exist_says_so(tmp_path: Path) -> None:
 
 def test_a_part_that_ignores_sigterm_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A part and a worker of its own that ignore SIGTERM are gone after close."""
-    monkeypatch.setattr("loadgen.part.TERMINATE_S", 0.2)
+    monkeypatch.setattr("offboard.loadgen.testbed.part.TERMINATE_S", 0.2)
     code = (
         "import os, signal, time; signal.signal(15, signal.SIG_IGN); os.fork(); print('up'); time.sleep(99)"
     )

@@ -10,10 +10,11 @@ from typing import Any
 
 import pytest
 
-from loadgen.processes import LocalTestbed
-from robot_client import answers, references, trace
-from robot_client.policies import PINNED
-from robot_client.runner import CLOUD, ONBOARD
+from offboard.loadgen.testbed.processes import LocalTestbed
+from offboard.robot_client.policies import PINNED
+from offboard.robot_client.records import trace
+from offboard.robot_client.simulated import answers, references
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
 
@@ -25,7 +26,7 @@ WAIT_S = 60.0
 
 
 def command(*flags: object) -> list[str]:
-    return [sys.executable, "-m", "robot_client", *map(str, flags)]
+    return [sys.executable, "-m", "offboard.robot_client", *map(str, flags)]
 
 
 def robot(*flags: object, code: int = 0) -> str:
@@ -47,7 +48,7 @@ def test_a_killed_run_goes_on_where_it_was(
     testbed: Callable[..., LocalTestbed], tmp_path: Path, arrivals: tuple[str, ...]
 ) -> None:
     """kill -9, and again on the same files: each task is answered once, as in a run that nobody killed."""
-    bed = testbed({"tasks": "common.planner"})
+    bed = testbed({"tasks": "offboard.common.planning.planner"})
     flags = [*MAP, *arrivals, "--cloud", bed.endpoint, "--tasks", 150, "--sizes", "uniform:0:3", "--seed", 7]
     robot(*flags, "--answers", tmp_path / "whole.jsonl")
     path, kept = tmp_path / "answers.jsonl", tmp_path / "trace.jsonl"
@@ -113,7 +114,7 @@ def test_an_interrupted_run_records_what_it_answered(
 
 def test_references_are_of_each_site_alone(testbed: Callable[..., LocalTestbed], tmp_path: Path) -> None:
     """Every fifth plan again onboard and in the cloud; the trace of the run holds only the run."""
-    bed = testbed({"tasks": "common.planner"}, delay_ms=5.0)
+    bed = testbed({"tasks": "offboard.common.planning.planner"}, delay_ms=5.0)
     kept = tmp_path / "trace.jsonl"
     flags = ["--cloud", bed.endpoint, "--tasks", 20, "--window", 4, "--trace", kept, "--reference", 5]
     robot(*MAP, *flags, "--answers", tmp_path / "a.jsonl")

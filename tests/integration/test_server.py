@@ -18,14 +18,15 @@ import numpy as np
 import pytest
 import zmq
 
-from cloud_server.executors import EXECUTORS, SPARES
-from cloud_server.metrics import Metrics
-from cloud_server.server import Server
-from cloud_server.web import Web, create_app
-from common import VERSION, wire
-from common.errors import ConfigError
-from common.load import LOADED
-from common.wire import Blob, Cancel, Hello, Ping, Pong, Reply, Request
+from offboard.cloud_server.executors import EXECUTORS, SPARES
+from offboard.cloud_server.http_api import Web, create_app
+from offboard.cloud_server.metrics import Metrics
+from offboard.cloud_server.server import Server
+from offboard.common import VERSION
+from offboard.common.errors import ConfigError
+from offboard.common.host.load import LOADED
+from offboard.common.wire import messages as wire
+from offboard.common.wire.messages import Blob, Cancel, Hello, Ping, Pong, Reply, Request
 
 pytestmark = pytest.mark.integration
 
@@ -33,7 +34,7 @@ ROOT = Path(__file__).parents[2]
 WAIT_S = 8.0
 MODULE = '''
 import os, signal
-from common.tasks import task
+from offboard.common.tasks import task
 
 started = []
 
@@ -631,7 +632,7 @@ class Command:
 
 def start(folder: Path, *flags: str) -> "subprocess.Popen[str]":
     return subprocess.Popen(
-        [sys.executable, "-W", "error", "-m", "cloud_server", "--tasks", "served_tasks", *flags],
+        [sys.executable, "-W", "error", "-m", "offboard.cloud_server", "--tasks", "served_tasks", *flags],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -708,7 +709,7 @@ def test_a_users_mistake_is_one_line_and_2(serve: Serve, folder: Path, flags: li
 def test_help_loads_nothing_heavy() -> None:
     """--help answers without zmq, numba and fastapi."""
     code = (
-        "import sys; from cloud_server.__main__ import serve\n"
+        "import sys; from offboard.cloud_server.__main__ import serve\n"
         "try: serve(['--help'], {})\n"
         "except SystemExit: print({'zmq', 'numba', 'fastapi', 'numpy'} & set(sys.modules))"
     )

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from common.errors import ConfigError
-from loadgen.containers import DockerTestbed
-from loadgen.processes import HOG, LocalTestbed
-from loadgen.testbed import Setup
+from offboard.common.errors import ConfigError
+from offboard.loadgen.testbed.containers import DockerTestbed
+from offboard.loadgen.testbed.processes import HOG, LocalTestbed
+from offboard.loadgen.testbed.testbed import Setup
 from tests.testbeds import CONTRACT, Bench, setups
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]

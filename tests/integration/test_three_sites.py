@@ -8,12 +8,12 @@ from random import Random
 
 import pytest
 
-from loadgen.processes import LocalTestbed
-from loadgen.testbed import Setup
-from robot_client.offloader import Offloader
-from robot_client.policies import DEFAULT
-from robot_client.runner import CLOUD, ONBOARD
-from robot_client.trace import Record
+from offboard.loadgen.testbed.processes import LocalTestbed
+from offboard.loadgen.testbed.testbed import Setup
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import DEFAULT
+from offboard.robot_client.records.trace import Record
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests import slow_site
 from tests.phases import EDGE, PHASES, TASKS, check
 

@@ -17,13 +17,13 @@ import pytest
 import toxiproxy
 from toxiproxy.exceptions import InvalidToxic, NotFound, ProxyExists
 
-from loadgen.relay.proxies import PROXIES_MAX, TOXICS_MAX
-from loadgen.relay.toxiproxy import BODY_BYTES_MAX
+from offboard.loadgen.relay.toxiproxy.proxies import PROXIES_MAX, TOXICS_MAX
+from offboard.loadgen.relay.toxiproxy.toxiproxy_api import BODY_BYTES_MAX
 from tests.relays import WAIT_S, receive, round_trip_s, silent
 
 pytestmark = pytest.mark.integration
 
-WAN = [sys.executable, "-m", "loadgen", "wan", "--listen", "127.0.0.1:0", "--http", "127.0.0.1:0"]
+WAN = [sys.executable, "-m", "offboard.loadgen", "wan", "--listen", "127.0.0.1:0", "--http", "127.0.0.1:0"]
 CONNECTIONS = 16
 
 

@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
-from loadgen.relay.control import BODY_BYTES_MAX
-from loadgen.relay.jitter import SAMPLES_MAX
-from loadgen.relay.schedule import EVENTS_MAX
-from loadgen.relay.wan import WanConfig
+from offboard.loadgen.relay.http_control import BODY_BYTES_MAX
+from offboard.loadgen.relay.link.jitter import SAMPLES_MAX
+from offboard.loadgen.relay.schedule import EVENTS_MAX
+from offboard.loadgen.relay.wan import WanConfig
 from tests.relays import QUIET_S, WAIT_S, WAN, echo, quietest, receive, round_trip_s, silent, wait_until
 
 pytestmark = pytest.mark.integration

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from loadgen.relay.link import SEGMENT_BYTES
+from offboard.loadgen.relay.link.link import SEGMENT_BYTES
 from tests.relays import (
     WAIT_S,
     WAN,

@@ -13,20 +13,11 @@ from typing import Any
 import pytest
 import scipy.stats
 
-from loadgen.relay import flow
-from loadgen.relay.link import SEGMENT_BYTES, Link, LinkConditions
-from loadgen.relay.relay import Relay
-from loadgen.relay.truth import Truth
-from tests.relays import (
-    WAIT_S,
-    echo,
-    quietest,
-    read_truth,
-    receive,
-    round_trip_s,
-    stop,
-    wait_until,
-)
+from offboard.loadgen.relay import flow
+from offboard.loadgen.relay.link.link import SEGMENT_BYTES, Link, LinkConditions
+from offboard.loadgen.relay.link_record import Truth
+from offboard.loadgen.relay.relay import Relay
+from tests.relays import WAIT_S, echo, quietest, read_truth, receive, round_trip_s, stop, wait_until
 
 pytestmark = pytest.mark.integration
 

@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[2]
 TASKS = '''
 """A user's own tasks."""
 import os
-from common.tasks import task
+from offboard.common.tasks import task
 
 @task("count_primes", size=lambda limit: limit)
 def count_primes(limit: int) -> int:
@@ -30,7 +30,7 @@ def where_am_i() -> int:
 
 PROGRAM = """
 import asyncio, os, sys
-from robot_client import Offloader
+from offboard import Offloader
 from mytasks import count_primes, where_am_i
 
 with Offloader.connect(sys.argv[1], window=5) as offload:
@@ -43,7 +43,7 @@ with Offloader.connect(sys.argv[1], window=5) as offload:
 CHANGED = """
 import logging, sys
 logging.basicConfig(format="%(message)s")
-from robot_client import Offloader
+from offboard import Offloader
 from mytasks import count_primes
 with Offloader.connect(sys.argv[1]) as offload:
     print(offload.wait_for_sites(count_primes, 3.0))

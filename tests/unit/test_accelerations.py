@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from common import maps, search
-from common.errors import Unwanted
-from common.flood import PAUSE_CELLS
-from common.planner import Point, Pose, Scan, plan_path
-from common.planners import ASTAR, DIJKSTRA, JPS, PLANNERS
-from common.search import NO_HITS, Cell, Field, Hits, Route
-from common.wanted import call_while
+from offboard.common.errors import Unwanted
+from offboard.common.planning import maps, search
+from offboard.common.planning.flood import PAUSE_CELLS
+from offboard.common.planning.planner import Point, Pose, Scan, plan_path
+from offboard.common.planning.planner_names import ASTAR, DIJKSTRA, JPS, PLANNERS
+from offboard.common.planning.search import NO_HITS, Cell, Field, Hits, Route
+from offboard.common.wanted import call_while
 from tests.mazes import FORMS, check, oracle, path_cost, random_cells, random_maze, serpentine, warm
 
 ROOT = Path(__file__).parents[2]

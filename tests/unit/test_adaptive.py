@@ -4,10 +4,10 @@ from random import Random
 
 import pytest
 
-from common.errors import ConfigError
-from robot_client import predictors
-from robot_client.predictors import Predictor
-from robot_client.predictors.adaptive import (
+from offboard.common.errors import ConfigError
+from offboard.robot_client import predictors
+from offboard.robot_client.predictors import Predictor
+from offboard.robot_client.predictors.adaptive import (
     CLIP,
     CLIP_FROM,
     GROWTH,
@@ -18,8 +18,8 @@ from robot_client.predictors.adaptive import (
     Paced,
     Scale,
 )
-from robot_client.predictors.linear import RecursiveLeastSquares
-from robot_client.window import WINDOW_MAX
+from offboard.robot_client.predictors.least_squares import RecursiveLeastSquares
+from offboard.robot_client.predictors.window import WINDOW_MAX
 
 FOLLOWING = ("clipped-least-squares", "kalman", "blind-average", "average")
 ROBUST = ("clipped-least-squares", "kalman")

@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from common.errors import ConfigError
-from robot_client.allowance import DUPLICATES_FIRST, DUPLICATES_MAX, Allowance
+from offboard.common.errors import ConfigError
+from offboard.robot_client.policies.allowance import DUPLICATES_FIRST, DUPLICATES_MAX, Allowance
 
 
 def begin(allowance: Allowance, tasks: int, every_s: float = 1.0, from_s: float = 0.0) -> None:

@@ -8,11 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common import planner
-from common.errors import BadValue, ConfigError, DataError
-from common.maps import GridMap
-from common.planner import Plan, Point, Pose, plan_path
-from robot_client.answers import STEPS, Answered, Answers, cells_of, of_plan, of_value, read
+from offboard.common.errors import BadValue, ConfigError, DataError
+from offboard.common.planning import planner
+from offboard.common.planning.maps import GridMap
+from offboard.common.planning.planner import Plan, Point, Pose, plan_path
+from offboard.robot_client.simulated.answers import (
+    STEPS,
+    Answered,
+    Answers,
+    cells_of,
+    of_plan,
+    of_value,
+    read,
+)
 
 planner.warm()  # compiles before the clock of any test runs
 

@@ -4,8 +4,8 @@ from random import Random
 
 import pytest
 
-from robot_client.predictors.average import FEARED, START, Average, blind_average
-from robot_client.runner import UNMEASURED, Condition
+from offboard.robot_client.predictors.average import FEARED, START, Average, blind_average
+from offboard.robot_client.sites.runner import UNMEASURED, Condition
 
 
 class Says:

@@ -8,15 +8,15 @@ from typing import Any
 
 import pytest
 
-from common.errors import CloudBroken, CloudTimeout, ConfigError, Overtaken, TaskFailed
-from common.tasks import Task, task
-from robot_client import policies, predictors
-from robot_client.allowance import DUPLICATES_MAX, Allowance
-from robot_client.offloader import Offloader
-from robot_client.placement import SERVER_IN_FLIGHT_MAX
-from robot_client.policies.rules import WARM_UP
-from robot_client.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
-from robot_client.trace import Record
+from offboard.common.errors import CloudBroken, CloudTimeout, ConfigError, Overtaken, TaskFailed
+from offboard.common.tasks import Task, task
+from offboard.robot_client import policies, predictors
+from offboard.robot_client.execution.placement import SERVER_IN_FLIGHT_MAX
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies.allowance import DUPLICATES_MAX, Allowance
+from offboard.robot_client.policies.rules import WARM_UP
+from offboard.robot_client.records.trace import Record
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
 from tests.fakes import ScriptedRunner
 
 WAIT_S = 5.0

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from loadgen import bootstrap, score
-from loadgen.bootstrap import Blocks, block_length
+from offboard.loadgen.table import bootstrap, score
+from offboard.loadgen.table.bootstrap import Blocks, block_length
 
 
 def means(values: np.ndarray, blocks: Blocks) -> tuple[float, float]:

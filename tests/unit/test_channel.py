@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 import zmq
 
-from common.channel import Channel
+from offboard.common.wire.channel import Channel
 
 SENDERS, MESSAGES = 4, 500
 LONG_S = 30.0  # a signal that is lost is one that a test waits for as long

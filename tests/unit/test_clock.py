@@ -5,7 +5,7 @@ from concurrent.futures import Future
 
 import pytest
 
-from robot_client.clock import SystemClock
+from offboard.robot_client.sites.clock import SystemClock
 
 
 def test_time_never_goes_back() -> None:

@@ -8,14 +8,14 @@ from typing import Any
 
 import pytest
 
-from common.config import as_dict, check, load, run_command, setting
-from common.errors import ConfigError, DataError, OffloadError
-from robot_client import trace
-from robot_client.allowance import DUPLICATES_MAX
-from robot_client.config import RobotConfig
-from robot_client.energy import Energy
-from robot_client.objectives import Mean, TimeAndEnergy
-from robot_client.policies.wrappers import STALE
+from offboard.common.config import as_dict, check, load, run_command, setting
+from offboard.common.errors import ConfigError, DataError, OffloadError
+from offboard.robot_client.config import RobotConfig
+from offboard.robot_client.policies.allowance import DUPLICATES_MAX
+from offboard.robot_client.policies.energy import Energy
+from offboard.robot_client.policies.objectives import Mean, TimeAndEnergy
+from offboard.robot_client.policies.wrappers import STALE
+from offboard.robot_client.records import trace
 
 
 @dataclass(frozen=True)
@@ -232,7 +232,11 @@ def test_a_users_mistake_is_one_line_and_exit_code_2(
     for name, text in FILES.items():
         (tmp_path / name).write_text(text)
     done = subprocess.run(
-        [sys.executable, "-m", *command], capture_output=True, text=True, timeout=30, cwd=tmp_path
+        [sys.executable, "-m", f"offboard.{command[0]}", *command[1:]],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        cwd=tmp_path,
     )
     assert done.returncode == 2, done.stderr
     assert message in done.stderr
@@ -373,20 +377,20 @@ def test_the_flags_of_cost_become_what_the_offloader_is_given() -> None:
 def test_a_command_keeps_and_uses_its_memory(tmp_path: Path) -> None:
     """With --memory the second run begins with what the first one learnt; a folder is refused."""
     (tmp_path / "mine.py").write_text(
-        "from common.tasks import task\n"
+        "from offboard.common.tasks import task\n"
         "@task('mine', size=lambda number: number)\n"
         "def mine(number: int) -> int:\n"
         "    return number\n"
     )
     flags = "--task mine:mine --sizes uniform:1:9 --window 5 --memory memory.json --trace trace.jsonl --tasks"
     for tasks in ("8", "1"):
-        command = [sys.executable, "-m", "robot_client", *flags.split(), tasks]
+        command = [sys.executable, "-m", "offboard.robot_client", *flags.split(), tasks]
         done = subprocess.run(command, capture_output=True, text=True, timeout=30, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
     records = list(trace.read(tmp_path / "trace.jsonl"))
     assert records[0]["sites"]["onboard"]["predicted_s"] is None
     assert records[8]["sites"]["onboard"]["predicted_s"] is not None
     assert (records[8]["i"], records[8]["sites"]["onboard"]["age"]) == (0, STALE)
-    command = [sys.executable, "-m", "robot_client", *flags.replace("memory.json", ".").split(), "1"]
+    command = [sys.executable, "-m", "offboard.robot_client", *flags.replace("memory.json", ".").split(), "1"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=30, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (2, "robot-client: memory .: is a folder\n")

@@ -6,7 +6,7 @@ from random import Random
 
 import pytest
 
-from robot_client.conformal import COVERAGE, SCORES_MAX, SCORES_MIN, Conformal
+from offboard.robot_client.learning.intervals import COVERAGE, SCORES_MAX, SCORES_MIN, Conformal
 
 TASKS = 6_000
 

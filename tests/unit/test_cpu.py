@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from common.cpu import Clock, parse_usage, usage_file
-from loadgen.quota import CgroupQuota, hold
+from offboard.common.host.cpu import Clock, parse_usage, usage_file
+from offboard.loadgen.testbed.cpu_quota import CgroupQuota, hold
 
 ROOT = Path(__file__).parents[2]
 TOLERANCE_S = 0.05  # a process's start and end, and what else the kernel charges to it
@@ -172,7 +172,7 @@ def test_without_a_file_it_is_the_processs_own_clock(tmp_path: Path) -> None:
 
 FORKED = """
 import os, sys
-from common import cpu
+from offboard.common.host import cpu
 cpu.used_s()
 cpu._clock._lock.acquire()  # as another thread might at that moment
 cpu._lock.acquire()
@@ -193,7 +193,7 @@ def test_a_forked_process_looks_anew() -> None:
 # runs of its own that ask no clock: how much more its clock shows than the process's does.
 PAIR = f"""
 import statistics, subprocess, sys, time
-from common import cpu
+from offboard.common.host import cpu
 burner = "import time\\nwhile time.process_time() < {BURNT_S}: pass\\nprint(time.process_time())"
 sys.stdin.readline()
 print(cpu.usage_file(cpu.SELF))

@@ -6,16 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.errors import ConfigError, DataError
-from loadgen.dataset import DatasetConfig, ExportConfig, run_dataset, run_export
-from loadgen.evaluate import TableConfig, table_text
-from loadgen.notes import notes
-from loadgen.play import play
-from loadgen.rows import read
-from loadgen.scenario import read_scenario
-from robot_client.policies import Decision
-from robot_client.runner import Execution
-from robot_client.trace import Record, Trace
+from offboard.common.errors import ConfigError, DataError
+from offboard.loadgen.play.dataset import DatasetConfig, ExportConfig, run_dataset, run_export
+from offboard.loadgen.play.play import play
+from offboard.loadgen.scenario.scenario import read_scenario
+from offboard.loadgen.table.notes import notes
+from offboard.loadgen.table.rows import read
+from offboard.loadgen.table.table_two import TableConfig, table_text
+from offboard.robot_client.policies import Decision
+from offboard.robot_client.records.trace import Record, Trace
+from offboard.robot_client.sites.runner import Execution
 
 ROOT = Path(__file__).parents[2]
 CSV = "size,onboard_s,cloud_s\n1,0.1,0.2\n2,0.2,0.1\n3,0.3,0.1\n"

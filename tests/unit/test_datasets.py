@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from loadgen.evaluate import PAPER_WINDOWS, Evaluation, TableConfig, table_text
-from loadgen.rows import read
+from offboard.loadgen.table.rows import read
+from offboard.loadgen.table.table_two import PAPER_WINDOWS, Evaluation, TableConfig, table_text
 from tests.unit.test_evaluate import expected_table, lines_of, replay, rows_of, section
 
 FOLDER = Path(__file__).parents[2] / "loadgen" / "datasets"

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from common.errors import CloudTimeout, DataError
-from loadgen.disturbance import ALONE, Change, Disturbance, measure
-from loadgen.player import TRACE
-from robot_client.policies import Decision
-from robot_client.runner import CLOUD, ONBOARD, Execution
-from robot_client.trace import Record, Trace, alone_path, as_dict
+from offboard.common.errors import CloudTimeout, DataError
+from offboard.loadgen.play.player import TRACE
+from offboard.loadgen.table.disturbance import ALONE, Change, Disturbance, measure
+from offboard.robot_client.policies import Decision
+from offboard.robot_client.records.trace import Record, Trace, alone_path, as_dict
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 
 LATE = Execution(CLOUD, 2.0, failure=CloudTimeout("late"), censored=True)
 

@@ -13,25 +13,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from common.errors import CloudTimeout, TaskFailed
-from common.maps import GridMap
-from common.planner import plan_path, warm
-from common.tasks import Task, task
-from robot_client import answers as answers_file
-from robot_client import drive as drive_module
-from robot_client import references as references_file
-from robot_client.answers import Answers
-from robot_client.config import RobotConfig
-from robot_client.drive import MADE_MAX, WAYS, Drive, OwnRecord, made_ahead
-from robot_client.offloader import BOTH, Offloader
-from robot_client.onboard import OnboardRunner
-from robot_client.policies.rules import Paper
-from robot_client.predictors import LEAST_SQUARES, make
-from robot_client.references import References, orders
-from robot_client.robot import SimulatedRobot
-from robot_client.runner import CLOUD, ONBOARD, Execution, Runner
-from robot_client.trace import Record
-from robot_client.work import Calls, Plans
+from offboard.common.errors import CloudTimeout, TaskFailed
+from offboard.common.planning.maps import GridMap
+from offboard.common.planning.planner import plan_path, warm
+from offboard.common.tasks import Task, task
+from offboard.robot_client.config import RobotConfig
+from offboard.robot_client.offloader import BOTH, Offloader
+from offboard.robot_client.policies.rules import Paper
+from offboard.robot_client.predictors import LEAST_SQUARES, make
+from offboard.robot_client.records.trace import Record
+from offboard.robot_client.simulated import answers as answers_file
+from offboard.robot_client.simulated import drive as drive_module
+from offboard.robot_client.simulated import references as references_file
+from offboard.robot_client.simulated.answers import Answers
+from offboard.robot_client.simulated.drive import MADE_MAX, WAYS, Drive, OwnRecord, made_ahead
+from offboard.robot_client.simulated.references import References, orders
+from offboard.robot_client.simulated.robot import SimulatedRobot
+from offboard.robot_client.simulated.task_source import Calls, Plans
+from offboard.robot_client.sites.onboard import OnboardRunner
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution, Runner
 from tests.fakes import ScriptedRunner
 
 PLANS = 4

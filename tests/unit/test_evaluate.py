@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from common.errors import ConfigError, DataError, MissingExtra
-from loadgen.evaluate import PAPER_WINDOWS, TableConfig, run_table
+from offboard.common.errors import ConfigError, DataError, MissingExtra
+from offboard.loadgen.table.table_two import PAPER_WINDOWS, TableConfig, run_table
 
 PAGE = (Path(__file__).parents[2] / "docs" / "evaluation.md").read_text(encoding="utf-8")
 UNDEFINED = "–"  # noqa: RUF001
@@ -343,7 +343,7 @@ def test_correlation_survives_large_offsets(table: Print, offset: float, step: f
 def test_correlation_in_blocks_is_the_same(table: Print, monkeypatch: pytest.MonkeyPatch) -> None:
     """The bound on memory does not change a figure."""
     whole = table(THOUSAND[:100], windows=("5", "30"))
-    monkeypatch.setattr("loadgen.score.BLOCK_CELLS_MAX", 64)
+    monkeypatch.setattr("offboard.loadgen.table.score.BLOCK_CELLS_MAX", 64)
     assert table(THOUSAND[:100], windows=("5", "30")) == whole
 
 
@@ -426,10 +426,10 @@ def test_a_missing_library_is_named(table: Print, monkeypatch: pytest.MonkeyPatc
     """Asked for by name it is an error that names the extra; among all it has a line that does."""
     monkeypatch.setitem(sys.modules, "sklearn", None)
     monkeypatch.setitem(sys.modules, "sklearn.ensemble", None)
-    monkeypatch.delitem(sys.modules, "robot_client.predictors.forest", raising=False)
+    monkeypatch.delitem(sys.modules, "offboard.robot_client.predictors.learned.random_forest", raising=False)
     with pytest.raises(MissingExtra, match=r"random-forest needs the extra 'learned'"):
         table(TWELVE, windows=("full",), predictors=("random-forest",))
-    monkeypatch.setattr("robot_client.predictors.names", lambda: ("least-squares", "random-forest"))
+    monkeypatch.setattr("offboard.robot_client.predictors.names", lambda: ("least-squares", "random-forest"))
     lines = lines_of(table(TWELVE, windows=("full",), predictors=("all",)))
     assert lines[0][:2] == ["least-squares", "full"]
     assert lines[1][0].startswith("random-forest: predictor random-forest needs the extra 'learned'")

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cloud_server.executors import EXECUTORS, SPARES, Executor, Outcome, Processes
-from common.wire import StoredBlob, decode, encode
+from offboard.cloud_server.executors import EXECUTORS, SPARES, Executor, Outcome, Processes
+from offboard.common.wire.messages import StoredBlob, decode, encode
 
 WAIT_S = 8
 BURNT_S = 0.2
@@ -27,8 +27,8 @@ TOLERANCE_S = 0.05  # the CPU time of whatever else the process does meanwhile
 ROOT = Path(__file__).parents[2]
 MODULE = '''
 import asyncio, os, pathlib, threading, time
-from common.tasks import task
-from common.wanted import check_wanted
+from offboard.common.tasks import task
+from offboard.common.wanted import check_wanted
 
 warmed = []
 
@@ -328,7 +328,7 @@ def test_workers_that_cannot_start_are_reported(module: str) -> None:
 
 SERVER = """
 import sys
-from cloud_server.executors import Processes
+from offboard.cloud_server.executors import Processes
 
 if __name__ == "__main__":
     sys.path.insert(0, sys.argv[1])

@@ -4,10 +4,10 @@ from random import Random
 
 import pytest
 
-from robot_client import predictors
-from robot_client.predictors.features import GAIN_MAX, Measured
-from robot_client.predictors.linear import LeastSquares
-from robot_client.runner import Condition
+from offboard.robot_client import predictors
+from offboard.robot_client.predictors.features import GAIN_MAX, Measured
+from offboard.robot_client.predictors.least_squares import LeastSquares
+from offboard.robot_client.sites.runner import Condition
 
 QUIET = Condition()
 

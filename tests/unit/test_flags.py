@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
-from common.config import load
-from common.errors import ConfigError, DataError
-from loadgen.relay.control import Change
-from loadgen.relay.flags import LinkFlags, as_flags
-from loadgen.relay.link import Link, LinkConditions
-from loadgen.scenario import read_scenario
+from offboard.common.config import load
+from offboard.common.errors import ConfigError, DataError
+from offboard.loadgen.relay.http_control import Change
+from offboard.loadgen.relay.link.link import Link, LinkConditions
+from offboard.loadgen.relay.link.link_settings import LinkFlags, as_flags
+from offboard.loadgen.scenario.scenario import read_scenario
 
 NAMES = {field.name for field in fields(LinkConditions)}
 SCENARIO = """

@@ -10,10 +10,10 @@ from types import FrameType
 import pytest
 
 from benchmarks.decision import AtOnce
-from common.tasks import Task, task
-from robot_client import policies, predictors
-from robot_client.offloader import Offloader
-from robot_client.runner import CLOUD, ONBOARD, Execution
+from offboard.common.tasks import Task, task
+from offboard.robot_client import policies, predictors
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 
 GROWTH_BYTES = 20_000  # of a few megabytes: dictionaries that are made anew, caches of small numbers
 CALLS_MAX = {"paper": 190, policies.DEFAULT: 290}

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from cloud_server.config import ServerConfig
-from common import guard
-from common.errors import ConfigError
-from common.guard import Guard, on_loopback, read_private, read_token, warn_each_minute
-from loadgen.relay.wan import WanConfig
+from offboard.cloud_server.config import ServerConfig
+from offboard.common.errors import ConfigError
+from offboard.common.security import guard
+from offboard.common.security.guard import Guard, on_loopback, read_private, read_token, warn_each_minute
+from offboard.loadgen.relay.wan import WanConfig
 
 TOKEN = "a-token-of-the-tests"
 

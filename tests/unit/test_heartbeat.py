@@ -2,7 +2,7 @@
 
 import pytest
 
-from robot_client.heartbeat import (
+from offboard.robot_client.sites.heartbeat import (
     BESIDE_LEAST_OF,
     EVERY_S,
     JITTER,
@@ -13,8 +13,8 @@ from robot_client.heartbeat import (
     Heartbeat,
     Told,
 )
-from robot_client.own_cpu import LATE_MAX, LOADED_SLOWER, OwnCpu
-from robot_client.runner import Condition
+from offboard.robot_client.sites.own_cpu import LATE_MAX, LOADED_SLOWER, OwnCpu
+from offboard.robot_client.sites.runner import Condition
 
 TRIP_S = 0.03
 IDLE = Told()

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from loadgen.host import STAT, Stolen
+from offboard.loadgen.play.stolen_time import STAT, Stolen
 
 
 def stat(user: int, idle: int, steal: int) -> str:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from common.errors import ConfigError
-from loadgen.inside import as_popen, as_seen, measured, quota
-from loadgen.output import Output
-from loadgen.owner import is_gone, owner
+from offboard.common.errors import ConfigError
+from offboard.loadgen.testbed.container_output import Output
+from offboard.loadgen.testbed.container_part import as_popen, as_seen, measured, quota
+from offboard.loadgen.testbed.owner import is_gone, owner
 
 
 def test_files_are_seen_where_they_are_mounted(tmp_path: Path) -> None:

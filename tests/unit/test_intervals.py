@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from loadgen.intervals import Interval, interval_columns, interval_figures, intervals_of, late_seconds
+from offboard.loadgen.scenario.interval_coverage import (
+    Interval,
+    interval_columns,
+    interval_figures,
+    intervals_of,
+    late_seconds,
+)
 
 SITES = {
     "onboard": {"predicted_s": 0.2, "low_s": 0.1, "high_s": 0.4},

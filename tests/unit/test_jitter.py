@@ -9,9 +9,9 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.errors import DataError
-from loadgen.relay.draws import REPLAY_MAX, Draws, replay_from
-from loadgen.relay.jitter import (
+from offboard.common.errors import DataError
+from offboard.loadgen.relay.link.draws import REPLAY_MAX, Draws, replay_from
+from offboard.loadgen.relay.link.jitter import (
     DISTRIBUTIONS,
     PARETO_SD,
     PARETO_SHAPE,

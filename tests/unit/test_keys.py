@@ -7,9 +7,9 @@ import pytest
 import zmq
 import zmq.auth
 
-from common import keys
-from common.errors import ConfigError
-from common.keys import make_keys, read_public, robot_keys, server_keys
+from offboard.common.errors import ConfigError
+from offboard.common.security import keys
+from offboard.common.security.keys import make_keys, read_public, robot_keys, server_keys
 
 GOOD = "Yne@$w-vo<fVvi]a<NY6T1ed:M$fCG*[IaLV{hID"  # of RFC 26, with the next line
 SECRET = "D:)Q[IlAW!ahhC2ac:9*A}h:p?([4%wOTJ%JR%cs"

@@ -17,26 +17,34 @@ ROOMS = {
 # Heavy or optional libraries, and the files that may import them.
 OWNERS = {
     "zmq": {
-        "common/channel.py",
-        "common/keys.py",
-        "robot_client/cloud.py",
-        "cloud_server/outbox.py",
-        "cloud_server/robots.py",
+        "common/wire/channel.py",
+        "common/security/keys.py",
+        "robot_client/sites/cloud.py",
+        "cloud_server/reply_queue.py",
+        "cloud_server/authorisation.py",
         "cloud_server/server.py",
-        "cloud_server/unsent.py",
+        "cloud_server/unsent_replies.py",
     },
-    "fastapi": {"cloud_server/web.py", "loadgen/relay/control.py", "loadgen/relay/toxiproxy.py"},
-    "uvicorn": {"common/bounded_http.py", "cloud_server/web.py", "loadgen/relay/control.py"},
-    "docker": {"loadgen/containers.py"},
-    "numba": {"common/compiled.py"},
-    "PIL": {"common/maps.py"},
-    "yaml": {"common/maps.py"},
-    "matplotlib": {"loadgen/charts.py"},
-    "sklearn": {"robot_client/predictors/forest.py"},
-    "statsmodels": {"robot_client/predictors/series.py"},
-    "threadpoolctl": {"robot_client/predictors/series.py"},
-    "torch": {"robot_client/predictors/lstm.py"},
-    "river": {"robot_client/predictors/online.py"},
+    "fastapi": {
+        "cloud_server/http_api.py",
+        "loadgen/relay/http_control.py",
+        "loadgen/relay/toxiproxy/toxiproxy_api.py",
+    },
+    "uvicorn": {
+        "common/security/bounded_http.py",
+        "cloud_server/http_api.py",
+        "loadgen/relay/http_control.py",
+    },
+    "docker": {"loadgen/testbed/containers.py"},
+    "numba": {"common/planning/compiled.py"},
+    "PIL": {"common/planning/maps.py"},
+    "yaml": {"common/planning/maps.py"},
+    "matplotlib": {"loadgen/report/charts.py"},
+    "sklearn": {"robot_client/predictors/learned/random_forest.py"},
+    "statsmodels": {"robot_client/predictors/learned/arima.py"},
+    "threadpoolctl": {"robot_client/predictors/learned/arima.py"},
+    "torch": {"robot_client/predictors/learned/lstm.py"},
+    "river": {"robot_client/predictors/learned/river_model.py"},
 }
 
 
@@ -78,8 +86,8 @@ def test_the_robot_library_needs_no_extra() -> None:
         "for name in ('fastapi', 'uvicorn', 'docker', 'numba', 'PIL', 'yaml', 'httpx', 'rich',\n"
         "             'sklearn', 'statsmodels', 'river', 'torch', 'scipy', 'pandas'):\n"
         "    sys.modules[name] = None\n"
-        "import robot_client, robot_client.cloud, robot_client.metrics\n"
-        "print(robot_client.Offloader.__name__)\n"
+        "import offboard, offboard.robot_client.sites.cloud, offboard.robot_client.records.metrics\n"
+        "print(offboard.Offloader.__name__)\n"
     )
     done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True, cwd=ROOT, timeout=30)
     assert done.stdout == "Offloader\n", done.stderr
@@ -93,7 +101,7 @@ def test_help_loads_no_heavy_library(command: str) -> None:
         "import runpy, sys\n"
         f"sys.argv = [{command!r}, '--help']\n"
         "try:\n"
-        f"    runpy.run_module({command!r}, run_name='__main__')\n"
+        f"    runpy.run_module('offboard.{command}', run_name='__main__')\n"
         "except SystemExit as end:\n"
         "    assert end.code in (0, None), end.code\n"
         f"print([name for name in {heavy!r} if name in sys.modules], file=sys.stderr)\n"

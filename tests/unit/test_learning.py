@@ -5,15 +5,15 @@ from random import Random
 
 import pytest
 
-from common.errors import CloudTimeout, OffloadError
-from common.tasks import task
-from robot_client import policies, predictors
-from robot_client.allowance import Allowance
-from robot_client.learning import TOGETHER
-from robot_client.memory import SiteMemory
-from robot_client.offloader import BOTH, Offloader
-from robot_client.predictors import AVERAGE, LEAST_SQUARES
-from robot_client.runner import CLOUD, ONBOARD
+from offboard.common.errors import CloudTimeout, OffloadError
+from offboard.common.tasks import task
+from offboard.robot_client import policies, predictors
+from offboard.robot_client.learning.kind import SiteMemory
+from offboard.robot_client.learning.lessons import TOGETHER
+from offboard.robot_client.offloader import BOTH, Offloader
+from offboard.robot_client.policies.allowance import Allowance
+from offboard.robot_client.predictors import AVERAGE, LEAST_SQUARES
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.virtual import VirtualClock, VirtualRunner
 
 ONBOARD_S, CLOUD_S = 0.1, 0.05  # a unit of size

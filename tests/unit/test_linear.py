@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.errors import ConfigError
-from robot_client.predictors.linear import RecursiveLeastSquares
+from offboard.common.errors import ConfigError
+from offboard.robot_client.predictors.least_squares import RecursiveLeastSquares
 from tests.checks import Row, line, teach
 
 RELATIVE = 1e-9

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.errors import ConfigError
-from loadgen.relay.jitter import DISTRIBUTIONS, Jitter
-from loadgen.relay.link import BUCKET_S, CHUNK_BYTES, SEGMENT_BYTES, Link, LinkConditions, Pipe
-from loadgen.relay.loss import Loss, stall_ms
+from offboard.common.errors import ConfigError
+from offboard.loadgen.relay.link.jitter import DISTRIBUTIONS, Jitter
+from offboard.loadgen.relay.link.link import BUCKET_S, CHUNK_BYTES, SEGMENT_BYTES, Link, LinkConditions, Pipe
+from offboard.loadgen.relay.link.loss import Loss, stall_ms
 
 SEEDS = st.integers(0, 2**32)
 CUTS = st.lists(st.integers(1, 5 * SEGMENT_BYTES), min_size=1, max_size=20)

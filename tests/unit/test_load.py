@@ -7,8 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from common import load
-from common.load import EVERY_S, HURRIED_S, LOOKED_UP_EVERY, READINGS_MAX, TICK_S, Load, LoadWatch
+from offboard.common.host import load
+from offboard.common.host.load import (
+    EVERY_S,
+    HURRIED_S,
+    LOOKED_UP_EVERY,
+    READINGS_MAX,
+    TICK_S,
+    Load,
+    LoadWatch,
+)
 from tests.unit.test_cpu import Machine
 
 CPUS = os.cpu_count() or 1

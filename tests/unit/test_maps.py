@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from common import maps, planner
-from common.errors import DataError
-from common.maps import GridMap, read_map
+from offboard.common.errors import DataError
+from offboard.common.planning import maps, planner
+from offboard.common.planning.maps import GridMap, read_map
 
 ROOT = Path(__file__).parents[2]
 planner.warm()  # compiles before the clock of any test runs

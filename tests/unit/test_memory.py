@@ -5,14 +5,14 @@ from random import Random
 
 import pytest
 
-from common.errors import CloudBroken, CloudBusy, CloudError, CloudTimeout, Overtaken, TaskFailed
-from common.tasks import kind_of, task
-from robot_client import objectives, predictors
-from robot_client.energy import Energy
-from robot_client.memory import WAY_LEAST_OF, KindMemory
-from robot_client.own_cpu import LATE_MAX
-from robot_client.policies import Outlook
-from robot_client.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
+from offboard.common.errors import CloudBroken, CloudBusy, CloudError, CloudTimeout, Overtaken, TaskFailed
+from offboard.common.tasks import kind_of, task
+from offboard.robot_client import predictors
+from offboard.robot_client.learning.kind import WAY_LEAST_OF, KindMemory
+from offboard.robot_client.policies import Outlook, objectives
+from offboard.robot_client.policies.energy import Energy
+from offboard.robot_client.sites.own_cpu import LATE_MAX
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
 
 SILENT = Condition(silent=True)
 

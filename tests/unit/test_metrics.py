@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 from prometheus_client import CollectorRegistry
 
-from common.errors import CloudBroken
-from robot_client.metrics import Metrics
-from robot_client.regret import Regret
-from robot_client.runner import CLOUD, ONBOARD, Execution
+from offboard.common.errors import CloudBroken
+from offboard.robot_client.learning.regret import Regret
+from offboard.robot_client.records.metrics import Metrics
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.unit.test_trace import record
 
 

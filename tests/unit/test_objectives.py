@@ -2,11 +2,11 @@
 
 import pytest
 
-from common.errors import ConfigError
-from robot_client import objectives
-from robot_client.conformal import Conformal
-from robot_client.energy import Energy
-from robot_client.objectives import Expected
+from offboard.common.errors import ConfigError
+from offboard.robot_client.learning.intervals import Conformal
+from offboard.robot_client.policies import objectives
+from offboard.robot_client.policies.energy import Energy
+from offboard.robot_client.policies.objectives import Expected
 
 
 def expected(seconds: float, spread_s: float | None = None, joules: float = 0.0) -> Expected:

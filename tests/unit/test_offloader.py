@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from common.errors import (
+from offboard.common.errors import (
     BadValue,
     CloudBroken,
     CloudBusy,
@@ -18,13 +18,13 @@ from common.errors import (
     TaskFailed,
     UnknownTask,
 )
-from common.tasks import Task, task
-from robot_client import policies, predictors
-from robot_client.allowance import DUPLICATES, Allowance
-from robot_client.offloader import Offloader
-from robot_client.onboard import OnboardRunner
-from robot_client.policies import Decision, Forecast
-from robot_client.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution, Runner
+from offboard.common.tasks import Task, task
+from offboard.robot_client import policies, predictors
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import Decision, Forecast
+from offboard.robot_client.policies.allowance import DUPLICATES, Allowance
+from offboard.robot_client.sites.onboard import OnboardRunner
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution, Runner
 from tests.fakes import ScriptedRunner
 from tests.virtual import VirtualClock, VirtualRunner
 

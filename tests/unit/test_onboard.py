@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from common.errors import OffloadError, Overtaken, Unwanted
-from common.tasks import Task, kind_of, task
-from common.wanted import check_wanted
-from robot_client import onboard
-from robot_client.onboard import ASIDE_MAX, ASIDE_NICE, OnboardRunner
-from robot_client.own_cpu import LOADED_SLOWER, OWN_CPU
+from offboard.common.errors import OffloadError, Overtaken, Unwanted
+from offboard.common.tasks import Task, kind_of, task
+from offboard.common.wanted import check_wanted
+from offboard.robot_client.sites import onboard
+from offboard.robot_client.sites.onboard import ASIDE_MAX, ASIDE_NICE, OnboardRunner
+from offboard.robot_client.sites.own_cpu import LOADED_SLOWER, OWN_CPU
 
 WAIT_S = 5.0
 

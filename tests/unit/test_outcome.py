@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import pytest
 
-from loadgen.check import Check
-from loadgen.compare import CompareConfig, table, turned
-from loadgen.outcome import FIGURES, Answered, Outcome, Reading, Reference
-from loadgen.scenario import Scenario, Workload
+from offboard.loadgen.compare.compare import CompareConfig, table, turned
+from offboard.loadgen.scenario.check import Check
+from offboard.loadgen.scenario.outcome import FIGURES, Answered, Outcome, Reading, Reference
+from offboard.loadgen.scenario.scenario import Scenario, Workload
 
 
 def answered(i: int, response_s: float, chosen: str = "cloud", **more: object) -> Answered:

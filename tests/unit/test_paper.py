@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.errors import ConfigError
-from common.tasks import task
-from robot_client import policies
-from robot_client.offloader import Offloader
-from robot_client.policies import Forecast, Outlook
-from robot_client.predictors.linear import LeastSquares
-from robot_client.runner import CLOUD, ONBOARD, Execution
+from offboard.common.errors import ConfigError
+from offboard.common.tasks import task
+from offboard.robot_client import policies
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import Forecast, Outlook
+from offboard.robot_client.predictors.least_squares import LeastSquares
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.fakes import ScriptedRunner
 
 

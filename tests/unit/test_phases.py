@@ -10,15 +10,15 @@ from typing import NamedTuple
 
 import pytest
 
-from common.errors import CloudBroken, CloudBusy, CloudTimeout, OffloadError, TaskFailed
-from common.tasks import task
-from robot_client import policies, predictors
-from robot_client.allowance import DUPLICATES_MAX, Allowance
-from robot_client.offloader import Offloader
-from robot_client.policies import Decision, Forecast, Policy
-from robot_client.predictors.linear import LeastSquares
-from robot_client.runner import CLOUD, ONBOARD, Condition
-from robot_client.trace import Late, Record
+from offboard.common.errors import CloudBroken, CloudBusy, CloudTimeout, OffloadError, TaskFailed
+from offboard.common.tasks import task
+from offboard.robot_client import policies, predictors
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import Decision, Forecast, Policy
+from offboard.robot_client.policies.allowance import DUPLICATES_MAX, Allowance
+from offboard.robot_client.predictors.least_squares import LeastSquares
+from offboard.robot_client.records.trace import Late, Record
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition
 from tests.virtual import VirtualClock, VirtualRunner
 
 EDGE = "edge"

@@ -7,7 +7,7 @@ from random import Random
 
 import pytest
 
-from robot_client.placement import (
+from offboard.robot_client.execution.placement import (
     BUDGET_SHARE,
     ONBOARD_IN_FLIGHT,
     SERVER_IN_FLIGHT,

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from common import maps, planner, search
-from common.maps import GridMap
-from common.planner import Plan, Point, Pose, Scan, plan_path
-from common.tasks import kind_of
+from offboard.common.planning import maps, planner, search
+from offboard.common.planning.maps import GridMap
+from offboard.common.planning.planner import Plan, Point, Pose, Scan, plan_path
+from offboard.common.tasks import kind_of
 
 ROOT = Path(__file__).parents[2]
 planner.warm()  # compiles before the clock of any test runs
@@ -241,8 +241,8 @@ def test_without_numba_planning_names_the_extra() -> None:
     code = (
         "import sys; sys.modules['numba'] = None\n"
         "import numpy as np\n"
-        "from common.errors import MissingExtra\n"
-        "from common.planner import *\n"
+        "from offboard.common.errors import MissingExtra\n"
+        "from offboard.common.planning.planner import *\n"
         "try: plan_path(GridMap(np.zeros((4, 4), np.int8), 1.0), None, Pose(1, 1), Point(2, 2))\n"
         "except MissingExtra as error: print(error)\n"
     )

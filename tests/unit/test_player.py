@@ -7,15 +7,15 @@ from typing import Any
 
 import pytest
 
-from cloud_server.config import ServerConfig
-from common.config import load
-from loadgen.player import Files, Lines, make_room, setups
-from loadgen.relay.flags import as_flags
-from loadgen.relay.wan import WanConfig
-from loadgen.scenario import Scenario, Workload, find_scenario, read_scenario, shipped
-from loadgen.testbed import CLOUD, ROBOT, WAN
-from robot_client.config import RobotConfig
-from robot_client.trace import alone_path, reference_path
+from offboard.cloud_server.config import ServerConfig
+from offboard.common.config import load
+from offboard.loadgen.play.player import Files, Lines, make_room, setups
+from offboard.loadgen.relay.link.link_settings import as_flags
+from offboard.loadgen.relay.wan import WanConfig
+from offboard.loadgen.scenario.scenario import Scenario, Workload, find_scenario, read_scenario, shipped
+from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN
+from offboard.robot_client.config import RobotConfig
+from offboard.robot_client.records.trace import alone_path, reference_path
 
 CONFIGS = {CLOUD: ServerConfig, WAN: WanConfig, ROBOT: RobotConfig}
 

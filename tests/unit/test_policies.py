@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from common.errors import ConfigError
-from robot_client import policies
-from robot_client.policies import Decision, Forecast, Outlook, Policy, rules, wrappers
-from robot_client.policies.rules import EPSILON, WARM_UP
-from robot_client.policies.wrappers import (
+from offboard.common.errors import ConfigError
+from offboard.robot_client import policies
+from offboard.robot_client.policies import Decision, Forecast, Outlook, Policy, rules, wrappers
+from offboard.robot_client.policies.rules import EPSILON, WARM_UP
+from offboard.robot_client.policies.wrappers import (
     BREAK_AFTER,
     BROKEN_FOR,
     BROKEN_MAX,
@@ -21,7 +21,7 @@ from robot_client.policies.wrappers import (
     SELDOM_MAX,
     STALE,
 )
-from robot_client.runner import CLOUD, ONBOARD
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests import policy_checks
 from tests.policy_checks import EDGE, SILENT
 
@@ -308,7 +308,7 @@ def test_a_wrong_name_is_one_line(name: str, says: str) -> None:
 @pytest.mark.parametrize("name", policies.names())
 def test_every_rule_has_a_predictor_that_there_is(name: str) -> None:
     """What a policy is meant with can be made, in any wrapping."""
-    from robot_client import predictors
+    from offboard.robot_client import predictors
 
     assert predictors.make(policies.predictor_of(f"hedge:probe:{name}"), 5).predict(1.0) is None
     assert policies.predictor_of(f"hedge:{name}") == policies.predictor_of(name)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from common.errors import ConfigError, MissingExtra
-from robot_client import predictors
-from robot_client.predictors import Predictor
+from offboard.common.errors import ConfigError, MissingExtra
+from offboard.robot_client import predictors
+from offboard.robot_client.predictors import Predictor
 from tests import checks
 
 ROOT = Path(__file__).parents[2]
@@ -79,8 +79,8 @@ def test_a_missing_library_names_its_extra(name: str, library: str, extra: str) 
     said = python(
         "import sys\n"
         f"sys.modules[{library!r}] = None\n"
-        "from common.errors import MissingExtra\n"
-        "from robot_client import predictors\n"
+        "from offboard.common.errors import MissingExtra\n"
+        "from offboard.robot_client import predictors\n"
         "try:\n"
         f"    predictors.make({name!r}, 50)\n"
         "except MissingExtra as missing:\n"
@@ -94,7 +94,7 @@ def test_the_base_predictors_load_no_heavy_library() -> None:
     """Those that need no extra learn and predict on numpy alone."""
     said = python(
         "import sys\n"
-        "from robot_client import predictors\n"
+        "from offboard.robot_client import predictors\n"
         f"for name in {BASE!r}:\n"
         "    predictor = predictors.make(name, 5)\n"
         "    for i in range(6):\n"

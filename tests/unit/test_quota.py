@@ -1,6 +1,14 @@
 """What one robot may send in a second."""
 
-from cloud_server.quota import BUSY_A_S, CUT_OFF_S, EXCESS_S, MESSAGE_BYTES, ROBOTS_MAX, Quota, Verdict
+from offboard.cloud_server.rate_limit import (
+    BUSY_A_S,
+    CUT_OFF_S,
+    EXCESS_S,
+    MESSAGE_BYTES,
+    ROBOTS_MAX,
+    Quota,
+    Verdict,
+)
 
 RATE = 100 * MESSAGE_BYTES
 

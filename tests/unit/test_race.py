@@ -4,10 +4,18 @@ from collections.abc import Callable
 
 import pytest
 
-from common.errors import BadValue, CloudBroken, CloudBusy, CloudTimeout, OffloadError, Overtaken, TaskFailed
-from common.tasks import Task, kind_of, task
-from robot_client.race import Plan, Race, answer_of
-from robot_client.runner import CLOUD, ONBOARD, Execution
+from offboard.common.errors import (
+    BadValue,
+    CloudBroken,
+    CloudBusy,
+    CloudTimeout,
+    OffloadError,
+    Overtaken,
+    TaskFailed,
+)
+from offboard.common.tasks import Task, kind_of, task
+from offboard.robot_client.execution.race import Plan, Race, answer_of
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.virtual import VirtualClock, VirtualRunner
 
 EDGE = "edge"

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from loadgen.outcome import Answered, Outcome
-from loadgen.recovery import median_recovery, read_outage, recovery_tasks
+from offboard.loadgen.scenario.outcome import Answered, Outcome
+from offboard.loadgen.scenario.recovery import median_recovery, read_outage, recovery_tasks
 
 
 def run(sites: str, outage: tuple[int, int] | None = (20, 30)) -> Outcome:

@@ -4,7 +4,7 @@ from random import Random
 
 import pytest
 
-from robot_client.regret import PROBES_MAX, PROBES_MIN, RegretEstimate, student_95
+from offboard.robot_client.learning.regret import PROBES_MAX, PROBES_MIN, RegretEstimate, student_95
 
 REPETITIONS = 1_000
 

@@ -8,8 +8,8 @@ from dataclasses import asdict, fields, replace
 
 import pytest
 
-from loadgen.render import FORMATS, Table, render
-from loadgen.score import HEADINGS, Score
+from offboard.loadgen.table.render import FORMATS, Table, render
+from offboard.loadgen.table.score import HEADINGS, Score
 
 SCORE = Score(
     "least-squares", "50", "", 0.302734, 0.70641, 0.14025, 0.14061, 0.00036, 0.17554, 0.18027, -0.00473,

@@ -7,15 +7,15 @@ from typing import Any
 
 import pytest
 
-from common.errors import ConfigError, DataError
-from loadgen import evaluate
-from loadgen.evaluate import TableConfig
-from loadgen.replay import ReplayConfig, replay, run_replay
-from loadgen.rows import read
-from robot_client import policies
-from robot_client.policies import Decision, Forecast, Outlook, rules
-from robot_client.runner import Execution
-from robot_client.trace import Record, Trace
+from offboard.common.errors import ConfigError, DataError
+from offboard.loadgen.table import table_two as evaluate
+from offboard.loadgen.table.replay import ReplayConfig, replay, run_replay
+from offboard.loadgen.table.rows import read
+from offboard.loadgen.table.table_two import TableConfig
+from offboard.robot_client import policies
+from offboard.robot_client.policies import Decision, Forecast, Outlook, rules
+from offboard.robot_client.records.trace import Record, Trace
+from offboard.robot_client.sites.runner import Execution
 from tests.unit.test_evaluate import THOUSAND, TWELVE, csv_of
 
 Replayed = Callable[..., list[dict[str, Any]]]

@@ -12,16 +12,18 @@ import matplotlib
 import numpy as np
 import pytest
 
-from common.errors import ConfigError, DataError
-from loadgen import charts, paper, series
-from loadgen.__main__ import main
-from loadgen.evaluate import Evaluation, TableConfig
-from loadgen.findings import Findings
-from loadgen.render import render
-from loadgen.report import ReportConfig, all_charts, facts, find_source, run_report
-from loadgen.rows import Rows, read
-from loadgen.svg import inline
-from robot_client import policies
+from offboard.common.errors import ConfigError, DataError
+from offboard.loadgen.__main__ import main
+from offboard.loadgen.report import chart_data as series
+from offboard.loadgen.report import charts
+from offboard.loadgen.report.findings import Findings
+from offboard.loadgen.report.report import ReportConfig, all_charts, facts, find_source, run_report
+from offboard.loadgen.report.svg import inline
+from offboard.loadgen.table import paper_table as paper
+from offboard.loadgen.table.render import render
+from offboard.loadgen.table.rows import Rows, read
+from offboard.loadgen.table.table_two import Evaluation, TableConfig
+from offboard.robot_client import policies
 from tests.unit.test_evaluate import PAGE, THOUSAND, Line, csv_of
 from tests.unit.test_replay import trace_of
 
@@ -391,7 +393,7 @@ def test_captions_say_what_was_replayed_how(found: Callable[..., Findings]) -> N
 
 def test_every_policy_has_a_look_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """Policies that come later are drawn too, each in its own colour and dashes."""
-    from loadgen.looks import LOOKS, policy_look
+    from offboard.loadgen.report.chart_styles import LOOKS, policy_look
 
     later = tuple(f"later-{number}" for number in range(6))
     monkeypatch.setattr(policies, "names", lambda: ("paper", "onboard", "cloud", *later))
@@ -451,7 +453,7 @@ def test_without_matplotlib_the_extra_is_named(dataset: Callable[[list[Line]], P
     """One line and exit code 2 where it is absent; --help does not load it."""
     block = (
         "import sys; sys.modules['matplotlib'] = None\n"
-        "from loadgen.__main__ import main; sys.exit(main(sys.argv[1:]))"
+        "from offboard.loadgen.__main__ import main; sys.exit(main(sys.argv[1:]))"
     )
 
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:

@@ -7,17 +7,24 @@ from pathlib import Path
 
 import pytest
 
-from loadgen.check import Check
-from loadgen.digest import digests, of_scenario, of_software
-from loadgen.play import SUMMARY, judge, write_summary
-from loadgen.resume import played_before
-from loadgen.scenario import RobotPart, Scenario, Workload, find_scenario, read_scenario
-from loadgen.work import hash_rounds
-from robot_client.answers import of_value
+from offboard.loadgen.compare.resume import played_before
+from offboard.loadgen.play.digest import digests, of_scenario, of_software
+from offboard.loadgen.play.play import SUMMARY, judge, write_summary
+from offboard.loadgen.scenario.check import Check
+from offboard.loadgen.scenario.hash_tasks import hash_rounds
+from offboard.loadgen.scenario.scenario import RobotPart, Scenario, Workload, find_scenario, read_scenario
+from offboard.robot_client.simulated.answers import of_value
 
 TASKS = 3
 SCENARIO = Scenario(
-    "small", 1, Workload(task="loadgen.work:hash_rounds", sizes=("constant:5",), tasks=TASKS, obstacles=0)
+    "small",
+    1,
+    Workload(
+        task="offboard.loadgen.scenario.hash_tasks:hash_rounds",
+        sizes=("constant:5",),
+        tasks=TASKS,
+        obstacles=0,
+    ),
 )
 
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from common import maps, planner
-from common.errors import ConfigError
-from common.maps import GridMap
-from common.planner import Plan, Point, Pose, plan_path, size_of_plan
-from robot_client.robot import CANDIDATES, FAILURES_MAX, TRIES_MAX, SimulatedRobot
+from offboard.common.errors import ConfigError
+from offboard.common.planning import maps, planner
+from offboard.common.planning.maps import GridMap
+from offboard.common.planning.planner import Plan, Point, Pose, plan_path, size_of_plan
+from offboard.robot_client.simulated.robot import CANDIDATES, FAILURES_MAX, TRIES_MAX, SimulatedRobot
 
 WILLOW = maps.read_map(Path(__file__).parents[2] / "maps/willow-full-0.05.yaml")
 NO_PATH = Plan("NO_VALID_PATH", np.zeros((0, 2), np.int32), np.zeros((0, 2), np.float32), 0.0, 0)

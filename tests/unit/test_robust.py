@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.errors import ConfigError
-from robot_client.predictors import Predictor, make
-from robot_client.predictors.base import Prediction
-from robot_client.predictors.refitted import Column
-from robot_client.predictors.robust import EPSILON, SAMPLE, Huber, TheilSen, huber_line, median
+from offboard.common.errors import ConfigError
+from offboard.robot_client.predictors import Predictor, make
+from offboard.robot_client.predictors.base import Prediction
+from offboard.robot_client.predictors.refitted import Column
+from offboard.robot_client.predictors.robust import EPSILON, SAMPLE, Huber, TheilSen, huber_line, median
 from tests.checks import Row, teach
 
 ROBUST = ("theil-sen", "huber")

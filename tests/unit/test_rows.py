@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from common.errors import CloudTimeout, ConfigError, DataError
-from loadgen import rows
-from robot_client.policies import Decision
-from robot_client.runner import CLOUD, ONBOARD, Execution
-from robot_client.trace import Record, Trace, as_dict
+from offboard.common.errors import CloudTimeout, ConfigError, DataError
+from offboard.loadgen.table import rows
+from offboard.robot_client.policies import Decision
+from offboard.robot_client.records.trace import Record, Trace, as_dict
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 
 HEADER = "size,onboard_s,cloud_s\n"
 

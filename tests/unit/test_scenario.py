@@ -6,16 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from common.errors import ConfigError, DataError
-from loadgen.chaos import FAULTS, Chaos
-from loadgen.relay.flags import LinkFlags
-from loadgen.scenario import Scenario, find_scenario, read_scenario
-from loadgen.timeline import Timeline, absent_at_first
+from offboard.common.errors import ConfigError, DataError
+from offboard.loadgen.relay.link.link_settings import LinkFlags
+from offboard.loadgen.scenario.random_faults import FAULTS, Chaos
+from offboard.loadgen.scenario.scenario import Scenario, find_scenario, read_scenario
+from offboard.loadgen.scenario.timeline import Timeline, absent_at_first
 
 LINK = LinkFlags(delay_ms=7.0, down_delay_ms=9.0, loss=0.01).link
 HEAD = """name = "small"
 [workload]
-task = "loadgen.work:hash_rounds"
+task = "offboard.loadgen.scenario.hash_tasks:hash_rounds"
 sizes = ["constant:1000"]
 tasks = 50
 robots = 2

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from common.errors import ConfigError, DataError
-from loadgen.relay.link import Link, LinkConditions
-from loadgen.relay.schedule import EVENTS_MAX, Schedule, parse_schedule, read_schedule
+from offboard.common.errors import ConfigError, DataError
+from offboard.loadgen.relay.link.link import Link, LinkConditions
+from offboard.loadgen.relay.schedule import EVENTS_MAX, Schedule, parse_schedule, read_schedule
 
 GOOD = """
 [[event]]

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common import maps, planner, search
-from common.errors import Unwanted
-from common.flood import DISTANCE_MAX, PAUSE_CELLS, STRAIGHT
-from common.search import Field, Hits
-from common.wanted import call_while
+from offboard.common.errors import Unwanted
+from offboard.common.planning import maps, planner, search
+from offboard.common.planning.flood import DISTANCE_MAX, PAUSE_CELLS, STRAIGHT
+from offboard.common.planning.search import Field, Hits
+from offboard.common.wanted import call_while
 from tests.mazes import check, oracle, random_cells, random_maze, serpentine
 
 ROOT = Path(__file__).parents[2]

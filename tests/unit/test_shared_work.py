@@ -5,7 +5,7 @@ from random import Random
 
 import pytest
 
-from robot_client.shared_work import PAIRS_MAX, SharedWork
+from offboard.robot_client.learning.shared_work import PAIRS_MAX, SharedWork
 
 
 def test_nothing_is_known_at_first() -> None:

@@ -7,23 +7,23 @@ from pathlib import Path
 
 import pytest
 
-from common.errors import ConfigError
-from loadgen.outcome import FIGURES, Outcome
-from loadgen.scenario import Scenario, find_scenario, read_scenario, shipped
-from loadgen.simulation.batch import Batch
-from loadgen.simulation.costs import DECIDING_CPU_S, HASH, START_S
-from loadgen.simulation.run import simulate
-from loadgen.simulation.tasks import Tasks, find_tasks
-from loadgen.simulation.world import check_simulated
-from loadgen.testbed import ROBOT
-from robot_client.cloud import RECONNECT_MAX_MS
-from robot_client.runner import CLOUD, ONBOARD
+from offboard.common.errors import ConfigError
+from offboard.loadgen.scenario.outcome import FIGURES, Outcome
+from offboard.loadgen.scenario.scenario import Scenario, find_scenario, read_scenario, shipped
+from offboard.loadgen.simulation.batch import Batch
+from offboard.loadgen.simulation.model.costs import DECIDING_CPU_S, HASH, START_S
+from offboard.loadgen.simulation.model.simulated_tasks import Tasks, find_tasks
+from offboard.loadgen.simulation.run import simulate
+from offboard.loadgen.simulation.world import check_simulated
+from offboard.loadgen.testbed.testbed import ROBOT
+from offboard.robot_client.sites.cloud import RECONNECT_MAX_MS
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.mazes import warm
 
 warm()  # compiles before the clock of any test runs
 HEAD = """name = "small"
 [workload]
-task = "loadgen.work:hash_rounds"
+task = "offboard.loadgen.scenario.hash_tasks:hash_rounds"
 sizes = ["{sizes}"]
 tasks = 60
 {workload}

@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 import pytest
 
-from loadgen.__main__ import main
-from loadgen.render import FORMATS, Table, render
-from loadgen.simulation.tables import summary_table
+from offboard.loadgen.__main__ import main
+from offboard.loadgen.compare.simulated_tables import summary_table
+from offboard.loadgen.table.render import FORMATS, Table, render
 
 TABLES = (
     "compare",

@@ -6,29 +6,29 @@ from pathlib import Path
 
 import pytest
 
-from common.errors import Overtaken
-from common.load import SERVER_EVERY_S
-from loadgen.relay.link import LinkConditions
-from loadgen.scenario import CloudPart, read_scenario
-from loadgen.simulation.clock import VirtualClock
-from loadgen.simulation.costs import HASH
-from loadgen.simulation.lockstep import LockstepClock
-from loadgen.simulation.processor import Processor, Run
-from loadgen.simulation.server import Server
-from loadgen.simulation.tasks import find_tasks
-from loadgen.simulation.way import Way
-from loadgen.simulation.world import World
-from loadgen.testbed import ROBOT
-from loadgen.timeline import Event
-from robot_client import predictors
-from robot_client.heartbeat import Told
-from robot_client.offloader import Offloader
-from robot_client.policies import Decision, Forecast
-from robot_client.trace import Record
+from offboard.common.errors import Overtaken
+from offboard.common.host.load import SERVER_EVERY_S
+from offboard.loadgen.relay.link.link import LinkConditions
+from offboard.loadgen.scenario.scenario import CloudPart, read_scenario
+from offboard.loadgen.scenario.timeline import Event
+from offboard.loadgen.simulation.model.clock import VirtualClock
+from offboard.loadgen.simulation.model.costs import HASH
+from offboard.loadgen.simulation.model.lockstep import LockstepClock
+from offboard.loadgen.simulation.model.one_way import Way
+from offboard.loadgen.simulation.model.processor import Processor, Run
+from offboard.loadgen.simulation.model.server import Server
+from offboard.loadgen.simulation.model.simulated_tasks import find_tasks
+from offboard.loadgen.simulation.world import World
+from offboard.loadgen.testbed.testbed import ROBOT
+from offboard.robot_client import predictors
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import Decision, Forecast
+from offboard.robot_client.records.trace import Record
+from offboard.robot_client.sites.heartbeat import Told
 
 SMALL = """name = "small"
 [workload]
-task = "loadgen.work:hash_rounds"
+task = "offboard.loadgen.scenario.hash_tasks:hash_rounds"
 sizes = ["constant:40000"]
 tasks = 2
 [robot]

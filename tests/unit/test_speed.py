@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loadgen.compare import CompareConfig, Line, table
-from loadgen.outcome import Answered, Outcome
-from loadgen.scenario import find_scenario, read_scenario
+from offboard.loadgen.compare.compare import CompareConfig, Line, table
+from offboard.loadgen.scenario.outcome import Answered, Outcome
+from offboard.loadgen.scenario.scenario import find_scenario, read_scenario
 
 SEEDS = 8
 TASKS = 200

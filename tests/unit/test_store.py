@@ -12,17 +12,18 @@ from typing import Any
 
 import pytest
 
-from common.errors import CloudTimeout, ConfigError, TaskFailed
-from common.tasks import Task, task
-from robot_client import policies, predictors, store
-from robot_client.memory import OBSERVATIONS_MAX
-from robot_client.offloader import Offloader
-from robot_client.policies import Outlook
-from robot_client.policies.wrappers import STALE
-from robot_client.predictors.linear import LeastSquares
-from robot_client.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
-from robot_client.store import HALF_LIFE_S, SAVE_EVERY_S, Store
-from robot_client.trace import Record
+from offboard.common.errors import CloudTimeout, ConfigError, TaskFailed
+from offboard.common.tasks import Task, task
+from offboard.robot_client import policies, predictors
+from offboard.robot_client.learning import store
+from offboard.robot_client.learning.kind import OBSERVATIONS_MAX
+from offboard.robot_client.learning.store import HALF_LIFE_S, SAVE_EVERY_S, Store
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import Outlook
+from offboard.robot_client.policies.wrappers import STALE
+from offboard.robot_client.predictors.least_squares import LeastSquares
+from offboard.robot_client.records.trace import Record
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
 from tests.fakes import ScriptedRunner
 from tests.virtual import VirtualClock
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from common.errors import BadValue, ConfigError, UnknownTask
-from common.tasks import kind_named, kind_of, load_modules, task
+from offboard.common.errors import BadValue, ConfigError, UnknownTask
+from offboard.common.tasks import kind_named, kind_of, load_modules, task
 
 
 @task("double", size=lambda number, scale=1: number * scale)

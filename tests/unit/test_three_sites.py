@@ -4,13 +4,13 @@ from random import Random
 
 import pytest
 
-from common.errors import CloudTimeout
-from common.tasks import Task, task
-from robot_client import policies, predictors
-from robot_client.offloader import Offloader
-from robot_client.policies.wrappers import PROBE_EVERY
-from robot_client.runner import CLOUD, ONBOARD, Condition, Execution
-from robot_client.trace import Record
+from offboard.common.errors import CloudTimeout
+from offboard.common.tasks import Task, task
+from offboard.robot_client import policies, predictors
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies.wrappers import PROBE_EVERY
+from offboard.robot_client.records.trace import Record
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution
 from tests.fakes import ScriptedRunner
 from tests.phases import EDGE, PHASES, TASKS, WITHIN, check, switch_point
 

@@ -1,7 +1,7 @@
 """The relay under toxics, as far as it needs no sockets."""
 
-from loadgen.relay.relay import Refusal
-from loadgen.relay.toxic_relay import ToxicRelay
+from offboard.loadgen.relay.relay import Refusal
+from offboard.loadgen.relay.toxiproxy.toxic_relay import ToxicRelay
 
 
 def test_what_comes_after_the_close_is_refused() -> None:

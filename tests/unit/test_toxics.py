@@ -6,9 +6,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.errors import ConfigError
-from loadgen.relay.link import Link, LinkConditions
-from loadgen.relay.toxics import ATTRIBUTES, Refused, Toxic, attributes, closes_after_s, link_of
+from offboard.common.errors import ConfigError
+from offboard.loadgen.relay.link.link import Link, LinkConditions
+from offboard.loadgen.relay.toxiproxy.toxics import (
+    ATTRIBUTES,
+    Refused,
+    Toxic,
+    attributes,
+    closes_after_s,
+    link_of,
+)
 
 
 def toxic(type: str, stream: str = "downstream", toxicity: float = 1.0, **given: Any) -> Toxic:

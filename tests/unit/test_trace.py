@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from common.errors import CloudTimeout, ConfigError, DataError
-from robot_client.policies import Decision, Outlook
-from robot_client.regret import Regret
-from robot_client.runner import CLOUD, ONBOARD, Condition, Execution
-from robot_client.trace import WAITING_MAX, WRITE_EVERY_S, Late, Record, Trace, read
+from offboard.common.errors import CloudTimeout, ConfigError, DataError
+from offboard.robot_client.learning.regret import Regret
+from offboard.robot_client.policies import Decision, Outlook
+from offboard.robot_client.records.trace import WAITING_MAX, WRITE_EVERY_S, Late, Record, Trace, read
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution
 
 ROOT = Path(__file__).parents[2]
 

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from common.errors import ConfigError
-from loadgen.relay import truth as module
-from loadgen.relay.link import Link, LinkConditions, Pipe
-from loadgen.relay.truth import Truth
+from offboard.common.errors import ConfigError
+from offboard.loadgen.relay import link_record as module
+from offboard.loadgen.relay.link.link import Link, LinkConditions, Pipe
+from offboard.loadgen.relay.link_record import Truth
 
 
 def read(path: Path) -> list[dict[str, Any]]:

@@ -7,9 +7,9 @@ from concurrent.futures import CancelledError
 
 import pytest
 
-from robot_client import turns
-from robot_client.clock import SystemClock
-from robot_client.turns import Answer, Turns
+from offboard.robot_client.sites import turns
+from offboard.robot_client.sites.clock import SystemClock
+from offboard.robot_client.sites.turns import Answer, Turns
 
 LONG_S = 30.0  # what is lost is waited for as long
 

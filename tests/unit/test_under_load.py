@@ -4,7 +4,7 @@ from random import Random
 
 import pytest
 
-from robot_client.under_load import KEPT, ODD, UnderLoad
+from offboard.robot_client.learning.under_load import KEPT, ODD, UnderLoad
 
 
 def taught(*times: tuple[float, float], onboard: bool = False) -> UnderLoad:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from robot_client.uploads import KEPT, NEW_AFTER, Uploads
+from offboard.robot_client.sites.uploads import KEPT, NEW_AFTER, Uploads
 
 BYTES = 100_000
 MESSAGE_BYTES_MAX = 2**24

@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from common.planner import plan_path
-from loadgen.outcome import Answered
-from loadgen.scenario import Workload
-from loadgen.verify import verified, wrong_plan
-from robot_client import answers
-from robot_client.work import make_work
+from offboard.common.planning.planner import plan_path
+from offboard.loadgen.play.answer_check import verified, wrong_plan
+from offboard.loadgen.scenario.outcome import Answered
+from offboard.loadgen.scenario.scenario import Workload
+from offboard.robot_client.simulated import answers
+from offboard.robot_client.simulated.task_source import make_work
 
 MAP = Path(__file__).parents[1] / "samples" / "32room_000-crop.map"
 SEED = 3
 PLANS = Workload(map=MAP, tasks=8, jump=True, obstacles=4, radius_m=0.0)
-CALLS = Workload(task="loadgen.work:hash_rounds", sizes=("uniform:10:1000",), tasks=8)
+CALLS = Workload(task="offboard.loadgen.scenario.hash_tasks:hash_rounds", sizes=("uniform:10:1000",), tasks=8)
 
 
 def answered_rightly(workload: Workload) -> list[Answered]:

@@ -2,8 +2,8 @@
 
 from collections import Counter
 
-from cloud_server.waiting import CRASHED_KEPT, CRASHES_MAX, ROBOTS_MAX, Crashes, Waiting, Work
-from common.wire import Request
+from offboard.cloud_server.fair_queue import CRASHED_KEPT, CRASHES_MAX, ROBOTS_MAX, Crashes, Waiting, Work
+from offboard.common.wire.messages import Request
 
 
 def request(robot: bytes, id: int, arrived: float = 0.0) -> Work:

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.errors import ConfigError
-from robot_client.predictors import LEAST_SQUARES, make
-from robot_client.window import Window
+from offboard.common.errors import ConfigError
+from offboard.robot_client.predictors import LEAST_SQUARES, make
+from offboard.robot_client.predictors.window import Window
 
 SPREAD_MIN = 1e-5  # of the mean of d: above it predictions are exact to RELATIVE
 

@@ -13,9 +13,20 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from common import blobs, values, wire
-from common.errors import BadValue, ProtocolError
-from common.wire import Blob, BlobStore, Cancel, Hello, Ping, Pong, Reply, Request, StoredBlob
+from offboard.common.errors import BadValue, ProtocolError
+from offboard.common.wire import blobs, values
+from offboard.common.wire import messages as wire
+from offboard.common.wire.messages import (
+    Blob,
+    BlobStore,
+    Cancel,
+    Hello,
+    Ping,
+    Pong,
+    Reply,
+    Request,
+    StoredBlob,
+)
 
 DIGEST = bytes(range(32))
 

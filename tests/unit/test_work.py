@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from common.errors import ConfigError, DataError
-from common.planner import Plan, plan_path, size_of_plan
-from common.planners import PLANNERS
-from loadgen.testbed import PART
-from loadgen.work import MUCH, RARE, hash_rarely_long, hash_rounds, rounds_on
-from robot_client.answers import cells_of
-from robot_client.config import RobotConfig
-from robot_client.work import Work, make_work
+from offboard.common.errors import ConfigError, DataError
+from offboard.common.planning.planner import Plan, plan_path, size_of_plan
+from offboard.common.planning.planner_names import PLANNERS
+from offboard.loadgen.scenario.hash_tasks import MUCH, RARE, hash_rarely_long, hash_rounds, rounds_on
+from offboard.loadgen.testbed.testbed import PART
+from offboard.robot_client.config import RobotConfig
+from offboard.robot_client.simulated.answers import cells_of
+from offboard.robot_client.simulated.task_source import Work, make_work
 from tests import probes
 from tests.mazes import warm
 
@@ -132,7 +132,7 @@ def test_answers_are_described_by_kind() -> None:
         ("tests.probes:np", "tests.probes has no function 'np'"),
         ("math:sqrt", "sqrt is not a task; decorate it with @task"),
         ("tests.probes:process_id", "too many positional arguments"),
-        ("common.planner:plan_path", "missing a required argument"),
+        ("offboard.common.planning.planner:plan_path", "missing a required argument"),
     ],
 )
 def test_a_task_that_cannot_be_called_is_named(task: str, why: str) -> None:

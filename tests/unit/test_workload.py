@@ -7,8 +7,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from common.errors import ConfigError, DataError
-from robot_client.workload import BURSTS, CONSTANT, POISSON, SIZE_MAX, due_instants, parse_sizes, sizes
+from offboard.common.errors import ConfigError, DataError
+from offboard.robot_client.simulated.workload import (
+    BURSTS,
+    CONSTANT,
+    POISSON,
+    SIZE_MAX,
+    due_instants,
+    parse_sizes,
+    sizes,
+)
 
 SEEDS = (1, 2, 3)
 

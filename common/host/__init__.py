@@ -1,0 +1,1 @@
+"""What a computer reports about itself: CPU time, load, capacity."""

@@ -1,0 +1,1 @@
+"""The task `plan_path`: maps, search, and the compiled loops."""

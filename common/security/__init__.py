@@ -1,0 +1,1 @@
+"""Keys, tokens, private files, and bounded HTTP connections."""

@@ -1,0 +1,1 @@
+"""What crosses the link: messages, values, large arguments, and the socket."""

@@ -1,0 +1,247 @@
+"""How arguments and results become bytes: msgpack, raw array buffers, and blobs named by their SHA-256.
+
+What the frames travel in is `wire.messages`.
+"""
+
+import dataclasses
+import functools
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from offboard.common.errors import BadValue, ProtocolError
+from offboard.common.wire.blobs import (
+    DTYPES,
+    Array,
+    Buffer,
+    StoredBlob,
+    array_digest,
+    array_view,
+    byte_length,
+    checked_dtype,
+)
+
+BLOB_BYTES_MIN = 64 * 1024  # a larger argument is a blob
+VALUE_BYTES_MAX = 16 * 1024 * 1024  # msgpack part of a value; arrays do not count
+ARRAYS_MAX = 1000  # arrays sent beside one value
+BLOBS_MAX = 64  # blobs one value may refer to
+UNSCANNED_BYTES_MAX = 512  # of msgpack that cannot announce more than is harmless
+NESTING_MAX = 32
+DIMENSIONS_MAX = 8
+TYPES_MAX = 256  # dataclasses whose fields are remembered
+
+_IN_FRAME, _IN_BLOB, _DATACLASS = 1, 2, 3
+_SCALARS = {type(None), bool, int, float, str}
+_UNPACK_ERRORS = (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException)
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """An encoded value: frame 0 is msgpack, the rest raw arrays; `blobs` is what it names by digest."""
+
+    frames: list[Buffer]
+    blobs: dict[bytes, memoryview] = field(default_factory=dict)
+
+
+def encode(
+    value: Any,
+    types: Sequence[type] = (),
+    *,
+    blobs: bool = False,
+    along: Callable[[memoryview], bool] = lambda _: False,
+) -> Body:
+    """Encode None, bool, int, float, str, bytes, list, tuple, dict, arrays and dataclasses of `types`.
+
+    With `blobs`, every array or bytes over BLOB_BYTES_MIN is named by digest instead of sent along, unless
+    `along` says so of the array's bytes.
+    Arrays are not copied: leave them alone until the frames are sent. BadValue names what cannot cross.
+    """
+    encoder = _Encoder(types, blobs, along)
+    main = encoder.pack(value, 0)
+    if len(main) > VALUE_BYTES_MAX:
+        raise BadValue(
+            f"value takes {len(main)} bytes beside its arrays, at most {VALUE_BYTES_MAX} are allowed"
+        )
+    return Body([main, *encoder.frames], encoder.blobs)
+
+
+def decode(frames: Sequence[Buffer], types: Sequence[type], blobs: Mapping[bytes, StoredBlob]) -> Any:
+    """The value in `frames`, arrays as read-only views on them; anything unsound is ProtocolError."""
+    if not 1 <= len(frames) <= 1 + ARRAYS_MAX:
+        raise ProtocolError(f"value of {len(frames)} frames, 1 to {1 + ARRAYS_MAX} are allowed")
+    return _Decoder(frames, types, blobs).unpack(frames[0], 0)
+
+
+def unpack_bounded(data: Buffer, bytes_max: int) -> Any:
+    """msgpack to a plain tree, extension values left as ExtType."""
+    if byte_length(data) > bytes_max:
+        raise ProtocolError(f"msgpack of {byte_length(data)} bytes, at most {bytes_max} are allowed")
+    try:
+        # Skipping proves that every announced item is there; unpacking alone allocates on announcement, for
+        # each byte of the data at most as many items as it has bytes.
+        if byte_length(data) > UNSCANNED_BYTES_MAX:
+            scan = msgpack.Unpacker(max_buffer_size=bytes_max, strict_map_key=False)
+            scan.feed(data)
+            scan.skip()
+        return msgpack.unpackb(data, strict_map_key=False)
+    except _UNPACK_ERRORS as error:
+        raise ProtocolError(f"not msgpack: {type(error).__name__} {error}") from error
+
+
+class _Encoder:
+    """Turns a value into what msgpack packs, collecting array frames and blobs on the way."""
+
+    def __init__(self, types: Sequence[type], use_blobs: bool, along: Callable[[memoryview], bool]) -> None:
+        self.types = types
+        self.use_blobs = use_blobs
+        self.along = along
+        self.frames: list[Buffer] = []
+        self.blobs: dict[bytes, memoryview] = {}
+
+    def pack(self, value: Any, depth: int) -> bytes:
+        tree = self._tree(value, depth)
+        try:
+            packed: bytes = msgpack.packb(tree)
+        except (ValueError, OverflowError) as error:
+            raise BadValue(f"value cannot cross the wire: {error}") from error
+        return packed
+
+    def _tree(self, value: Any, depth: int) -> Any:
+        kind = type(value)
+        if kind in _SCALARS:
+            return value
+        if kind is bytes:
+            return self._bytes(value)
+        if depth > NESTING_MAX:
+            raise BadValue(f"value nests deeper than {NESTING_MAX} levels")
+        if kind is list or kind is tuple:
+            if set(map(type, value)) <= _SCALARS:
+                return value
+            return [one if type(one) in _SCALARS else self._tree(one, depth + 1) for one in value]
+        if kind is dict:
+            return {
+                self._key(key): one if type(one) in _SCALARS else self._tree(one, depth + 1)
+                for key, one in value.items()
+            }
+        if kind is np.ndarray:
+            return self._array(value)
+        if isinstance(value, np.generic) and value.dtype.str in DTYPES and value.dtype.kind in "biuf":
+            return value.item()
+        if kind in self.types and dataclasses.is_dataclass(value):
+            return self._dataclass(value, depth)
+        raise BadValue(f"a value of type {kind.__module__}.{kind.__qualname__} cannot cross the wire")
+
+    def _key(self, key: Any) -> str | int:
+        if type(key) is str or type(key) is int:
+            return key
+        raise BadValue(f"a dict key of type {type(key).__qualname__} cannot cross the wire, str or int can")
+
+    def _bytes(self, value: bytes) -> Any:
+        if not self.use_blobs or len(value) <= BLOB_BYTES_MIN:
+            return value
+        digest = hashlib.sha256(value).digest()
+        return self._blob(digest, memoryview(value), None, ())
+
+    def _array(self, array: Array) -> Any:
+        if array.dtype.str not in DTYPES or array.ndim > DIMENSIONS_MAX:
+            raise BadValue(
+                f"an array of {array.ndim} dimensions and dtype {array.dtype} cannot cross the wire"
+            )
+        raw = np.asarray(array, order="C").reshape(-1).view(np.uint8).data
+        if self.use_blobs and raw.nbytes > BLOB_BYTES_MIN and not self.along(raw):
+            return self._blob(array_digest(array, raw), raw, array.dtype.str, array.shape)
+        if len(self.frames) == ARRAYS_MAX:
+            raise BadValue(f"value holds more than {ARRAYS_MAX} arrays")
+        self.frames.append(raw)
+        place = (len(self.frames), array.dtype.str, array.shape)
+        return msgpack.ExtType(_IN_FRAME, msgpack.packb(place))
+
+    def _blob(self, digest: bytes, raw: memoryview, dtype: str | None, shape: tuple[int, ...]) -> Any:
+        self.blobs[digest] = raw
+        if len(self.blobs) > BLOBS_MAX:
+            raise BadValue(f"value holds more than {BLOBS_MAX} arrays over {BLOB_BYTES_MIN} bytes")
+        return msgpack.ExtType(_IN_BLOB, msgpack.packb((digest, dtype, shape)))
+
+    def _dataclass(self, value: Any, depth: int) -> Any:
+        kind: Any = type(value)
+        fields = {name: getattr(value, name) for name in _field_names(kind)}
+        return msgpack.ExtType(_DATACLASS, self.pack([kind.__name__, fields], depth + 1))
+
+
+@functools.lru_cache(TYPES_MAX)
+def _field_names(kind: Any) -> tuple[str, ...]:
+    return tuple(one.name for one in dataclasses.fields(kind) if one.init)
+
+
+class _Decoder:
+    """Turns what msgpack unpacked back into a value, trusting nothing."""
+
+    def __init__(
+        self, frames: Sequence[Buffer], types: Sequence[type], blobs: Mapping[bytes, StoredBlob]
+    ) -> None:
+        self.frames = frames
+        self.types = {cls.__name__: cls for cls in types}
+        self.blobs = blobs
+
+    def unpack(self, data: Buffer, depth: int) -> Any:
+        return self._value(unpack_bounded(data, VALUE_BYTES_MAX), depth)
+
+    def _value(self, tree: Any, depth: int) -> Any:
+        kind = type(tree)
+        if kind in _SCALARS or kind is bytes:
+            return tree
+        if depth > NESTING_MAX:
+            raise ProtocolError(f"value nests deeper than {NESTING_MAX} levels")
+        if kind is list:
+            if set(map(type, tree)) <= _SCALARS:
+                return tree
+            return [self._value(item, depth + 1) for item in tree]
+        if kind is dict:
+            if not set(map(type, tree)) <= {str, int}:
+                raise ProtocolError("a dict key is neither str nor int")
+            return {key: self._value(item, depth + 1) for key, item in tree.items()}
+        if kind is msgpack.ExtType:
+            return self._extension(tree.code, tree.data, depth)
+        raise ProtocolError(f"unexpected {kind.__name__} in a value")
+
+    def _extension(self, code: int, data: bytes, depth: int) -> Any:
+        if code == _DATACLASS:
+            return self._dataclass(self.unpack(data, depth + 1))
+        tree = unpack_bounded(data, VALUE_BYTES_MAX)
+        if code not in (_IN_FRAME, _IN_BLOB) or not isinstance(tree, list) or len(tree) != 3:
+            raise ProtocolError(f"unknown extension {code}")
+        where, dtype, shape = tree[0], tree[1], _shape(tree[2])
+        if code == _IN_FRAME:
+            if type(where) is not int or not 1 <= where < len(self.frames):
+                raise ProtocolError(f"array in frame {where!r} of {len(self.frames)}")
+            return array_view(memoryview(self.frames[where]).toreadonly(), dtype, shape)
+        blob = self.blobs.get(where) if isinstance(where, bytes) else None
+        if blob is None:
+            raise ProtocolError("value refers to a blob that was not announced")
+        return bytes(blob.data) if dtype is None else blob.array(checked_dtype(dtype).str, shape)
+
+    def _dataclass(self, tree: Any) -> Any:
+        if not (isinstance(tree, list) and len(tree) == 2 and isinstance(tree[1], dict)):
+            raise ProtocolError("malformed dataclass")
+        name, fields = tree
+        cls = self.types.get(name) if isinstance(name, str) else None
+        if cls is None or not dataclasses.is_dataclass(cls):
+            raise ProtocolError(f"no dataclass {name!r:.80} is registered with this task")
+        if fields.keys() != {f.name for f in dataclasses.fields(cls) if f.init}:
+            raise ProtocolError(f"the fields of dataclass {name} differ")
+        try:
+            return cls(**fields)
+        except Exception as error:
+            raise ProtocolError(f"dataclass {name} refused its fields: {error}") from error
+
+
+def _shape(shape: Any) -> tuple[int, ...]:
+    if not isinstance(shape, list) or len(shape) > DIMENSIONS_MAX:
+        raise ProtocolError(f"array shape is not a list of at most {DIMENSIONS_MAX} numbers")
+    if not all(type(n) is int and 0 <= n < 2**63 for n in shape):
+        raise ProtocolError(f"array shape {shape!r:.80} has a bad dimension")
+    return tuple(shape)

@@ -1,0 +1,1 @@
+"""Many runs: the same scenario with several policies and seeds."""

@@ -1,0 +1,86 @@
+"""`loadgen compare --simulate`: a table a scenario, and of several scenarios one over all of them first."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import make_dataclass
+from typing import Any
+
+from offboard.loadgen.compare.compare import CompareConfig, split_strategy, table
+from offboard.loadgen.scenario.scenario import Scenario
+from offboard.loadgen.simulation.batch import Batch
+from offboard.loadgen.simulation.world import check_simulated
+from offboard.loadgen.table.render import Heading, Table, render
+
+ABOUT = "time over oracle of each policy"
+DIGITS = 3
+
+
+def simulated(scenarios: Sequence[Scenario], config: CompareConfig) -> str:
+    """All tables as text."""
+    for scenario in scenarios:
+        check_simulated(scenario)
+    with Batch(config.jobs) as batch:
+        tables = [_table(scenario, config, batch) for scenario in scenarios]
+    if len(tables) == 1:
+        return render(tables, config.format)
+    summary = summary_table(_over_oracle(scenarios, tables, config.policies), _caption(config))
+    if config.format == "csv":  # its lines are of another shape
+        return render([summary], config.format) + "\n" + render(tables, config.format)
+    return render([summary, *tables], config.format)
+
+
+def summary_table(figures: Mapping[str, Mapping[str, float | None]], caption: str) -> Table:
+    """A line a policy; `figures` hold by policy, and then by scenario, its time over oracle.
+
+    `mean` and `worst` are those of the scenarios that have one.
+    """
+    scenarios = list(next(iter(figures.values())))
+    columns = {name: f"on_{name.replace('-', '_')}" for name in scenarios}
+    fields = [("policy", str), *((name, float | None) for name in ("mean", "worst", *columns.values()))]
+    line = make_dataclass("SummaryLine", [*fields, ("note", str, "")], frozen=True)
+    headings = {
+        "policy": Heading("policy", "policy", None),
+        "mean": Heading("mean", "mean", DIGITS),
+        "worst": Heading("worst", "worst", DIGITS),
+        **{column: Heading(name, name, DIGITS) for name, column in columns.items()},
+    }
+    lines = [
+        line(policy, *_mean_and_worst(list(of.values())), *of.values()) for policy, of in figures.items()
+    ]
+    return Table(caption, {"summary": ABOUT}, headings, lines)
+
+
+def _mean_and_worst(values: Sequence[float | None]) -> tuple[Any, Any]:
+    there = [value for value in values if value is not None]
+    return (sum(there) / len(there), max(there)) if there else (None, None)
+
+
+def _table(scenario: Scenario, config: CompareConfig, batch: Batch) -> Table:
+    strategies = {
+        name: dict(zip(("policy", "predictor"), split_strategy(name), strict=True))
+        for name in config.policies
+    }
+    seeds = [scenario.changed(seed=scenario.seed + n) for n in range(config.seeds)]
+    played = batch.play(seeds, strategies)
+    compared = scenario.compared()
+    runs = {name: [run.of(compared).between(config.from_task) for run in played[name]] for name in played}
+    return table(scenario, config, runs, batch.map)
+
+
+def _over_oracle(
+    scenarios: Sequence[Scenario], tables: Sequence[Table], policies: Sequence[str]
+) -> dict[str, dict[str, float | None]]:
+    """By policy and scenario."""
+    found: dict[str, dict[str, float | None]] = {policy: {} for policy in policies}
+    for scenario, one in zip(scenarios, tables, strict=True):
+        for line in one.lines:
+            if not line.bound:
+                found[line.policy][scenario.name] = line.time_over_oracle
+    return found
+
+
+def _caption(config: CompareConfig) -> str:
+    span = f" from task {config.from_task} on" if config.from_task else ""
+    return (
+        f"In simulation, {config.seeds} seeds: time of all tasks{span} over that of the better site for each,"
+        " by scenario, and the mean and the worst of these."
+    )

@@ -1,0 +1,1 @@
+"""One run: plays a scenario, checks the answers, writes the summary."""

@@ -1,0 +1,1 @@
+"""The relay under Toxiproxy's HTTP API."""

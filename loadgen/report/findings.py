@@ -1,0 +1,115 @@
+"""Everything that a report says of one file of measured times, computed once."""
+
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from offboard.loadgen.report import chart_data as series
+from offboard.loadgen.report.chart_data import Accuracies, Decisions, Times
+from offboard.loadgen.table import replay
+from offboard.loadgen.table import table_two as evaluate
+from offboard.loadgen.table.notes import read_noted
+from offboard.loadgen.table.render import Table
+from offboard.loadgen.table.replay import ORACLE, RECORDED, ReplayConfig
+from offboard.loadgen.table.rows import Column, read_lived
+from offboard.loadgen.table.score import Score, Sides
+from offboard.loadgen.table.table_two import Evaluation, TableConfig
+
+
+class Findings:
+    """Of `source`, with the predictors of `table` and the policies, predictor, window and seed of `replay`.
+
+    `feedback` of `replay` is the mode of all but `evaluated`, which holds a table of each mode of `table`.
+    """
+
+    def __init__(self, source: Path, table: TableConfig, replay: ReplayConfig) -> None:
+        self._source = source
+        self._table = table
+        self.settings = replay
+        self.lived = read_lived(source, replay.kind)
+        self.rows = read_noted(source, replay.kind, least=0 if len(self.lived.waited_s) else 1)
+        self.scored = self.rows.since(replay.window)
+
+    @cached_property
+    def times(self) -> Times | None:
+        """None: no task ran on both sites."""
+        return series.times(self.rows, self.settings.seed) if len(self.rows) else None
+
+    @cached_property
+    def evaluated(self) -> list[Table]:
+        """Table II; none where no task ran on both sites."""
+        return evaluate.tables(self._source, self.rows, self._table) if len(self.rows) else []
+
+    @property
+    def scores(self) -> list[Score]:
+        """The lines of Table II with predictions, and then those of rules that predict nothing."""
+        wanted = self.settings.feedback
+        lines = [
+            line for table in self.evaluated if table.about["feedback"] == wanted for line in table.lines
+        ]
+        return [line for line in lines if line.scored]
+
+    @cached_property
+    def accuracies(self) -> Accuracies | None:
+        """None: no window leaves a row to predict."""
+        settings = self.settings
+        predicted = [score for score in self.scores if score.predictor]
+        if not predicted:
+            return None
+        own = [score for score in predicted if score.predictor == settings.predictor]
+        evaluation = Evaluation(self.rows, self._table)
+        intervals = series.accuracy_intervals(evaluation, own, settings.feedback, settings.seed)
+        return Accuracies(predicted, intervals, [score for score in self.scores if not score.predictor])
+
+    @cached_property
+    def replayed(self) -> Table:
+        """The figures of each policy, and of the run as it is recorded."""
+        (table,) = replay.tables(self._source, self.settings)
+        return table
+
+    @cached_property
+    def decisions(self) -> Decisions | None:
+        """Those recorded, or else those of the first policy; None where there are neither."""
+        settings, lived = self.settings, self.lived
+        if len(lived.waited_s):
+            return series.decisions(RECORDED, lived.waited_s, lived.to_cloud, first=1, seed=settings.seed)
+        if not len(self.scored):
+            return None
+        policy = settings.policies[0]
+        return series.decisions(
+            policy,
+            self._spent_s(self._to_cloud[policy]),
+            self._to_cloud[policy],
+            first=settings.window + 1,
+            seed=settings.seed,
+            best=self._to_cloud[ORACLE],
+        )
+
+    @property
+    def spent_s(self) -> dict[str, Column]:
+        """By policy, the times of the rows after the warm-up; the run as recorded has other tasks."""
+        found = {policy: self._spent_s(to_cloud) for policy, to_cloud in self._to_cloud.items()}
+        return found | ({RECORDED: self.lived.waited_s} if len(self.lived.waited_s) else {})
+
+    @cached_property
+    def _to_cloud(self) -> dict[str, Sides]:
+        """By policy, where each row after the warm-up was answered; nothing where there are none."""
+        if not len(self.scored):
+            return {}
+        settings = self.settings
+        found = {
+            policy: replay.replay(
+                self.rows,
+                policy,
+                predictor=settings.predictor,
+                window=settings.window,
+                feedback=settings.feedback,
+                seed=settings.seed,
+            ).to_cloud
+            for policy in settings.policies
+        }
+        return found | {ORACLE: self.scored.cloud_s < self.scored.onboard_s}
+
+    def _spent_s(self, to_cloud: Sides) -> Column:
+        return np.where(to_cloud, self.scored.cloud_s, self.scored.onboard_s)

@@ -1,0 +1,1 @@
+"""A run as data: scenario, timeline, checks, and what came of it."""

@@ -1,0 +1,176 @@
+"""The timeline of a scenario: what happens to which part, at a time or at a task. Data, and when it is due.
+
+Who makes it happen is `play`.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from offboard.common.config import line_of, unknown
+from offboard.common.errors import ConfigError, DataError
+from offboard.loadgen.relay.link.link import Link
+from offboard.loadgen.testbed.cpu_quota import CPUS_MAX, CPUS_MIN
+from offboard.loadgen.testbed.testbed import WAN, Testbed
+
+EVENTS_MAX = 10_000
+AT_S_MAX = 86_400.0
+AT_TASK_MAX = 1_000_000
+HOGS_MAX = 16
+WHEN = ("at_s", "at_task")
+ON_A_PART = ("kill", "stop", "start", "restart", "pause", "resume", "cut", "join")
+ACTIONS = ("link", "cpus", "hogs", "reset", *ON_A_PART)
+KEYS = (*WHEN, *ACTIONS)
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One action, `at_s` seconds after the first task was due or once `at_task` tasks are answered.
+
+    `value` is a part's name, {part: CPUs}, {part: hogs}, conditions as PUT /link takes them, or True.
+    """
+
+    action: str
+    value: Any
+    at_s: float | None = None
+    at_task: int | None = None
+
+    def shown(self) -> dict[str, Any]:
+        """As it was given."""
+        when = {"at_s": self.at_s} if self.at_s is not None else {"at_task": self.at_task}
+        return {**when, self.action: self.value}
+
+    def apply(self, testbed: Testbed) -> None:
+        """Make it happen."""
+        match self.action:
+            case "link":
+                testbed.set_link(**self.value)
+            case "cpus":
+                for part, cpus in self.value.items():
+                    testbed.set_cpus(part, cpus)
+            case "hogs":
+                for part, count in self.value.items():
+                    testbed.set_hogs(part, count)
+            case "reset":
+                testbed.reset()
+            case "restart":
+                testbed.kill(self.value)
+                testbed.start(self.value)
+            case action:
+                getattr(testbed, action)(self.value)
+
+    def parts(self) -> tuple[str, ...]:
+        if self.action in ON_A_PART:
+            return (self.value,)
+        return tuple(self.value) if self.action in ("cpus", "hogs") else ()
+
+
+class Timeline:
+    """Gives out each event once, when it is due; those due together in the order of the file."""
+
+    def __init__(self, events: Sequence[Event]) -> None:
+        self._left = list(events)
+
+    def due(self, elapsed_s: float, answered: int) -> list[Event]:
+        """The events whose time, or whose task, has come."""
+        due = [event for event in self._left if _is_due(event, elapsed_s, answered)]
+        self._left = [event for event in self._left if event not in due]
+        return due
+
+    def left(self) -> Sequence[Event]:
+        return tuple(self._left)
+
+
+def absent_at_first(events: Sequence[Event]) -> set[str]:
+    """The parts whose first event is their start: they are not there before."""
+    first: dict[str, str] = {}
+    for event in events:
+        for part in event.parts():
+            first.setdefault(part, event.action)
+    return {part for part, action in first.items() if action == "start"}
+
+
+def parse_events(table: Mapping[str, Any], path: Path, parts: Sequence[str], link: Link) -> tuple[Event, ...]:
+    """The events of a scenario's file, in its order; DataError names file and line."""
+    lines = path.read_text().splitlines()
+    given = table.get("event", [])
+    if not isinstance(given, list) or not all(isinstance(event, dict) for event in given):
+        raise DataError(f"{path}: event is not a list of tables, each under [[event]]")
+    if len(given) > EVENTS_MAX:
+        raise DataError(f"{path}: {len(given)} events, at most {EVENTS_MAX} are allowed")
+    events = []
+    for number, event in enumerate(given, 1):
+        try:
+            events.append(_parse(event, parts, link))
+        except ConfigError as error:
+            key, _, said = str(error).partition(": ")
+            place = f"{path}:{line_of(lines, 'event', number, key)}"
+            raise DataError(f"{place}: {key}: {said}" if key in KEYS else f"{place}: {said}") from None
+    return tuple(events)
+
+
+def _parse(given: Mapping[str, Any], parts: Sequence[str], link: Link) -> Event:
+    """ConfigError starts with the key."""
+    for key in given:
+        if key not in KEYS:
+            raise ConfigError(f"{key}: {unknown('event or key', key, KEYS)}")
+    actions = [key for key in given if key in ACTIONS]
+    if len(actions) != 1:
+        what = f"{' and '.join(actions)} in one event" if actions else "an event without an action"
+        raise ConfigError(f"event: {what}; one of {', '.join(ACTIONS)} is needed")
+    whens = [key for key in given if key in WHEN]
+    if len(whens) != 1:
+        raise ConfigError(
+            f"event: either at_s or at_task is needed, {' and '.join(whens) or 'none'} is given"
+        )
+    number = _number(whens[0], given[whens[0]], 0, AT_S_MAX if whens[0] == "at_s" else AT_TASK_MAX)
+    if whens[0] == "at_task" and number != int(number):
+        raise ConfigError(f"at_task: {number} is not a whole number")
+    value = _value(actions[0], given[actions[0]], parts, link)
+    if whens[0] == "at_s":
+        return Event(actions[0], value, at_s=number)
+    return Event(actions[0], value, at_task=int(number))
+
+
+def _value(action: str, value: Any, parts: Sequence[str], link: Link) -> Any:
+    if action in ON_A_PART:
+        return _part(action, value, parts)
+    if action == "reset":
+        if value is not True:
+            raise ConfigError(f"reset: {value!r} is not true")
+        return True
+    if not isinstance(value, dict) or not value:
+        raise ConfigError(f"{action}: {value!r} is not a table with something in it")
+    if action == "link":
+        try:
+            link.changed(value)
+        except ConfigError as error:
+            raise ConfigError(f"link: {error}") from None
+        return value
+    low, high = (CPUS_MIN, CPUS_MAX) if action == "cpus" else (0, HOGS_MAX)
+    named = {_part(action, part, parts): _number(action, number, low, high) for part, number in value.items()}
+    if action == "hogs" and any(number != int(number) for number in named.values()):
+        raise ConfigError(f"hogs: {value!r}: not whole numbers")
+    if WAN in named:
+        raise ConfigError(f"{action}: the relay is held to no quota")
+    return {part: int(number) for part, number in named.items()} if action == "hogs" else named
+
+
+def _part(action: str, name: Any, parts: Sequence[str]) -> str:
+    if name not in parts:
+        raise ConfigError(f"{action}: {name!r} is not a part; {', '.join(parts)} are")
+    return str(name)
+
+
+def _number(key: str, value: Any, low: float, high: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise ConfigError(f"{key}: {value!r} is not a number from {low:g} to {high:g}")
+    return float(value)
+
+
+def _is_due(event: Event, elapsed_s: float, answered: int) -> bool:
+    if event.at_s is not None:
+        return elapsed_s >= event.at_s
+    assert event.at_task is not None
+    return answered >= event.at_task

@@ -1,0 +1,1 @@
+"""Modelled machines, links and costs, and the virtual clock."""

@@ -1,0 +1,1 @@
+"""Tables from measured times: Table II, replay, and their intervals."""

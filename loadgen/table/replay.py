@@ -1,0 +1,259 @@
+"""`loadgen replay`: what each policy would have made of the same tasks, by the robot's own `Offloader`.
+
+Only the runners differ from a live run: they answer at once with the times that were measured.
+"""
+
+import sys
+from collections.abc import Iterator
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from offboard.common.config import check, setting
+from offboard.common.tasks import Kind, Task, task
+from offboard.loadgen.table import bootstrap, score
+from offboard.loadgen.table.notes import read_noted
+from offboard.loadgen.table.render import Heading, Table, render
+from offboard.loadgen.table.rows import Column, Rows, read_lived
+from offboard.loadgen.table.score import Scored, Sides
+from offboard.loadgen.table.table_two import BOTH, FULL, Asked
+from offboard.robot_client import policies, predictors
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import Decision, Forecast, Policy
+from offboard.robot_client.predictors.window import WINDOW, WINDOW_MAX
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
+
+ORACLE = "oracle"
+RECORDED = "as recorded"
+
+
+@dataclass(frozen=True)
+class ReplayConfig(Asked):
+    """Which policies to replay, and what they predict with."""
+
+    policies: tuple[str, ...] = setting(
+        (*policies.names(), policies.DEFAULT), f"policies to replay: {policies.HELP}", metavar="NAME,NAME,.."
+    )
+    predictor: str | None = setting(
+        None, f"for all of them, instead of each one's own: {predictors.HELP}", metavar="NAME"
+    )
+    window: int = setting(WINDOW, "rows of warm-up, not scored", minimum=2, maximum=WINDOW_MAX)
+
+    def __post_init__(self) -> None:
+        check(self)
+        for policy in self.policies:
+            policies.check_name(policy, "--policies")
+        if self.predictor is not None:
+            predictors.check_name(self.predictor, "--predictor")
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyScore:
+    """One line: how one policy did on the `scored` tasks. None: undefined, or not to be had from the file.
+
+    Where a policy ran a task on both sites its time is that of the first answer.
+    """
+
+    policy: str
+    bound: str = ""
+    scored: int = 0
+    mean_s: float | None = None
+    p95_s: float | None = None
+    p99_s: float | None = None
+    time_over_oracle: float | None = None
+    regret_s: float | None = None
+    regret_mean_s: float | None = None
+    accuracy_percent: float | None = None
+    cloud_percent: float | None = None
+    both_percent: float | None = None
+    note: str = ""
+
+
+HEADINGS: dict[str, Heading] = {
+    "policy": Heading("policy", "policy", None),
+    "bound": Heading("bound", "bound", None),
+    "scored": Heading("tasks", "tasks", 0),
+    "mean_s": Heading("mean s", "mean", 5),
+    "p95_s": Heading("P95 s", "P95", 5),
+    "p99_s": Heading("P99 s", "P99", 5),
+    "time_over_oracle": Heading("time/oracle", "time/oracle", 5),
+    "regret_s": Heading("regret s", "regret", 5),
+    "regret_mean_s": Heading("regret s/task", "regret/task", 5),
+    "accuracy_percent": Heading("accuracy %", r"acc. \%", 2),
+    "cloud_percent": Heading("cloud %", r"cloud \%", 2),
+    "both_percent": Heading("both %", r"both \%", 2),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """What a policy did with each scored row: the site whose answer came first, and whether both ran."""
+
+    to_cloud: Sides
+    both: Sides
+
+
+def run_replay(path: Path, config: ReplayConfig) -> int:
+    """Print the tables of `path` to stdout."""
+    sys.stdout.write(render(tables(path, config), config.format))
+    return 0
+
+
+def tables(path: Path, config: ReplayConfig) -> list[Table]:
+    """One table a feedback mode; the first line of a trace's is the run that it records."""
+    rows, lived = read_noted(path, config.kind, least=0), read_lived(path, config.kind)
+    recorded = [_recorded(lived.waited_s, lived.to_cloud)] if len(lived.waited_s) else []
+    return [_table(path, rows, config, mode, recorded) for mode in config.modes()]
+
+
+def replay(
+    rows: Rows, policy: str, *, predictor: str | None, window: int, feedback: str, seed: int = 1
+) -> Played:
+    """Offer every row to `policy`, in order; what it did with those after the first `window`.
+
+    The warm-up runs on both sites whatever the policy, so that all are scored on the same rows.
+    """
+    chooser = _Chooser(policies.make(policy, seed), every=feedback == FULL)
+    name = policies.predictor_of(policy) if predictor is None else predictor
+    to_cloud, both = np.zeros((2, len(rows)), dtype=bool)
+    with Offloader(
+        [_Replaying(ONBOARD, rows.onboard_s), _Replaying(CLOUD, rows.cloud_s)],
+        policy=chooser,
+        predictor=lambda: predictors.make(name, window, seed),
+    ) as offload:
+        for row, size in enumerate(rows.size.tolist()):
+            offload(_replayed, size, row, where=BOTH if row < window else None)
+            if row >= window:
+                to_cloud[row], both[row] = chooser.last.site == CLOUD, _ran_both(chooser.last)
+    first = rows.cloud_s < rows.onboard_s
+    return Played(np.where(both, first, to_cloud)[window:], both[window:])
+
+
+def _ran_both(decision: Decision) -> bool:
+    """A probe runs both at once; a hedge waits for a time that a replayed task does not have."""
+    return decision.both or (decision.second is not None and decision.second_after_s == 0)
+
+
+class _Chooser:
+    """A policy, its last choice, and with `every` the other site run beside the chosen one: both learn."""
+
+    last: Decision
+
+    def __init__(self, policy: Policy, *, every: bool) -> None:
+        self._policy = policy
+        self._every = every
+
+    def decide(self, forecast: Forecast) -> Decision:
+        self.last = self._policy.decide(forecast)
+        return replace(self.last, both=self.last.both or self._every)
+
+
+class _Replaying:
+    """A runner that takes as long as it did."""
+
+    def __init__(self, site: str, seconds: Column) -> None:
+        self.site = site
+        self._seconds = seconds.tolist()
+
+    def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - every row has both times
+        return None
+
+    def submit(self, task: Task, budget_s: float) -> "Future[Execution]":  # noqa: ARG002 - it was answered
+        _, row = task.args
+        future: Future[Execution] = Future()
+        future.set_result(Execution(self.site, self._seconds[row]))
+        return future
+
+    def cancel(self, task: Task) -> None:
+        pass
+
+    def hurry(self) -> None:
+        pass
+
+    def condition(self) -> Condition:
+        return UNMEASURED
+
+    def close(self) -> None:
+        pass
+
+
+@task("replayed", size=lambda size, row: size)  # noqa: ARG005 - the size of a row is known
+def _replayed(size: float, row: int) -> None:  # noqa: ARG001
+    raise AssertionError("a replayed task is looked up, not run")
+
+
+def _table(path: Path, rows: Rows, config: ReplayConfig, feedback: str, recorded: list[PolicyScore]) -> Table:
+    lines = [*recorded]
+    for name in (*config.policies, ORACLE):
+        lines.extend(_lines(rows, name, config, feedback))
+    left_out = f" ({rows.left_out} tasks without both times left out)" if rows.left_out else ""
+    predictor = config.predictor or "each policy's own"
+    about = f"predictor {predictor}, window {config.window}, feedback {feedback}"
+    return Table(
+        caption=f"{path}: {len(rows)} rows{left_out}, {about}.",
+        about={
+            "source": str(path),
+            "rows": len(rows),
+            "left_out": rows.left_out,
+            "feedback": feedback,
+            "predictor": predictor,
+            "window": config.window,
+        },
+        headings={name: of for name, of in HEADINGS.items() if name != "bound" or config.bootstrap},
+        lines=lines,
+        notes=rows.notes,
+    )
+
+
+def _lines(rows: Rows, policy: str, config: ReplayConfig, feedback: str) -> Iterator[PolicyScore]:
+    """The figures of one policy, and the ends of their intervals where those are asked for."""
+    line = PolicyScore(policy)
+    if len(rows) <= config.window:
+        both = f"{len(rows) or 'no'} tasks ran on both sites, the warm-up takes {config.window}"
+        yield replace(line, note=f"cannot be told: {both}")
+        return
+    scored = rows.since(config.window)
+    if policy == ORACLE:
+        first = scored.cloud_s < scored.onboard_s
+        played = Played(first, np.zeros_like(first))
+    else:
+        played = replay(
+            rows,
+            policy,
+            predictor=config.predictor,
+            window=config.window,
+            feedback=feedback,
+            seed=config.seed,
+        )
+    sent = Scored(scored.onboard_s, scored.cloud_s, played.to_cloud)
+    yield replace(line, scored=len(scored), **score.plain(_figures(sent, played.both)))
+    if config.bootstrap:
+        ends = config.blocks(len(scored)).intervals(
+            lambda picks: _figures(sent.picked(picks), played.both[picks])
+        )
+        for bound, end in zip(bootstrap.BOUNDS, ends, strict=True):
+            yield replace(line, bound=bound, scored=len(scored), **end)
+
+
+def _figures(sent: Scored, both: Sides) -> dict[str, Any]:
+    spent_s = np.where(sent.to_cloud, sent.cloud_s, sent.onboard_s)
+    rule = score.rule_figures(sent)
+    kept = ("time_over_oracle", "regret_s", "regret_mean_s", "accuracy_percent", "cloud_percent")
+    return _times(spent_s) | {name: rule[name] for name in kept} | {"both_percent": 100 * both.mean(-1)}
+
+
+def _recorded(waited_s: Column, to_cloud: Sides) -> PolicyScore:
+    """The tasks that the robot ran on the site it chose: the other site's time is not known."""
+    found = _times(waited_s) | {"cloud_percent": 100 * to_cloud.mean()}
+    return PolicyScore(RECORDED, scored=len(waited_s), **score.plain(found))
+
+
+def _times(seconds: Column) -> dict[str, Any]:
+    return {
+        "mean_s": seconds.mean(-1),
+        "p95_s": score.quantile(seconds, 95),
+        "p99_s": score.quantile(seconds, 99),
+    }

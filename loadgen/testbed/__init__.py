@@ -1,0 +1,1 @@
+"""What a run is played on: child processes on loopback, or containers."""

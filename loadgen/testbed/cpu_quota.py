@@ -1,0 +1,264 @@
+"""Holds a process to a share of CPU: a cgroup where one may be made, else stopping and continuing it."""
+
+import atexit
+import contextlib
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Self
+
+from offboard.common.errors import ConfigError
+
+CPUS_MIN = 0.05
+CPUS_MAX = 64.0
+CGROUP_PERIOD_S = 0.010  # at the kernel's own 100 ms a quota is a staircase of 75 ms stops
+CGROUP_QUOTA_S_MIN = 0.001  # the kernel takes no less
+SIGNAL_PERIOD_S = 0.020
+SIGNAL_STEP_S = 0.0005  # the controller looks no more often than this
+PERIODS_MADE_UP = 3  # a controller that was late makes up for at most so many periods
+CLOSE_WAIT_S = 1.0
+
+
+class Quota:
+    """What holds one process; close it to let the process go.
+
+    `cpus` and `period_s` are what is in force, read back where the kernel keeps them.
+    """
+
+    kind: str
+    cpus: float
+    period_s: float
+
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
+        self._process = os.pidfd_open(pid)  # names this process for good: its number may be used again
+        atexit.register(self.close)
+
+    def set(self, cpus: float) -> None:
+        """Hold it to so many CPUs from now on."""
+        raise NotImplementedError
+
+    def add(self, pid: int) -> None:
+        """Let another process share the quota, until this is closed."""
+        raise NotImplementedError
+
+    def pause(self) -> None:
+        """Stop the process until `resume`."""
+        self._signal(signal.SIGSTOP)
+
+    def resume(self) -> None:
+        self._signal(signal.SIGCONT)
+
+    def close(self) -> None:
+        """Let the process run free. Safe to call twice, and after its end."""
+        if self._process >= 0:
+            self._signal(signal.SIGCONT)
+            os.close(self._process)
+            self._process = -1
+            atexit.unregister(self.close)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _signal(self, number: signal.Signals) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            signal.pidfd_send_signal(self._process, number)
+
+
+def hold(pid: int, cpus: float) -> Quota:
+    """Hold the process, all its threads together, to `cpus` CPUs from now on."""
+    check_cpus(cpus)
+    for version, home, parent in _places(pid):
+        try:
+            return CgroupQuota(pid, cpus, version, home, parent)
+        except OSError:  # not ours to write, or no CPU controller here: try the next
+            continue
+    return SignalQuota(pid, cpus)
+
+
+def check_cpus(cpus: float) -> None:
+    if not CPUS_MIN <= cpus <= CPUS_MAX:
+        raise ConfigError(f"CPU quota {cpus} is not a number from {CPUS_MIN} to {CPUS_MAX:g}")
+
+
+class CgroupQuota(Quota):
+    """The kernel's own quota, in a group made under `parent`; the process goes back `home` at close."""
+
+    def __init__(self, pid: int, cpus: float, version: int, home: Path, parent: Path) -> None:
+        self.kind = f"cgroup v{version}"
+        self._version = version
+        self._home = home
+        self._group = parent / f"offboard-{os.getpid()}-{pid}"
+        _remove_left_behind(parent)
+        self._group.mkdir()
+        try:
+            self.set(cpus)
+            self.add(pid)
+            super().__init__(pid)
+        except OSError:
+            self._remove()
+            raise
+
+    def set(self, cpus: float) -> None:
+        check_cpus(cpus)
+        self._write(self._version, cpus)
+        self.cpus, self.period_s = self._read(self._version)
+
+    def add(self, pid: int) -> None:
+        (self._group / "cgroup.procs").write_text(str(pid))
+
+    def close(self) -> None:
+        if self._process >= 0:
+            super().close()
+            self._remove()
+
+    def _write(self, version: int, cpus: float) -> None:
+        period_us = round(1e6 * max(CGROUP_PERIOD_S, CGROUP_QUOTA_S_MIN / cpus))
+        quota_us = round(cpus * period_us)
+        if version == 2:
+            (self._group / "cpu.max").open("r+").close()  # absent where the controller is not delegated
+            (self._group / "cpu.max").write_text(f"{quota_us} {period_us}")
+        else:
+            (self._group / "cpu.cfs_period_us").write_text(str(period_us))
+            (self._group / "cpu.cfs_quota_us").write_text(str(quota_us))
+
+    def _read(self, version: int) -> tuple[float, float]:
+        if version == 2:
+            quota_us, period_us = map(int, (self._group / "cpu.max").read_text().split())
+        else:
+            quota_us = int((self._group / "cpu.cfs_quota_us").read_text())
+            period_us = int((self._group / "cpu.cfs_period_us").read_text())
+        return quota_us / period_us, period_us / 1e6
+
+    def _remove(self) -> None:
+        """Move the processes back and remove the group; a dead one may take a moment to leave it."""
+        end = time.monotonic() + CLOSE_WAIT_S
+        while self._group.exists() and time.monotonic() < end:
+            with contextlib.suppress(OSError):
+                for pid in (self._group / "cgroup.procs").read_text().split():
+                    (self._home / "cgroup.procs").write_text(pid)
+            try:
+                self._group.rmdir()
+            except OSError:
+                time.sleep(SIGNAL_STEP_S)
+
+
+class SignalQuota(Quota):
+    """A thread that stops the process when its CPU time of a period is used up, until the next one.
+
+    CPU time beyond its share is taken off the next periods, a share not used is lost, as in the kernel.
+    Should this process be killed, the held one may stay stopped: whoever holds it sees that it dies too.
+    """
+
+    kind = "stop-continue"
+    period_s = SIGNAL_PERIOD_S
+
+    def __init__(self, pid: int, cpus: float) -> None:
+        super().__init__(pid)
+        self.cpus = cpus
+        self._used_s = {pid: 0.0}  # CPU time of every process that shares the quota, as last seen
+        self._sharing: list[int] = []  # what names the others for good
+        self._lock = threading.Lock()
+        self._spent = False
+        self._paused = False
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._control, name=f"quota-{pid}", daemon=True)
+        self._thread.start()
+
+    def set(self, cpus: float) -> None:
+        check_cpus(cpus)
+        self.cpus = cpus
+
+    def add(self, pid: int) -> None:
+        with self._lock:
+            self._sharing.append(os.pidfd_open(pid))
+            self._used_s[pid] = 0.0
+            if self._spent or self._paused:
+                signal.pidfd_send_signal(self._sharing[-1], signal.SIGSTOP)
+
+    def pause(self) -> None:
+        self._set(paused=True)
+
+    def resume(self) -> None:
+        self._set(paused=False)
+
+    def close(self) -> None:
+        self._closing.set()
+        self._thread.join(CLOSE_WAIT_S)
+        super().close()
+        while self._sharing:
+            os.close(self._sharing.pop())
+
+    def _control(self) -> None:
+        with contextlib.suppress(OSError):  # the process is gone
+            credit_s, used_s, filled_s = 0.0, self._used(), time.monotonic()
+            while not self._closing.is_set():
+                now_s = time.monotonic()
+                elapsed_s = min(now_s - filled_s, PERIODS_MADE_UP * SIGNAL_PERIOD_S)  # more than one if late
+                credit_s, filled_s = min(credit_s, 0.0) + self.cpus * elapsed_s, now_s
+                self._set(spent=credit_s <= 0)
+                while (
+                    left_s := now_s + SIGNAL_PERIOD_S - time.monotonic()
+                ) > 0 and not self._closing.is_set():
+                    self._closing.wait(left_s if self._spent else min(left_s, max(credit_s, SIGNAL_STEP_S)))
+                    used_before_s, used_s = used_s, self._used()
+                    credit_s -= used_s - used_before_s
+                    if credit_s <= 0:
+                        self._set(spent=True)
+
+    def _used(self) -> float:
+        """CPU seconds of all that share the quota; OSError once the held process is gone."""
+        for pid in tuple(self._used_s):
+            try:
+                self._used_s[pid] = time.clock_gettime((~pid << 3) | 2)  # the number of its CPU clock
+            except OSError:
+                if pid == self.pid:
+                    raise
+        return sum(self._used_s.values())
+
+    def _set(self, spent: bool | None = None, paused: bool | None = None) -> None:
+        """Change why the process is stopped, and stop or continue it where that makes a difference."""
+        with self._lock:
+            stopped = self._spent or self._paused
+            self._spent = self._spent if spent is None else spent
+            self._paused = self._paused if paused is None else paused
+            if stopped != (self._spent or self._paused):
+                self._signal(signal.SIGCONT if stopped else signal.SIGSTOP)
+
+    def _signal(self, number: signal.Signals) -> None:
+        super()._signal(number)
+        for process in self._sharing:
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(process, number)
+
+
+def _places(pid: int) -> Iterator[tuple[int, Path, Path]]:
+    """Where a group might be made, likeliest first: cgroup version, the process's own group, the parent.
+
+    Version 2 wants no processes in a group that has children, so there the groups above are tried too.
+    """
+    mounts = [line.split()[1:4] for line in Path("/proc/self/mounts").read_text().splitlines()]
+    for line in Path(f"/proc/{pid}/cgroup").read_text().splitlines():
+        _, controllers, path = line.split(":", 2)
+        for mount, filesystem, options in mounts:
+            home = Path(mount + path)
+            if filesystem == "cgroup" and "cpu" in controllers.split(",") and "cpu" in options.split(","):
+                yield 1, home, home
+            elif filesystem == "cgroup2" and controllers == "":
+                yield from (
+                    (2, home, parent) for parent in (home, *home.parents) if parent.is_relative_to(mount)
+                )
+
+
+def _remove_left_behind(parent: Path) -> None:
+    """Remove empty groups whose maker was killed."""
+    for group in parent.glob("offboard-*"):
+        if not Path("/proc", group.name.split("-")[1]).exists():
+            with contextlib.suppress(OSError):
+                group.rmdir()

@@ -1,0 +1,1 @@
+"""Which site starts when, and whose answer is used."""

@@ -1,0 +1,204 @@
+"""A batch of tasks of one kind over all sites at once: what `Offloader.map` runs.
+
+Which task goes where is `placement`'s business; each one then takes the offloader's one way.
+"""
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any
+
+from offboard.common.errors import Overtaken, TaskError
+from offboard.common.tasks import Kind, Task
+from offboard.robot_client.execution.placement import (
+    BUDGET_SHARE,
+    SERVER_IN_FLIGHT_MAX,
+    Queue,
+    Start,
+    next_start,
+    takeover,
+)
+from offboard.robot_client.policies.forecast import Decision, Forecast, Outlook
+from offboard.robot_client.policies.rules import WARM_UP
+from offboard.robot_client.records.trace import Record
+from offboard.robot_client.sites.clock import Clock
+from offboard.robot_client.sites.runner import ONBOARD, Execution
+
+NAME = "map"
+LOOK_AHEAD = 32  # waiting tasks that are looked at when one is placed
+RECHECK_S = 0.05  # at least so often running tasks are looked at: one may be overdue
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """The policy of one task that a batch has placed; `call` names a site that shall run it too, later."""
+
+    site: str
+    reason: str
+    call: "Future[str]" = field(default_factory=Future)
+
+    def decide(self, forecast: Forecast) -> Decision:
+        if self.site not in forecast.sites:
+            return Decision(ONBOARD, False, f"{self.reason}; {self.site} cannot take it", NAME)
+        return Decision(self.site, False, self.reason, NAME)
+
+
+Predict = Callable[[float, Mapping[str, int]], Forecast]
+Run = Callable[[Task, Placed], tuple[Execution, Record]]
+
+
+class Batch:
+    """Runs all tasks once; make a new one for the next.
+
+    `sites` are those that may be used. `predict` gives the forecast of a size, less the wait for so many
+    tasks of this batch that each site has; `run` runs a task to its end, in any thread. A server's answer is
+    given up after `timeout_s`.
+    """
+
+    def __init__(
+        self,
+        tasks: Sequence[Task],
+        sites: Sequence[str],
+        *,
+        predict: Predict,
+        run: Run,
+        clock: Clock,
+        timeout_s: float,
+    ) -> None:
+        self._tasks = tasks
+        # Of one kind: the longest is the largest.
+        self._waiting = sorted(range(len(tasks)), key=lambda number: -tasks[number].size)
+        self._queues = {site: Queue(site, BUDGET_SHARE * timeout_s) for site in sites}
+        self._predict = predict
+        self._run = run
+        self._clock = clock
+        self._running: dict[Future[tuple[Execution, Record]], int] = {}
+        self._placed: dict[int, Placed] = {}
+        self._values: dict[int, Any] = {}
+        self._errors: dict[int, BaseException] = {}
+
+    def run(self) -> list[Any]:
+        """The results in the order of the tasks; the first error in that order once all have ended."""
+        threads = SERVER_IN_FLIGHT_MAX * len(self._queues)
+        with ThreadPoolExecutor(threads, thread_name_prefix=NAME) as pool:
+            while self._waiting or self._running:
+                while (start := self._next()) is not None:
+                    self._start(pool, *start)
+                if not self._waiting:
+                    self._take_over()
+                self._clock.wait(list(self._running), RECHECK_S)
+                for done in [one for one in self._running if one.done()]:
+                    self._finish(done)
+        if self._errors:
+            raise self._errors[min(self._errors)]
+        return [self._values[number] for number in range(len(self._tasks))]
+
+    def _next(self) -> tuple[int, str, str] | None:
+        """Task, site and reason of what should start now."""
+        if not self._waiting or all(len(one.running) >= one.limit for one in self._queues.values()):
+            return None
+        first = _usable(self._look(self._waiting[0]))
+        cold = _cold(first)
+        for site in cold:
+            if not self._queues[site].running:
+                return self._warm_up(site, first[site].count)
+        looked = self._waiting[:LOOK_AHEAD]
+        start = next_start(
+            (_seconds(_usable(self._look(number)), cold) for number in looked),
+            self._queues,
+            self._clock.now_s(),
+        )
+        return None if start is None else (looked[start.place], start.site, self._reason(start))
+
+    def _look(self, number: int) -> Forecast:
+        own = {site: len(queue.running) for site, queue in self._queues.items()}
+        return self._predict(self._tasks[number].size, own)
+
+    def _warm_up(self, site: str, count: int) -> tuple[int, str, str]:
+        """From each part of the waiting sizes one, so that the line through them is known."""
+        place = len(self._waiting) * (count % WARM_UP + 1) // (WARM_UP + 1)
+        return self._waiting[place], site, f"warm-up: too little is known of {site}"
+
+    def _reason(self, start: Start) -> str:
+        order = sorted(start.finish_s, key=lambda site: (site != start.site, start.finish_s[site]))
+        said = " against ".join(f"{site} done in {start.finish_s[site] * 1e3:.3g} ms" for site in order)
+        return f"{said}; {len(self._waiting)} tasks wait"
+
+    def _start(self, pool: ThreadPoolExecutor, number: int, site: str, reason: str) -> None:
+        seconds = _seconds(self._look(number).sites).get(site, 0.0)
+        self._waiting.remove(number)
+        self._queues[site].start(number, seconds, self._clock.now_s())
+        placed = self._placed[number] = Placed(site, reason)
+        self._running[pool.submit(self._run, self._tasks[number], placed)] = number
+
+    def _take_over(self) -> None:
+        """An idle site runs too what should finish sooner there, while second runs are allowed."""
+        once = [number for number in self._running.values() if not self._placed[number].call.done()]
+        if not once or all(queue.running for queue in self._queues.values()):
+            return
+        forecasts = {number: self._look(number) for number in once}
+        sites = {number: _usable(one) for number, one in forecasts.items() if one.duplicates >= 1}
+        seconds = {number: _seconds(one, _cold(one)) for number, one in sites.items()}
+        now_s = self._clock.now_s()
+        found = takeover(seconds, self._queues, now_s)
+        if found is not None:
+            number, site = found
+            self._queues[site].start(number, seconds[number][site], now_s)
+            self._placed[number].call.set_result(site)
+
+    def _finish(self, done: "Future[tuple[Execution, Record]]") -> None:
+        number, now_s = self._running.pop(done), self._clock.now_s()
+        for queue in self._queues.values():
+            if number in queue.running:
+                queue.end(number, now_s)
+        if (error := done.exception()) is not None:
+            self._errors[number] = error
+            return
+        answer, record = done.result()
+        self._values[number] = answer.value
+        if answer.failure is not None:
+            self._errors[number] = answer.failure
+        for one in record.executions:
+            if one.site in self._queues and not isinstance(one.failure, Overtaken):
+                self._hear(self._queues[one.site], one)
+
+    def _hear(self, queue: Queue, execution: Execution) -> None:
+        if execution.ok or isinstance(execution.failure, TaskError):
+            queue.hear(execution.queue_s, execution.run_s)
+        else:
+            queue.hear(None, None)
+
+
+def arguments(kind: Kind, items: Iterable[Any]) -> list[tuple[Any, ...]]:
+    """Of each item: a tuple holds all arguments where the function takes several, else it is the argument."""
+    parameters = inspect.signature(kind.function).parameters.values()
+    several = len(parameters) > 1 or any(one.kind is one.VAR_POSITIONAL for one in parameters)
+    return [kind.bind(item if several and isinstance(item, tuple) else (item,), {}) for item in items]
+
+
+def _usable(forecast: Forecast) -> Mapping[str, Outlook]:
+    """The sites to compare: neither silent ones nor those that the caps leave too little for."""
+    if len(forecast.sites) == 1:
+        return forecast.sites
+    return {
+        site: one
+        for site, one in forecast.sites.items()
+        if site == ONBOARD
+        or not (one.condition.silent or one.bytes > forecast.bytes_left or one.joules > forecast.joules_left)
+    }
+
+
+def _cold(sites: Mapping[str, Outlook]) -> list[str]:
+    """Those of which too little is known; of a site that is alone nothing need be known."""
+    if len(sites) == 1:
+        return []
+    return [
+        site
+        for site, one in sites.items()
+        if one.predicted_s is None or (one.count < WARM_UP and not one.full)
+    ]
+
+
+def _seconds(sites: Mapping[str, Outlook], cold: Sequence[str] = ()) -> dict[str, float]:
+    return {site: max(0.0, one.predicted_s or 0.0) for site, one in sites.items() if site not in cold}

@@ -1,0 +1,159 @@
+"""One task on the sites that were decided for: who starts when, and whose answer is used.
+
+Which sites these are is `policies`' business, what is learnt of it the offloader's.
+"""
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import CancelledError, Future
+from dataclasses import dataclass
+from typing import Any
+
+from offboard.common.errors import BadValue, CloudBroken, CloudError, Overtaken, TaskError
+from offboard.common.tasks import Kind, Task
+from offboard.robot_client.sites.clock import Clock
+from offboard.robot_client.sites.runner import ONBOARD, Execution, Runner
+
+
+@dataclass(slots=True)
+class Plan:
+    """`first` start at once, `second` when no answer has come after `after_s`; `all`: wait for every one.
+
+    `call`: a site that starts too once this names it.
+    """
+
+    first: tuple[str, ...]
+    second: str | None = None
+    after_s: float = 0.0
+    all: bool = False
+    call: "Future[str] | None" = None
+
+
+class Race:
+    """Runs one task. `begun` is told of every site that starts; `allowed` is asked before a second one does,
+    but not before one in place of those that failed; `late` gets, in any thread, what comes of a run that was
+    still under way when the answer was there; `meanwhile` is called once the first ones have started."""
+
+    def __init__(
+        self,
+        task: Task,
+        runners: Mapping[str, Runner],
+        clock: Clock,
+        timeout_s: float,
+        *,
+        begun: Callable[[str], None],
+        allowed: Callable[[], bool],
+        late: Callable[[str, Execution], None],
+        meanwhile: Callable[[], None],
+    ) -> None:
+        self._task = task
+        self._runners = runners
+        self._clock = clock
+        self._timeout_s = timeout_s
+        self._begun = begun
+        self._allowed = allowed
+        self._late = late
+        self._meanwhile = meanwhile
+        self._runs: dict[str, tuple[Future[Execution], float]] = {}  # and when it began
+
+    def run(self, plan: Plan) -> tuple[Execution, ...]:
+        """All executions in the order in which they began; those still under way as overtaken."""
+        for site in plan.first:
+            self._start(site)
+        self._meanwhile()
+        if plan.all:
+            self._wait_for_all()
+        else:
+            if plan.second is not None:
+                self._start_second(plan.second, plan.after_s)
+            self._wait_for_answer(plan.call)
+        executions = {site: _finished(site, run) for site, (run, _) in self._runs.items() if run.done()}
+        if ONBOARD not in self._runs and all(
+            _may_fall_back(one, self._task.kind) for one in executions.values()
+        ):
+            self._start(ONBOARD)
+            self._wait_for_all()
+            executions[ONBOARD] = _finished(ONBOARD, self._runs[ONBOARD][0])
+        for site, (run, began_s) in self._runs.items():
+            if site not in executions:
+                probed = plan.second is not None and plan.after_s == 0.0
+                executions[site] = self._leave(site, run, began_s, keep=probed)
+        return tuple(executions[site] for site in self._runs)
+
+    def _start(self, site: str) -> None:
+        self._begun(site)
+        began_s = self._clock.now_s()
+        self._runs[site] = self._runners[site].submit(self._task, self._timeout_s), began_s
+
+    def _start_second(self, site: str, after_s: float) -> None:
+        late: list[str] = []
+        if after_s > 0:
+            late, runs = list(self._runs), [run for run, _ in self._runs.values()]
+            if not any(run.done() for run in runs):
+                self._clock.wait(runs, after_s)
+            if any(run.done() for run in runs):
+                return
+        if self._allowed():
+            self._start(site)
+        for first in late:  # after the start: a robot may be late for want of CPU
+            self._runners[first].hurry()
+
+    def _wait_for_answer(self, call: "Future[str] | None") -> None:
+        while True:
+            pending: list[Future[Any]] = []
+            for site, (run, _) in self._runs.items():
+                if not run.done():
+                    pending.append(run)
+                elif _is_answer(_finished(site, run)):
+                    return
+            if not pending:
+                return
+            if call is not None and call.done():
+                self._answer_call(call.result())
+                call = None
+            else:
+                self._clock.wait(pending if call is None else [*pending, call])
+
+    def _answer_call(self, site: str) -> None:
+        if site not in self._runs and self._allowed():
+            self._start(site)
+
+    def _wait_for_all(self) -> None:
+        while pending := [run for run, _ in self._runs.values() if not run.done()]:
+            self._clock.wait(pending)
+
+    def _leave(self, site: str, run: "Future[Execution]", began_s: float, *, keep: bool) -> Execution:
+        """A run that came second: its time is learnt when it ends, now where it can be stopped."""
+        run.add_done_callback(lambda done: self._late(site, _finished(site, done)))
+        if not keep:
+            self._runners[site].cancel(self._task)
+        failure = Overtaken("another site answered first")
+        return Execution(site, self._clock.now_s() - began_s, failure=failure, censored=True)
+
+
+def answer_of(executions: tuple[Execution, ...]) -> Execution:
+    """The first good answer; else the task's own failure; else whatever failed last."""
+    for execution in executions:
+        if isinstance(execution.failure, BadValue):
+            return execution
+    good = [execution for execution in executions if execution.ok]
+    if good:
+        return min(good, key=lambda execution: execution.seconds)
+    own = [execution for execution in executions if isinstance(execution.failure, TaskError)]
+    return (own or list(executions))[-1]
+
+
+def _finished(site: str, future: "Future[Execution]") -> Execution:
+    """A runner's future ends by itself within the budget; one cancelled by `close` counts as broken."""
+    try:
+        return future.result()
+    except CancelledError:
+        return Execution(site, 0.0, failure=CloudBroken("closed while the task was in flight"), started=False)
+
+
+def _is_answer(execution: Execution) -> bool:
+    """A failure of the task itself is the same everywhere."""
+    return execution.ok or isinstance(execution.failure, TaskError)
+
+
+def _may_fall_back(execution: Execution, kind: Kind) -> bool:
+    return isinstance(execution.failure, CloudError) and (kind.duplicate or not execution.started)

@@ -1,0 +1,1 @@
+"""What is remembered about a kind of task on a site."""

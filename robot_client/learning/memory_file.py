@@ -1,0 +1,136 @@
+"""What is in the file of a `store`: JSON, checked whole before any of it is believed."""
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from offboard.common import VERSION as SOFTWARE
+from offboard.robot_client.learning.kind import OBSERVATIONS_MAX, Observation
+from offboard.robot_client.sites.runner import Condition
+
+FORMAT = 1
+PER_SIZE, PER_WORK = "size", "work"
+
+
+@dataclass(frozen=True, slots=True)
+class KeptSite:
+    """The last observations of a site, oldest first, as they were at `saved_at` (Unix time)."""
+
+    saved_at: float
+    observations: tuple[Observation, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class KeptKind:
+    """Of one kind. `source`: hash of its source; `per`: unit of its amounts; `worked`: sizes and work."""
+
+    source: str
+    per: str
+    worked: tuple[tuple[float, float], ...]
+    sites: Mapping[str, KeptSite]
+
+
+class Unreadable(Exception):
+    """The file is not one of ours, or not whole; the text says why."""
+
+
+def encode(kinds: Mapping[str, KeptKind]) -> bytes:
+    """The file that holds these kinds."""
+    whole = {
+        "v": FORMAT,
+        "software": SOFTWARE,
+        "kinds": {name: asdict(kind, dict_factory=_plain) for name, kind in kinds.items()},
+    }
+    return json.dumps(whole, separators=(",", ":")).encode() + b"\n"
+
+
+def _plain(fields: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    return {name: one._asdict() if isinstance(one, Condition) else one for name, one in fields}
+
+
+def decode(text: bytes) -> dict[str, KeptKind]:
+    """The kinds that a file holds; Unreadable unless every part of it is as it should be."""
+    try:
+        whole = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise Unreadable(f"not JSON: {error}") from None
+    if not isinstance(whole, dict) or "v" not in whole or "kinds" not in whole:
+        raise Unreadable("no memory of a robot-client")
+    if whole["v"] != FORMAT:
+        raise Unreadable(
+            f"format version {whole['v']!r} of software {whole.get('software')!r}; this reads {FORMAT}"
+        )
+    try:
+        return {name: _kind(kind) for name, kind in whole["kinds"].items()}
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise Unreadable(f"{type(error).__name__}: {error}") from None
+
+
+def _kind(given: Any) -> KeptKind:
+    if given["per"] not in (PER_SIZE, PER_WORK):
+        raise ValueError(f"amounts per {given['per']!r}")
+    worked = [(_number(size), _number(work)) for size, work in given["worked"]]
+    sites = {name: _site(site) for name, site in given["sites"].items()}
+    return KeptKind(str(given["source"]), given["per"], tuple(worked[-OBSERVATIONS_MAX:]), sites)
+
+
+def _site(given: Any) -> KeptSite:
+    observations = [_observation(one) for one in given["observations"]]
+    return KeptSite(_number(given["saved_at"]), tuple(observations[-OBSERVATIONS_MAX:]))
+
+
+def _observation(given: Any) -> Observation:
+    return Observation(
+        size=_number(given["size"]),
+        amount=_number(given["amount"]),
+        work=_maybe(given["work"]),
+        seconds=_number(given["seconds"]),
+        ok=_fact(given["ok"]),
+        condition=_condition(given["condition"]),
+        predicted_s=None if given["predicted_s"] is None else _number(given["predicted_s"], -math.inf),
+        waited_s=_number(given["waited_s"]),
+        bytes=_number(given["bytes"]),
+        cpu_s=_maybe(given["cpu_s"]),
+        ahead=int(_number(given.get("ahead", 1))),  # unknown to earlier versions
+    )
+
+
+def _condition(given: Any) -> Condition:
+    unknown = given.keys() - set(Condition._fields)
+    if unknown:
+        raise ValueError(f"condition {sorted(unknown)[0]!r} is not known")
+    return Condition(
+        round_trip_s=_maybe(given["round_trip_s"]),
+        silent=_fact(given["silent"]),
+        queue=int(_number(given["queue"])),
+        load=_number(given["load"]),
+        wait_s=_number(given["wait_s"]),
+        capacity=_share(given.get("capacity", 1.0)),  # unknown to earlier versions, as what follows
+        server_load=_number(given.get("server_load", 0.0)),
+    )
+
+
+def _number(given: Any, least: float = 0.0) -> float:
+    if isinstance(given, bool) or not isinstance(given, int | float):
+        raise TypeError(f"{given!r} where a number was expected")
+    if not (least <= given and math.isfinite(given)):
+        raise ValueError(f"{given} where a finite number from {least:g} was expected")
+    return float(given)
+
+
+def _share(given: Any) -> float:
+    if not 0 < _number(given) <= 1:
+        raise ValueError(f"{given} where a share above 0 to 1 was expected")
+    return float(given)
+
+
+def _maybe(given: Any) -> float | None:
+    return None if given is None else _number(given)
+
+
+def _fact(given: Any) -> bool:
+    if not isinstance(given, bool):
+        raise TypeError(f"{given!r} where true or false was expected")
+    return given

@@ -1,0 +1,1 @@
+"""Predictors that need a machine learning library; each file imports one library."""

@@ -1,0 +1,1 @@
+"""What is written about each task: trace and metrics."""

@@ -1,0 +1,119 @@
+"""JSON Lines files that a run appends to and that survive its crash; what a line holds is its owner's."""
+
+import contextlib
+import errno
+import json
+import logging
+import os
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from offboard.common.errors import ConfigError, DataError
+
+VERSION = 1
+LINE_START = b'{"v":'
+
+_ENCODE = json.JSONEncoder(separators=(",", ":")).encode
+
+log = logging.getLogger(__name__)
+
+
+class Lines:
+    """Appends lines to a file, unbuffered and from any thread; `what` is the file's name in messages.
+
+    A line that cannot be written is logged and counted in `lost`, and tasks go on.
+    """
+
+    def __init__(self, what: str, path: Path) -> None:
+        self.path = path
+        self.lost = 0
+        self._what = what
+        self._lock = threading.Lock()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if path.is_file():
+                self._cut_torn_line()
+            self._file = path.open("ab", buffering=0)
+        except OSError as error:
+            raise ConfigError(f"{what} {path}: {error.strerror}") from error
+
+    def append(self, number: int, fields: Mapping[str, Any]) -> None:
+        """Append the line of task `number`; its first field is `v`. Once closed the file takes no more."""
+        line = _ENCODE(fields).encode() + b"\n"
+        with self._lock:
+            if self._file.closed:
+                log.debug("%s %s: task %d ended after the run", self._what, self.path, number)
+                return
+            end = os.fstat(self._file.fileno()).st_size
+            try:
+                if self._file.write(line) < len(line):  # a disk that fills up takes the part that fits
+                    raise OSError(errno.ENOSPC, "no space left for the whole line")
+            except OSError as error:
+                self.lost += 1
+                about = f"{self._what} {self.path}: task {number} lost ({self.lost} so far)"
+                log.error("%s: %s", about, error.strerror)
+                with contextlib.suppress(OSError):
+                    os.truncate(self._file.fileno(), end)
+
+    def close(self) -> None:
+        with self._lock:
+            self._file.close()
+
+    def _cut_torn_line(self) -> None:
+        """A crash may have left half a line, which would spoil the next one. No other file is touched."""
+        with self.path.open("rb") as file:
+            start = file.read(len(LINE_START))
+        if not LINE_START.startswith(start):
+            raise ConfigError(f"{self._what} {self.path}: the file is there and is no {self._what}")
+        kept = _end_of_last_line(self.path)
+        if kept < self.path.stat().st_size:
+            log.warning("%s %s: cut off a torn last line", self._what, self.path)
+            os.truncate(self.path, kept)
+
+
+def read(path: Path, names: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Each line's fields, `names` among them.
+
+    A torn last line is skipped with a warning; any other bad line is a DataError.
+    """
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror}") from error
+    with file:
+        for number, line in enumerate(file, 1):
+            if not line.endswith(b"\n"):
+                log.warning("%s:%d: torn last line skipped", path, number)
+                return
+            yield _parse(f"{path}:{number}", line, names)
+
+
+def _parse(where: str, line: bytes, names: Sequence[str]) -> dict[str, Any]:
+    try:
+        fields = json.loads(line)
+    except ValueError as error:
+        raise DataError(f"{where}: not a JSON line: {error}") from None
+    if not isinstance(fields, dict):
+        raise DataError(f"{where}: {type(fields).__name__} where an object was expected")
+    if fields.get("v") != VERSION:
+        raise DataError(f"{where}: v = {fields.get('v')!r}; this version reads {VERSION}")
+    missing = [name for name in names if name not in fields]
+    if missing:
+        raise DataError(f"{where}: no field {missing[0]!r}")
+    return fields
+
+
+def _end_of_last_line(path: Path) -> int:
+    """Bytes up to and including the last newline; looks at the tail only."""
+    with path.open("rb") as file:
+        end = file.seek(0, os.SEEK_END)
+        while end > 0:
+            start = max(0, end - 65536)
+            file.seek(start)
+            at = file.read(end - start).rfind(b"\n")
+            if at >= 0:
+                return start + at + 1
+            end = start
+    return 0

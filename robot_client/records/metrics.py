@@ -1,0 +1,92 @@
+"""Prometheus metrics of the robot, fed by the record of every task."""
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, start_http_server
+
+from offboard.robot_client.records.trace import Record
+from offboard.robot_client.sites.runner import Execution
+
+SECONDS_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
+
+REGRET = {
+    "": "Mean time a task that the better site would have saved",
+    "_low": "Lower end of the 95 % interval of robot_regret_seconds",
+    "_high": "Upper end of the 95 % interval of robot_regret_seconds",
+}
+
+
+class Metrics:
+    """An observer for the offloader; counts into `registry`."""
+
+    def __init__(self, registry: CollectorRegistry) -> None:
+        self._registry = registry
+        self._tasks = Counter(
+            "robot_tasks", "Tasks answered, by the site used", ["kind", "site"], registry=registry
+        )
+        self._executions = Counter(
+            "robot_executions",
+            "Executions by site and outcome",
+            ["kind", "site", "outcome"],
+            registry=registry,
+        )
+        self._waited = Histogram(
+            "robot_waited_seconds",
+            "What the caller waited",
+            ["kind"],
+            buckets=SECONDS_BUCKETS,
+            registry=registry,
+        )
+        self._predicted = Gauge(
+            "robot_predicted_seconds", "Last prediction", ["kind", "site"], registry=registry
+        )
+        self._interval = Counter(
+            "robot_interval",
+            "Answers by whether their time was inside the 90 % interval of the prediction",
+            ["kind", "site", "inside"],
+            registry=registry,
+        )
+        self._decisions = Counter(
+            "robot_decisions",
+            "Tasks by the site that was decided for",
+            ["kind", "site", "policy"],
+            registry=registry,
+        )
+        self._duplicates = Counter(
+            "robot_duplicates",
+            "Executions beyond the first of a task: warm-up, measuring, probes, hedges, fallbacks",
+            ["kind"],
+            registry=registry,
+        )
+        self._regret = {
+            name: Gauge(f"robot_regret{name}_seconds", f"{what}, from probes", registry=registry)
+            for name, what in REGRET.items()
+        }
+
+    def __call__(self, record: Record) -> None:
+        self._tasks.labels(record.kind, record.used or "none").inc()
+        self._waited.labels(record.kind).observe(record.waited_s)
+        self._decisions.labels(record.kind, record.decision.site, record.decision.policy).inc()
+        self._duplicates.labels(record.kind).inc(len(record.executions) - 1)
+        for execution in record.executions:
+            outcome = "ok" if execution.failure is None else type(execution.failure).__name__
+            self._executions.labels(record.kind, execution.site, outcome).inc()
+            self._judge(record, execution)
+        for site, outlook in record.sites.items():
+            if outlook.predicted_s is not None:
+                self._predicted.labels(record.kind, site).set(outlook.predicted_s)
+
+        if record.regret is not None:
+            regret = record.regret
+            for name, value in zip(REGRET, (regret.mean_s, regret.low_s, regret.high_s), strict=True):
+                self._regret[name].set(value)
+
+    def _judge(self, record: Record, execution: Execution) -> None:
+        """Whether the interval held what it said; a run without an answer has no time to tell by."""
+        outlook = record.sites.get(execution.site)
+        if not execution.ok or outlook is None or outlook.low_s is None or outlook.high_s is None:
+            return
+        inside = str(outlook.low_s <= execution.seconds <= outlook.high_s).lower()
+        self._interval.labels(record.kind, execution.site, inside).inc()
+
+    def serve(self, host: str, port: int) -> None:
+        """Answer GET /metrics from a thread of its own."""
+        start_http_server(port, host, registry=self._registry)

@@ -1,0 +1,184 @@
+"""The trace: one JSON line a task, what was predicted, decided and seen."""
+
+import atexit
+import threading
+from collections import deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from offboard.robot_client.learning.regret import Regret
+from offboard.robot_client.policies import Decision, Outlook
+from offboard.robot_client.records import lines
+from offboard.robot_client.records.lines import VERSION, Lines
+from offboard.robot_client.sites.own_cpu import OWN_CPU
+from offboard.robot_client.sites.runner import UNMEASURED, Condition, Execution
+
+WRITE_EVERY_S = 0.2
+WAITING_MAX = 1000  # records not yet written; whoever brings one more writes them
+
+_FIELDS = (
+    "v",
+    "i",
+    "id",
+    "kind",
+    "started_at",
+    "size",
+    "features",
+    "sites",
+    "decision",
+    "executions",
+    "used",
+    "waited_s",
+)
+_OUTLOOK_FIELDS = ("predicted_s", "spread_s", "low_s", "high_s", "age", "failures")
+_EXECUTION_FIELDS = (
+    "site",
+    "seconds",
+    "ok",
+    "error",
+    "censored",
+    "queue_s",
+    "run_s",
+    "network_s",
+    "cpu_s",
+    "bytes_out",
+    "bytes_in",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Late:
+    """An execution that ended after another site had answered its task; `id` is that of the task's record."""
+
+    id: str
+    site: str
+    seconds: float
+    ok: bool
+    censored: bool
+
+
+@dataclass(slots=True)
+class Record:
+    """Everything about one task, written once it is answered; `used` is the site whose answer was used.
+
+    `amount`: what the sites' predictors were asked with, the work that the size was expected to be, or the
+    size; `late`: what has ended since the last record of tasks answered before; `regret`: as estimated now.
+    """
+
+    i: int
+    id: str
+    kind: str
+    size: float
+    sites: Mapping[str, Outlook]
+    decision: Decision
+    executions: tuple[Execution, ...]
+    used: str | None
+    waited_s: float
+    amount: float | None = None
+    late: tuple[Late, ...] = ()
+    regret: Regret | None = None
+    started_at: datetime = field(default_factory=lambda: datetime.now(UTC))
+
+
+_DECISION_FIELDS, _LATE_FIELDS, _REGRET_FIELDS = (
+    tuple("reason" if one.name == "why" else one.name for one in fields(of))
+    for of in (Decision, Late, Regret)
+)
+
+
+class Trace(Lines):
+    """Appends records to a file, in order; a line that cannot be written is logged and tasks go on.
+
+    A thread makes the lines, some at a time, every WRITE_EVERY_S, more seldom on a loaded robot: where a
+    robot has a tenth of a CPU, a line between two tasks takes the time that the next one needs. A crash
+    loses what was not written yet.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__("trace", path)
+        self._waiting: deque[Record] = deque()
+        self._writing = threading.Lock()
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="trace", daemon=True)
+        self._thread.start()
+        atexit.register(self.close)  # whoever does not close it loses nothing by that
+
+    def write(self, record: Record) -> None:
+        """Any thread."""
+        self._waiting.append(record)
+        if len(self._waiting) >= WAITING_MAX or self._closing.is_set():
+            self.flush()
+
+    def close(self) -> None:
+        """Everything is written. Safe to call twice."""
+        atexit.unregister(self.close)
+        self._closing.set()
+        self._thread.join()
+        self.flush()
+        super().close()
+
+    def flush(self) -> None:
+        """Write what was given so far; any thread."""
+        with self._writing:
+            while self._waiting:
+                record = self._waiting.popleft()
+                self.append(record.i, as_dict(record))
+
+    def _run(self) -> None:
+        while not self._closing.wait(OWN_CPU.pause_s(WRITE_EVERY_S)):
+            self.flush()
+
+
+def alone_path(path: Path) -> Path:
+    """The trace of the plans that `robot-client --alone` measures, beside the trace of the run."""
+    return path.with_name(f"{path.stem}.alone.jsonl")
+
+
+def reference_path(path: Path) -> Path:
+    """The lines of `robot-client --reference`, beside the trace of the run."""
+    return path.with_name(f"{path.stem}.reference.jsonl")
+
+
+def as_dict(record: Record) -> dict[str, Any]:
+    """The record as its JSON line holds it (DESIGN, Trace)."""
+    return {
+        "v": VERSION,
+        "i": record.i,
+        "id": record.id,
+        "kind": record.kind,
+        "started_at": record.started_at.isoformat(timespec="milliseconds"),
+        "size": record.size,
+        "features": features(record),
+        "sites": {site: _values(outlook, _OUTLOOK_FIELDS) for site, outlook in record.sites.items()},
+        "decision": _values(record.decision, _DECISION_FIELDS),
+        "executions": [_values(one, _EXECUTION_FIELDS) for one in record.executions],
+        "used": record.used,
+        "waited_s": record.waited_s,
+        "late": [_values(one, _LATE_FIELDS) for one in record.late],
+        "regret": _values(record.regret, _REGRET_FIELDS) if record.regret else None,
+    }
+
+
+def features(record: Record) -> dict[str, float]:
+    """What was measured, by name: that of a site as SITE.NAME."""
+    found: dict[str, float] = {}
+    if record.amount is not None and record.amount != record.size:
+        found["work"] = record.amount
+    for site, outlook in record.sites.items():
+        if outlook.condition is not UNMEASURED:
+            for name, value in zip(Condition._fields, outlook.condition, strict=True):
+                if value is not None:
+                    found[f"{site}.{name}"] = value
+    return found
+
+
+def read(path: Path) -> Iterator[dict[str, Any]]:
+    """Each line's fields. A torn last line is skipped with a warning; any other bad line is a DataError."""
+    return lines.read(path, _FIELDS)
+
+
+def _values(of: object, names: tuple[str, ...]) -> dict[str, Any]:
+    return {name: getattr(of, name) for name in names}

@@ -1,0 +1,131 @@
+"""The answers file: one JSON line a task, what was answered and when; a run that died goes on from it."""
+
+import hashlib
+import json
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.common.errors import DataError
+from offboard.common.wire.values import encode
+from offboard.robot_client.records import lines
+from offboard.robot_client.records.lines import VERSION, Lines
+
+if TYPE_CHECKING:  # the planner is compiled where it is imported, and a robot may run other tasks
+    from offboard.common.planning.planner import Plan
+
+BEGIN_S = 0.25
+# (row, col) of each step; its digit counts eighths of a turn from along the row (the map's x) towards
+# higher rows (the map's y).
+STEPS = ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1))
+_OFFSETS = np.array(STEPS, np.int32)
+_NINE = np.array((3, 1), np.int32)  # a step to a neighbour times this is a number from -4 to 4: an index
+_DIGITS = np.full(9, ord("?"), np.uint8)
+_DIGITS[_OFFSETS @ _NINE] = [ord(str(digit)) for digit in range(len(STEPS))]
+STRAY = "the path steps to a cell that is no neighbour"
+_FIELDS = ("i", "id", "due_s", "began_s", "ended_s", "error", "answer")
+
+
+@dataclass(frozen=True, slots=True)
+class Answered:
+    """Task `i` of the workload: `id` is that of its record; times in s since the first task was due."""
+
+    i: int
+    id: str | None
+    due_s: float
+    began_s: float
+    ended_s: float
+    error: str | None
+    answer: Mapping[str, Any] | None
+
+
+class Answers:
+    """The answers of one run in `path`; `done` are the tasks that an earlier run has answered there.
+
+    A new file is made by `begin`: whoever waits for the run to begin waits for the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.done: frozenset[int] = frozenset()
+        self._lines: Lines | None = None
+        if path.exists():
+            self.begin()
+            try:
+                self.done = frozenset(fields["i"] for fields in read(path))
+            except DataError:
+                self.close()
+                raise
+
+    @property
+    def lost(self) -> int:
+        """Answers that could not be written."""
+        return self._lines.lost if self._lines else 0
+
+    def begin(self) -> None:
+        """The first task is due BEGIN_S after a new file is there: whoever waits for it has time to act."""
+        if self._lines is None:
+            new = not self.path.exists()
+            self._lines = Lines("answers", self.path)
+            time.sleep(BEGIN_S if new else 0.0)
+
+    def write(self, answered: Answered) -> None:
+        assert self._lines is not None, "not begun"
+        self._lines.append(answered.i, {"v": VERSION, **{name: getattr(answered, name) for name in _FIELDS}})
+
+    def close(self) -> None:
+        if self._lines:
+            self._lines.close()
+
+
+def read(path: Path) -> Iterator[dict[str, Any]]:
+    """Each line's fields, as `trace.read`; `i` is a whole number from 0."""
+    for fields in lines.read(path, _FIELDS):
+        if type(fields["i"]) is not int or fields["i"] < 0:
+            raise DataError(f"{path}: i = {json.dumps(fields['i'])} is not the number of a task")
+        yield fields
+
+
+def of_plan(plan: "Plan") -> dict[str, Any]:
+    """A plan as its line holds it; every cell of the path can be had again by `cells_of`."""
+    start = [int(place) for place in plan.cells[0]] if len(plan.cells) else None
+    return {
+        "status": plan.status,
+        "cost": plan.cost,
+        "expanded": plan.expanded,
+        "start": start,
+        "steps": _steps(plan.cells),
+    }
+
+
+def of_value(value: Any, types: Sequence[type]) -> dict[str, Any]:
+    """Any other result: the SHA-256 of the bytes that would cross the wire, arrays included."""
+    digest = hashlib.sha256()
+    for frame in encode(value, types).frames:
+        digest.update(frame)
+    return {"sha256": digest.hexdigest()}
+
+
+def cells_of(answer: Mapping[str, Any]) -> NDArray[np.int32]:
+    """The cells (row, col) of a plan's path, K x 2, from its start and steps."""
+    if answer["start"] is None:
+        return np.zeros((0, 2), np.int32)
+    digits = np.frombuffer(answer["steps"].encode(), np.uint8) - ord("0")
+    if (digits >= len(STEPS)).any():
+        raise DataError(f"steps {answer['steps']!r:.80} hold another sign than 0 to {len(STEPS) - 1}")
+    return np.concatenate((np.array([answer["start"]], np.int32), _OFFSETS[digits])).cumsum(0, np.int32)
+
+
+def _steps(cells: NDArray[np.int32]) -> str:
+    moves = cells[1:] - cells[:-1]
+    if moves.size and max(moves.max(), -moves.min()) > 1:
+        raise DataError(STRAY)
+    digits: bytes = _DIGITS[moves @ _NINE].tobytes()
+    if b"?" in digits:
+        raise DataError(STRAY)
+    return digits.decode()

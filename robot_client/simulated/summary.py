@@ -1,0 +1,113 @@
+"""What the robot says of its run at the end, and of each task on the way."""
+
+import statistics
+import sys
+from array import array
+from collections.abc import Callable, Sequence
+
+from offboard.robot_client.records.trace import Record
+from offboard.robot_client.sites.runner import ONBOARD
+
+PROGRESS_EVERY = 10  # tasks
+LATE_S = 0.01  # a task that begins less late than this began on time
+
+
+class Summary:
+    """Keeps two floats a task, in arrays: a long run must not grow.
+
+    `found` is what was got from those that `got` something.
+
+    `due` says that tasks had an instant at which they should begin.
+    """
+
+    def __init__(self, *, found: str | None, due: bool) -> None:
+        self._found = found
+        self._due = due
+        self._got = 0
+        self._failed = 0
+        self._late = array("d")  # seconds after the due instant
+        self._both: list[tuple[float | None, float | None]] = []  # seconds onboard, and of the fastest other
+        self._waited: dict[str, array[float]] = {}  # by the chosen site
+        self._fallbacks = 0
+        self._seconds = 0  # tasks that ran on a second site too
+
+    def add(self, record: Record, *, got: bool, late_s: float = 0.0) -> None:
+        self._got += got
+        self._late.append(late_s)
+        if record.decision.both:
+            good = {one.site: one.seconds for one in record.executions if one.ok}
+            onboard = good.pop(ONBOARD, None)
+            self._both.append((onboard, min(good.values(), default=None)))
+        else:
+            self._waited.setdefault(record.decision.site, array("d")).append(record.waited_s)
+            ran = [one.site for one in record.executions]
+            self._seconds += record.decision.second in ran
+            self._fallbacks += len(ran) > 1 and record.decision.second not in ran
+
+    def add_failure(self, *, late_s: float = 0.0) -> None:
+        """A task that has no answer."""
+        self._failed += 1
+        self._late.append(late_s)
+
+    def lines(self) -> list[str]:
+        chosen = sum(map(len, self._waited.values()))
+        found = f"; {self._found} for {self._got}" if self._found else ""
+        failed = f"; {self._failed} failed" if self._failed else ""
+        lines = [f"{len(self._both) + chosen} tasks answered{found}{failed}"]
+        if self._both:
+            lines.append(f"run on both sites: {len(self._both)}; {_both_times(self._both)}")
+        if chosen:
+            lines.append(f"run on the chosen site: {chosen} ({self._shares(chosen)}); {self._times()}")
+        if self._due and self._late:
+            lines.append(self._lateness())
+        return lines
+
+    def _shares(self, chosen: int) -> str:
+        return ", ".join(f"{site} {len(self._waited[site]) / chosen:.0%}" for site in sorted(self._waited))
+
+    def _times(self) -> str:
+        waited = [1e3 * seconds for times in self._waited.values() for seconds in times]
+        mean = statistics.fmean(waited)
+        twice = f"; {self._seconds} on a second site too" if self._seconds else ""
+        return f"mean {mean:.1f} ms, P95 {_p95(waited):.1f} ms; {self._fallbacks} fell back {ONBOARD}{twice}"
+
+    def _lateness(self) -> str:
+        late = sum(late_s > LATE_S for late_s in self._late)
+        return (
+            f"began over {LATE_S * 1e3:g} ms after they were due: {late} of {len(self._late)}; "
+            f"P95 of all {_p95(self._late) * 1e3:.1f} ms"
+        )
+
+
+def describe(record: Record) -> str:
+    """One decision in one line."""
+    took = ", ".join(
+        f"{one.site} {one.seconds * 1e3:.1f} ms" if one.ok else f"{one.site} {one.error}"
+        for one in record.executions
+    )
+    return f"size {record.size:.2f} -> {took} ({record.decision.reason})"
+
+
+def show_progress(done: int, total: int, about: Callable[[], str]) -> None:
+    """One line that is written over on a terminal; every so many tasks a line elsewhere."""
+    if sys.stdout.isatty():
+        print(f"\r\x1b[K{done}/{total} {about()}"[:160], end="", flush=True)
+        if done == total:
+            print()
+    elif done % PROGRESS_EVERY == 0 or done == total:
+        print(f"{done}/{total} {about()}", flush=True)
+
+
+def _p95(values: Sequence[float]) -> float:
+    return sorted(values)[min(len(values) - 1, int(0.95 * len(values)))]
+
+
+def _both_times(times: list[tuple[float | None, float | None]]) -> str:
+    pairs = [(onboard, other) for onboard, other in times if onboard is not None and other is not None]
+    if not pairs:
+        return "no answer from another site"
+    onboard_ms, other_ms = (1e3 * statistics.fmean(column) for column in zip(*pairs, strict=True))
+    share = sum(onboard > other for onboard, other in pairs) / len(pairs)
+    return (
+        f"cloud mean {other_ms:.1f} ms, onboard mean {onboard_ms:.1f} ms; the cloud was faster in {share:.0%}"
+    )

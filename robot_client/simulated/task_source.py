@@ -1,0 +1,160 @@
+"""What a run asks for, task by task: plans of a robot on a map, or calls of a function by size.
+
+When it is asked, and by whom it is answered, is the business of `Drive`.
+"""
+
+import inspect
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from offboard.common.errors import ConfigError, OffloadError
+from offboard.common.tasks import Kind, kind_of, load_modules
+from offboard.robot_client.config import RobotConfig
+from offboard.robot_client.simulated import answers
+from offboard.robot_client.simulated.workload import parse_sizes, sizes
+
+if TYPE_CHECKING:  # the planner is compiled where it is imported: only where there is a map
+    from offboard.common.planning.maps import GridMap
+    from offboard.robot_client.simulated.robot import SimulatedRobot
+
+TASK_ALLOWED = "MODULE:FUNCTION with a @task function of one number"
+
+
+class Work(Protocol):
+    """The tasks of one run in their order, for one thread at a time.
+
+    `found` says in the summary what was got (None: nothing to say); `got` tells which answers count;
+    `independent`: the tasks are the same whatever was answered.
+    """
+
+    function: Callable[..., Any]
+    found: str | None
+    independent: bool
+
+    def request(self) -> tuple[Any, ...]:
+        """The arguments of the present task; asking twice changes nothing."""
+
+    def advance(self, answer: Any) -> None:
+        """Go on to the next task; None where the present one was not asked or has no answer."""
+
+    def got(self, answer: Any) -> bool: ...
+
+    def describe(self, answer: Any) -> dict[str, Any]:
+        """The answer as the answers file holds it; an OffloadError where it is none."""
+
+
+class Plans:
+    """Plans of a robot, which drives each answer, or jumps to its goal without waiting for one.
+
+    `wanted` gives the input size of each task from the second on; without it goals are near and far alike.
+    """
+
+    found: str | None = "a path was found"
+
+    def __init__(self, robot: "SimulatedRobot", wanted: Iterator[float] | None, *, jump: bool) -> None:
+        from offboard.common.planning.planner import plan_path
+
+        self.function: Callable[..., Any] = plan_path
+        self.robot = robot
+        self.independent = jump
+        self._wanted = wanted
+
+    def request(self) -> tuple[Any, ...]:
+        return self.robot.request()
+
+    def advance(self, answer: Any) -> None:
+        size = next(self._wanted) if self._wanted else None
+        if self.independent:
+            self.robot.jump(size)
+        elif answer is None:
+            self.robot.give_up_goal(size)
+        else:
+            self.robot.drive(answer, size)
+
+    def got(self, answer: Any) -> bool:
+        return bool(answer.status == "NONE")
+
+    def describe(self, answer: Any) -> dict[str, Any]:
+        return answers.of_plan(answer)
+
+
+class Calls:
+    """Calls of a `@task` function with whole numbers, one of `wanted` each."""
+
+    found: str | None = None
+    independent = True
+
+    def __init__(self, function: Callable[..., Any], wanted: Iterator[float]) -> None:
+        self.function = function
+        self._types = kind_of(function).types
+        self._wanted = wanted
+        self._size = next(wanted)
+
+    def request(self) -> tuple[Any, ...]:
+        return (int(self._size),)
+
+    def advance(self, answer: Any) -> None:  # noqa: ARG002 - the next call is the same whatever came back
+        self._size = next(self._wanted)
+
+    def got(self, answer: Any) -> bool:  # noqa: ARG002 - any answer is what was asked for
+        return True
+
+    def describe(self, answer: Any) -> dict[str, Any]:
+        return answers.of_value(answer, self._types)
+
+
+def make_work(config: RobotConfig) -> Work:
+    """The work that the settings ask for; ConfigError or DataError where there is none such."""
+    wanted = sizes(parse_sizes(config.sizes), config.seed) if config.sizes else None
+    if config.task is not None:
+        assert wanted is not None, "checked by the config"
+        function = _find_task(config.task)
+        _check_repeats(config, kind_of(function))
+        return Calls(function, wanted)
+    from offboard.robot_client.simulated.robot import SimulatedRobot
+
+    assert config.map is not None, "checked by the config"
+    robot = SimulatedRobot(
+        read_prior(config.map, config.resolution),
+        seed=config.seed,
+        obstacles=config.obstacles,
+        radius_m=config.radius_m,
+        planner=config.planner,
+        size=next(wanted) if wanted else None,
+    )
+    return Plans(robot, wanted, jump=config.jump)
+
+
+def read_prior(path: Path, resolution: float) -> "GridMap":
+    """The map that the robot was given; ROS maps at the planning resolution."""
+    from offboard.common.planning.maps import read_map, resampled
+
+    grid = read_map(path)
+    return grid if path.suffix == ".map" else resampled(grid, resolution)
+
+
+def _find_task(name: str) -> Callable[..., Any]:
+    """The function of `--task`."""
+    module, _, function_name = name.partition(":")
+    try:
+        if not (module and function_name):
+            raise ConfigError("one of the two is missing")
+        load_modules([module])
+        function = getattr(sys.modules[module], function_name, None)
+        if not callable(function):
+            raise ConfigError(f"{module} has no function {function_name!r}")
+        inspect.signature(kind_of(function).function).bind(0)
+    except (OffloadError, TypeError) as error:
+        raise ConfigError(f"--task: {name!r} is not {TASK_ALLOWED}: {error}") from error
+    return kind_of(function).function
+
+
+def _check_repeats(config: RobotConfig, kind: Kind) -> None:
+    """A task that is never to run twice cannot be measured by running it again."""
+    for flag in ("measure", "alone", "reference"):
+        if getattr(config, flag) and not kind.duplicate:
+            raise ConfigError(
+                f"--{flag}: {getattr(config, flag)}: task {kind.name} is declared duplicate=False"
+            )

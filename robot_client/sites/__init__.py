@@ -1,0 +1,1 @@
+"""Where a task can run, and what is measured there."""
