@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from offboard.common.config import as_dict, load, run_command
 from offboard.common.errors import ConfigError, OffloadError
-from offboard.robot_client.config import RobotConfig
+from offboard.robot_client.simulated.config import RobotConfig
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, PORT_MAX
 
 if TYPE_CHECKING:

@@ -12,13 +12,13 @@ from pathlib import Path
 from offboard.common.config import setting
 from offboard.common.errors import ConfigError
 from offboard.common.security.guard import LOOPBACK, OPEN_REMEDY, on_loopback, read_token, warn_each_minute
-from offboard.loadgen.relay.endpoint import BACKLOG, address, bind, name_of
 from offboard.loadgen.relay.http_control import ControlServer, control_app
 from offboard.loadgen.relay.link.link import CHUNK_BYTES
 from offboard.loadgen.relay.link.link_settings import LinkFlags
-from offboard.loadgen.relay.link_record import Truth
-from offboard.loadgen.relay.relay import PreciseSelector, Relay
 from offboard.loadgen.relay.schedule import Schedule, read_schedule
+from offboard.loadgen.relay.tcp.endpoint import BACKLOG, address, bind, name_of
+from offboard.loadgen.relay.tcp.link_record import Truth
+from offboard.loadgen.relay.tcp.relay import PreciseSelector, Relay
 from offboard.loadgen.relay.toxiproxy.proxies import Proxies, RelaySettings
 from offboard.loadgen.relay.toxiproxy.toxiproxy_api import toxiproxy_app
 

@@ -20,7 +20,7 @@ from offboard.loadgen.scenario.timeline import AT_TASK_MAX, Event, parse_events
 from offboard.loadgen.testbed.cpu_quota import CPUS_MAX, CPUS_MIN
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN
 from offboard.robot_client import policies, predictors
-from offboard.robot_client.config import RobotConfig
+from offboard.robot_client.simulated.config import RobotConfig
 
 SHIPPED = Path(__file__).parents[1] / "scenarios"
 ROBOTS_MAX = 64

@@ -34,10 +34,10 @@ _ENTRIES: dict[str, _Entry] = {
     AVERAGE: _Entry("average", "Average"),
     "theil-sen": _Entry("robust", "TheilSen"),
     "huber": _Entry("robust", "Huber"),
-    "random-forest": _Entry("learned.random_forest", "RandomForest", slow=True),
-    "arima": _Entry("learned.arima", "Arima", slow=True),
-    "sarima": _Entry("learned.arima", "Sarima", slow=True),
-    "lstm": _Entry("learned.lstm", "Lstm", slow=True),
+    "random-forest": _Entry("random_forest", "RandomForest", slow=True),
+    "arima": _Entry("arima", "Arima", slow=True),
+    "sarima": _Entry("arima", "Sarima", slow=True),
+    "lstm": _Entry("lstm", "Lstm", slow=True),
 }
 HELP = f"{', '.join(_ENTRIES)}, or {RIVER}MODULE.CLASS; {FEATURES}NAME: on measured features"  # for --help
 
@@ -54,7 +54,7 @@ def make(name: str, window: int, seed: int = 0) -> Predictor:
 
         return Measured(make(name.removeprefix(FEATURES), window, seed))
     if name.startswith(RIVER):
-        from offboard.robot_client.predictors.learned.river_model import River
+        from offboard.robot_client.predictors.river_model import River
 
         return River(name.removeprefix(RIVER), window, seed)
     entry = _ENTRIES[name]

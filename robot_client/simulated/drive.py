@@ -14,10 +14,10 @@ from offboard.common import errors
 from offboard.common.errors import ConfigError, TaskError
 from offboard.common.host import cpu
 from offboard.common.tasks import kind_of
-from offboard.robot_client.config import RobotConfig
 from offboard.robot_client.offloader import BOTH, Offloader
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.simulated.answers import Answered, Answers
+from offboard.robot_client.simulated.config import RobotConfig
 from offboard.robot_client.simulated.references import References, orders
 from offboard.robot_client.simulated.summary import Summary, describe, show_progress
 from offboard.robot_client.simulated.task_source import Work

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from offboard.common.errors import ConfigError, OffloadError
 from offboard.common.tasks import Kind, kind_of, load_modules
-from offboard.robot_client.config import RobotConfig
 from offboard.robot_client.simulated import answers
+from offboard.robot_client.simulated.config import RobotConfig
 from offboard.robot_client.simulated.workload import parse_sizes, sizes
 
 if TYPE_CHECKING:  # the planner is compiled where it is imported: only where there is a map

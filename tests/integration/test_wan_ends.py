@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from offboard.loadgen.relay.link.link import Link
-from offboard.loadgen.relay.relay import Relay
+from offboard.loadgen.relay.tcp.relay import Relay
 from tests.relays import WAIT_S, echo, is_reset, receive, round_trip_s, silent, wait_until
 
 pytestmark = pytest.mark.integration

@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 import scipy.stats
 
-from offboard.loadgen.relay import flow
 from offboard.loadgen.relay.link.link import SEGMENT_BYTES, Link, LinkConditions
-from offboard.loadgen.relay.link_record import Truth
-from offboard.loadgen.relay.relay import Relay
+from offboard.loadgen.relay.tcp import flow
+from offboard.loadgen.relay.tcp.link_record import Truth
+from offboard.loadgen.relay.tcp.relay import Relay
 from tests.relays import WAIT_S, echo, quietest, read_truth, receive, round_trip_s, stop, wait_until
 
 pytestmark = pytest.mark.integration

@@ -17,7 +17,6 @@ from offboard.common.errors import CloudTimeout, TaskFailed
 from offboard.common.planning.maps import GridMap
 from offboard.common.planning.planner import plan_path, warm
 from offboard.common.tasks import Task, task
-from offboard.robot_client.config import RobotConfig
 from offboard.robot_client.offloader import BOTH, Offloader
 from offboard.robot_client.policies.rules import Paper
 from offboard.robot_client.predictors import LEAST_SQUARES, make
@@ -26,6 +25,7 @@ from offboard.robot_client.simulated import answers as answers_file
 from offboard.robot_client.simulated import drive as drive_module
 from offboard.robot_client.simulated import references as references_file
 from offboard.robot_client.simulated.answers import Answers
+from offboard.robot_client.simulated.config import RobotConfig
 from offboard.robot_client.simulated.drive import MADE_MAX, WAYS, Drive, OwnRecord, made_ahead
 from offboard.robot_client.simulated.references import References, orders
 from offboard.robot_client.simulated.robot import SimulatedRobot

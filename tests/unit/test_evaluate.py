@@ -426,7 +426,7 @@ def test_a_missing_library_is_named(table: Print, monkeypatch: pytest.MonkeyPatc
     """Asked for by name it is an error that names the extra; among all it has a line that does."""
     monkeypatch.setitem(sys.modules, "sklearn", None)
     monkeypatch.setitem(sys.modules, "sklearn.ensemble", None)
-    monkeypatch.delitem(sys.modules, "offboard.robot_client.predictors.learned.random_forest", raising=False)
+    monkeypatch.delitem(sys.modules, "offboard.robot_client.predictors.random_forest", raising=False)
     with pytest.raises(MissingExtra, match=r"random-forest needs the extra 'learned'"):
         table(TWELVE, windows=("full",), predictors=("random-forest",))
     monkeypatch.setattr("offboard.robot_client.predictors.names", lambda: ("least-squares", "random-forest"))

@@ -1,18 +1,66 @@
-"""The walls of the house: who may import whom."""
+"""Who may import whom: between packages, between folders, and never in a circle."""
 
 import ast
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
-ROOMS = {
+PACKAGES: dict[str, set[str]] = {
     "common": set(),
     "robot_client": {"common"},
     "cloud_server": {"common"},
     "loadgen": {"common", "robot_client"},
+}
+# Folders by what they may import from their own package. `__main__`, which
+# builds everything, may import all.
+FOLDERS: dict[str, set[str]] = {
+    "common/wire": {"common"},
+    "common/planning": {"common"},
+    "common/security": {"common"},
+    "common/host": set(),
+    "robot_client/sites": set(),
+    "robot_client/predictors": {"robot_client/sites"},
+    "robot_client/policies": {"robot_client/sites"},
+    "robot_client/learning": {"robot_client/policies", "robot_client/predictors", "robot_client/sites"},
+    "robot_client/records": {"robot_client/learning", "robot_client/policies", "robot_client/sites"},
+    "robot_client/execution": {"robot_client/policies", "robot_client/records", "robot_client/sites"},
+    "robot_client": {  # the offloader
+        "robot_client/execution",
+        "robot_client/learning",
+        "robot_client/policies",
+        "robot_client/predictors",
+        "robot_client/records",
+        "robot_client/sites",
+    },
+    "robot_client/simulated": {
+        "robot_client",
+        "robot_client/policies",
+        "robot_client/predictors",
+        "robot_client/records",
+        "robot_client/sites",
+    },
+    "loadgen/relay/link": set(),
+    "loadgen/relay/tcp": {"loadgen/relay/link"},
+    "loadgen/relay/toxiproxy": {"loadgen/relay/link", "loadgen/relay/tcp"},
+    "loadgen/relay": {"loadgen/relay/link", "loadgen/relay/tcp", "loadgen/relay/toxiproxy"},
+    "loadgen/testbed": {"loadgen/relay", "loadgen/relay/link"},
+    "loadgen/table": set(),
+    "loadgen/scenario": {"loadgen/relay/link", "loadgen/table", "loadgen/testbed"},
+    "loadgen/play": {"loadgen/scenario", "loadgen/table", "loadgen/testbed"},
+    "loadgen/simulation/model": {"loadgen/relay/link", "loadgen/scenario", "loadgen/testbed"},
+    "loadgen/simulation": {
+        "loadgen/play",
+        "loadgen/relay/link",
+        "loadgen/scenario",
+        "loadgen/simulation/model",
+        "loadgen/testbed",
+    },
+    "loadgen/compare": {"loadgen/play", "loadgen/scenario", "loadgen/simulation", "loadgen/table"},
+    "loadgen/report": {"loadgen/play", "loadgen/table"},
 }
 # Heavy or optional libraries, and the files that may import them.
 OWNERS = {
@@ -40,31 +88,95 @@ OWNERS = {
     "PIL": {"common/planning/maps.py"},
     "yaml": {"common/planning/maps.py"},
     "matplotlib": {"loadgen/report/charts.py"},
-    "sklearn": {"robot_client/predictors/learned/random_forest.py"},
-    "statsmodels": {"robot_client/predictors/learned/arima.py"},
-    "threadpoolctl": {"robot_client/predictors/learned/arima.py"},
-    "torch": {"robot_client/predictors/learned/lstm.py"},
-    "river": {"robot_client/predictors/learned/river_model.py"},
+    "sklearn": {"robot_client/predictors/random_forest.py"},
+    "statsmodels": {"robot_client/predictors/arima.py"},
+    "threadpoolctl": {"robot_client/predictors/arima.py"},
+    "torch": {"robot_client/predictors/lstm.py"},
+    "river": {"robot_client/predictors/river_model.py"},
 }
 
 
-def imported(path: Path) -> set[str]:
-    names: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+def modules() -> dict[str, Path]:
+    """Every module of ours by its full name."""
+    found = {}
+    for package in ("offboard", *PACKAGES):
+        for path in (ROOT / package).rglob("*.py"):
+            name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+            found[name if package == "offboard" else f"offboard.{name}"] = path
+    return found
+
+
+MODULES = modules()
+
+
+def imports(path: Path) -> Iterator[tuple[str, str]]:
+    """(module, name) of each import, those inside functions included, those for types alone left out."""
+    tree = ast.parse(path.read_text())
+    for_types = {
+        id(inner)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+        for inner in ast.walk(node)
+    }
+    for node in ast.walk(tree):
+        if id(node) in for_types:
+            continue
         if isinstance(node, ast.Import):
-            names |= {alias.name.partition(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield from ((alias.name, "") for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            names.add(node.module.partition(".")[0])
-    return names
+            yield from ((node.module or "", alias.name) for alias in node.names)
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_imports_point_one_way(room: str) -> None:
+def imported(path: Path) -> set[str]:
+    """The top-level packages that a file imports."""
+    return {module.partition(".")[0] for module, _ in imports(path)}
+
+
+def ours(path: Path) -> set[str]:
+    """The modules of ours that a file imports."""
+    found = set()
+    for module, name in imports(path):
+        found |= {one for one in (f"{module}.{name}", module) if one in MODULES} - {"offboard"}
+    return {one for one in found if not any(other.startswith(f"{one}.") for other in found)}
+
+
+def folder(path: Path) -> str:
+    return path.parent.relative_to(ROOT).as_posix()
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_imports_between_packages_point_one_way(package: str) -> None:
     """A package imports itself and the packages below it, and no other of ours."""
-    for path in (ROOT / room).rglob("*.py"):
-        ours = imported(path) & ROOMS.keys()
-        assert ours <= ROOMS[room] | {room}, f"{path} imports {sorted(ours)}"
+    for path in (ROOT / package).rglob("*.py"):
+        used = {folder(MODULES[name]).partition("/")[0] for name in ours(path)}
+        assert used <= PACKAGES[package] | {package}, f"{path} imports {sorted(used)}"
+
+
+@pytest.mark.parametrize("place", FOLDERS)
+def test_imports_between_folders_point_one_way(place: str) -> None:
+    """A folder imports itself and the folders that are listed for it, and no other of its package."""
+    for path in (ROOT / place).glob("*.py"):
+        if path.name == "__main__.py":
+            continue
+        used = {folder(MODULES[name]) for name in ours(path)} - {place}
+        inside = {one for one in used if one.partition("/")[0] == place.partition("/")[0]}
+        assert inside <= FOLDERS[place], f"{path} imports {sorted(inside - FOLDERS[place])}"
+
+
+def test_every_folder_is_listed() -> None:
+    """A new folder says what it may import; `common`, `cloud_server` and `loadgen` themselves are leaves."""
+    folders = {folder(path) for path in MODULES.values()} - {"offboard", "common", "cloud_server", "loadgen"}
+    assert folders == FOLDERS.keys()
+
+
+def test_no_module_imports_itself_in_a_circle() -> None:
+    """Following imports, those inside functions too, never leads back to where it began."""
+    left = {name: ours(path) - {name} for name, path in MODULES.items()}
+    while leaves := [name for name, used in left.items() if not used & left.keys()]:
+        for name in leaves:
+            del left[name]
+    assert not left, f"in a circle, or importing one: {sorted(left)}"
 
 
 @pytest.mark.parametrize("library", OWNERS)
@@ -72,7 +184,7 @@ def test_heavy_libraries_have_one_owner_a_room(library: str) -> None:
     """A heavy or optional library is imported by the files that own it, and those do import it."""
     users = {
         str(path.relative_to(ROOT))
-        for room in ROOMS
+        for room in PACKAGES
         for path in (ROOT / room).rglob("*.py")
         if library in imported(path)
     }

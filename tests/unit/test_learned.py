@@ -21,7 +21,7 @@ REFITTED = {"random-forest": ("forest", 10), "arima": ("series", 4), "lstm": ("t
 @pytest.fixture
 def forest() -> Any:
     pytest.importorskip("sklearn", reason="scikit-learn is not installed: `make install`")
-    from offboard.robot_client.predictors.learned import random_forest as forest
+    from offboard.robot_client.predictors import random_forest as forest
 
     return forest
 
@@ -29,7 +29,7 @@ def forest() -> Any:
 @pytest.fixture
 def series() -> Any:
     pytest.importorskip("statsmodels", reason="statsmodels is not installed: `make install`")
-    from offboard.robot_client.predictors.learned import arima as series
+    from offboard.robot_client.predictors import arima as series
 
     return series
 
@@ -42,7 +42,7 @@ def torch() -> Any:
 @pytest.fixture
 def online() -> Any:
     pytest.importorskip("river", reason="river is not installed: `make install`")
-    from offboard.robot_client.predictors.learned import river_model as online
+    from offboard.robot_client.predictors import river_model as online
 
     return online
 

@@ -14,8 +14,8 @@ from offboard.loadgen.relay.link.link_settings import as_flags
 from offboard.loadgen.relay.wan import WanConfig
 from offboard.loadgen.scenario.scenario import Scenario, Workload, find_scenario, read_scenario, shipped
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN
-from offboard.robot_client.config import RobotConfig
 from offboard.robot_client.records.trace import alone_path, reference_path
+from offboard.robot_client.simulated.config import RobotConfig
 
 CONFIGS = {CLOUD: ServerConfig, WAN: WanConfig, ROBOT: RobotConfig}
 

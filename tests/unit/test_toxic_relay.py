@@ -1,6 +1,6 @@
 """The relay under toxics, as far as it needs no sockets."""
 
-from offboard.loadgen.relay.relay import Refusal
+from offboard.loadgen.relay.tcp.relay import Refusal
 from offboard.loadgen.relay.toxiproxy.toxic_relay import ToxicRelay
 
 

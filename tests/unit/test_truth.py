@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from offboard.common.errors import ConfigError
-from offboard.loadgen.relay import link_record as module
 from offboard.loadgen.relay.link.link import Link, LinkConditions, Pipe
-from offboard.loadgen.relay.link_record import Truth
+from offboard.loadgen.relay.tcp import link_record as module
+from offboard.loadgen.relay.tcp.link_record import Truth
 
 
 def read(path: Path) -> list[dict[str, Any]]:

@@ -12,8 +12,8 @@ from offboard.common.planning.planner import Plan, plan_path, size_of_plan
 from offboard.common.planning.planner_names import PLANNERS
 from offboard.loadgen.scenario.hash_tasks import MUCH, RARE, hash_rarely_long, hash_rounds, rounds_on
 from offboard.loadgen.testbed.testbed import PART
-from offboard.robot_client.config import RobotConfig
 from offboard.robot_client.simulated.answers import cells_of
+from offboard.robot_client.simulated.config import RobotConfig
 from offboard.robot_client.simulated.task_source import Work, make_work
 from tests import probes
 from tests.mazes import warm

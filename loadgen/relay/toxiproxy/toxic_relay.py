@@ -7,9 +7,9 @@ import asyncio
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from offboard.loadgen.relay.connection import Connection
 from offboard.loadgen.relay.link.link import Link
-from offboard.loadgen.relay.relay import Refusal, Relay
+from offboard.loadgen.relay.tcp.connection import Connection
+from offboard.loadgen.relay.tcp.relay import Refusal, Relay
 from offboard.loadgen.relay.toxiproxy.toxics import Toxic, closes_after_s, link_of
 
 

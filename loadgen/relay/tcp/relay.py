@@ -13,10 +13,10 @@ import selectors
 import time
 from typing import Any
 
-from offboard.loadgen.relay.connection import Connection
-from offboard.loadgen.relay.flow import ReadBuffer
 from offboard.loadgen.relay.link.link import Link
-from offboard.loadgen.relay.link_record import Truth
+from offboard.loadgen.relay.tcp.connection import Connection
+from offboard.loadgen.relay.tcp.flow import ReadBuffer
+from offboard.loadgen.relay.tcp.link_record import Truth
 
 SPIN_S = 0.0003
 

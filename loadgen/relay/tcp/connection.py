@@ -9,9 +9,9 @@ import socket
 import struct
 from typing import Protocol
 
-from offboard.loadgen.relay.flow import Flow, ReadBuffer
 from offboard.loadgen.relay.link.link import Link, Pipe
-from offboard.loadgen.relay.link_record import Truth
+from offboard.loadgen.relay.tcp.flow import Flow, ReadBuffer
+from offboard.loadgen.relay.tcp.link_record import Truth
 
 CONNECT_S = 5.0
 RST_AT_CLOSE = struct.pack("ii", 1, 0)  # SO_LINGER on, of no seconds

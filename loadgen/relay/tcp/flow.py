@@ -9,7 +9,7 @@ from collections import deque
 from typing import Protocol
 
 from offboard.loadgen.relay.link.link import LinkConditions, Pipe
-from offboard.loadgen.relay.link_record import Truth
+from offboard.loadgen.relay.tcp.link_record import Truth
 
 READ_BYTES = 256 << 10  # at a time, and written at a time; the fastest of 64 KiB to 1 MiB
 CHUNKS_MAX = 65_536  # under way in one direction: a chunk of one byte takes memory for a hundred

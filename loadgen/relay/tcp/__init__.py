@@ -1,0 +1,1 @@
+"""The relay itself: TCP connections whose bytes pass the link model, and the record of what it did."""

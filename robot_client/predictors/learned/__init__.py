@@ -1,1 +1,0 @@
-"""Predictors that need a machine learning library; each file imports one library."""
