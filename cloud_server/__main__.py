@@ -1,4 +1,7 @@
-"""The command `cloud-server`: builds the server from its settings and runs it until it is told to stop."""
+"""`cloud-server`: builds the server from its settings, and runs it until a signal stops it.
+
+What the server does is in `server`, `http_api` and `executors`.
+"""
 
 import logging
 import os
@@ -10,46 +13,49 @@ from pathlib import Path
 from typing import Any
 
 from offboard.cloud_server.config import ROBOTS, ServerConfig
-from offboard.common.config import as_dict, load, run_command
+from offboard.common.command_line import load, run_command
+from offboard.common.config import as_dict
 from offboard.common.errors import ConfigError
 
 DESCRIPTION = (
-    "Runs tasks for robots over ZMQ; /health, /ready, /metrics, /config, /tasks and /docs over HTTP. "
-    "`cloud-server keys` makes its keys."
+    "Run tasks for robots. Robots connect over ZMQ; HTTP serves /health, /ready, /metrics, /config, /tasks "
+    "and /docs. `cloud-server keys` makes the keys of the server."
 )
 
-SWITCH_S = 0.0005  # in which a thread that computes lets others in: a reply shall not wait for a flood
+SWITCH_S = 0.0005  # a thread that computes must let others run this often, so that replies are not delayed
 
 log = logging.getLogger("offboard.cloud_server")
 
 
-def main() -> int:
-    command = make_keys if sys.argv[1:2] == ["keys"] else serve
-    return run_command("cloud-server", lambda: command(sys.argv[1:], os.environ))
+def main(argv: Sequence[str] | None = None) -> int:
+    arguments = sys.argv[1:] if argv is None else argv
+    if arguments[:1] == ["keys"]:
+        return run_command("cloud-server keys", lambda: make_keys(arguments[1:], os.environ))
+    return run_command("cloud-server", lambda: serve(arguments, os.environ))
 
 
 def make_keys(argv: Sequence[str], environ: Mapping[str, str]) -> int:
-    """`cloud-server keys`: the server's own, and the folder for those of robots."""
+    """`cloud-server keys`: make the keys of the server, and the folder for the keys of its robots."""
     from offboard.common.security.keys import SERVER, run_keys
 
-    folder = run_keys(SERVER, argv[1:], prog="cloud-server keys", prefix="CLOUD_KEYS", environ=environ)
+    folder = run_keys(SERVER, argv, prog="cloud-server keys", prefix="CLOUD_KEYS", environ=environ)
     robots = folder / ROBOTS
     try:
         robots.mkdir(exist_ok=True)
     except OSError as error:
         raise ConfigError(f"--out: {robots}: {error.strerror}") from error
-    print(f"{robots}: the public key of every robot that is let in goes there")
+    print(f"{robots}: copy the public key of each robot there, as NAME.key")
     return 0
 
 
 def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
-    """Serve until SIGTERM or Ctrl-C; 0 when every accepted request was answered."""
+    """Serve until SIGTERM or Ctrl-C; return 0 if every accepted request was answered, else 1."""
     config = load(
         ServerConfig, argv, prog="cloud-server", description=DESCRIPTION, environ=environ, prefix="CLOUD"
     )
     logging.basicConfig(level=config.log.upper(), format="%(asctime)s %(levelname)s %(message)s")
-    sys.path.insert(0, str(Path.cwd()))  # as `python -m` does, so that --tasks finds the user's modules
-    # Heavy libraries come after the settings are known to be right, and not for --help.
+    sys.path.insert(0, str(Path.cwd()))  # as `python -m` does, so that --tasks finds modules of the user
+    # These load heavy libraries, which --help and a wrong flag do not need.
     from offboard.cloud_server.executors import EXECUTORS
     from offboard.cloud_server.http_api import Web, create_app
     from offboard.cloud_server.metrics import Metrics
@@ -67,7 +73,7 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
     if not kinds():
         raise ConfigError(f"--tasks: {','.join(config.tasks)} registers no task")
     log.info("settings: %s", as_dict(config))
-    log.info("at most %d open files, one for each robot's connection", files_max)
+    log.info("up to %d files may be open; each connected robot needs one", files_max)
     metrics = Metrics()
     executor = EXECUTORS[config.executor]
     server = Server(
@@ -102,15 +108,17 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
     finally:
         web.close()
     if not answered:
-        log.error("tasks still ran when the drain time of %g s was over; they are abandoned", config.drain_s)
+        log.error(
+            "some tasks were still running after the drain time of %g s; they are abandoned", config.drain_s
+        )
         logging.shutdown()
-        os._exit(1)  # an abandoned thread cannot be stopped, and exit would wait for it
+        os._exit(1)  # a normal exit would wait for the abandoned threads, which cannot be stopped
     log.info("stopped; every accepted request was answered")
     return 0
 
 
 def raise_file_limit() -> int:
-    """Let this process open as many files as it may; how many that is."""
+    """Raise the limit of open files to the most that this process may have; return it."""
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     return most

@@ -1,4 +1,4 @@
-"""Settings of the server process."""
+"""The settings of `cloud-server`."""
 
 import os
 import re
@@ -10,8 +10,9 @@ from offboard.common.errors import ConfigError
 from offboard.common.security.guard import OPEN_REMEDY, on_loopback
 
 MIB = 1024 * 1024
-ROBOTS = "robots"  # the folder of robots in that of --keys
+ROBOTS = "robots"  # default folder for the keys of robots, inside the folder of --keys
 PORT_MAX = 65535
+ADDRESSES, TASKS, ACCESS, OUTPUT, LIMITS = "addresses", "tasks", "access", "output", "limits"
 
 _LISTEN = re.compile(r"tcp://(\*|\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5})")
 _HTTP = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5})")
@@ -19,71 +20,125 @@ _HTTP = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5})")
 
 @dataclass(frozen=True, slots=True)
 class ServerConfig:
-    """Flag, then `CLOUD_NAME`, then TOML file, then these defaults."""
+    """What the server listens on, whom it lets in, which tasks it runs, and its limits."""
 
     listen: str = setting(
         "tcp://127.0.0.1:5555",
-        "endpoint for robots; port 0 takes a free one; beyond loopback --keys are needed",
+        "endpoint for robots; port 0 picks a free one; an address beyond loopback needs --keys",
+        group=ADDRESSES,
         metavar="ENDPOINT",
     )
     http: str = setting(
         "127.0.0.1:8000",
-        "address of /health, /metrics, ...; beyond loopback --token-file is needed",
+        "address of /health, /metrics and the other pages; an address beyond loopback needs --token-file",
+        group=ADDRESSES,
         metavar="HOST:PORT",
-    )
-    keys: Path | None = setting(
-        None,
-        "folder with server.key_secret, as `cloud-server keys` makes it: all is encrypted (CURVE)",
-        metavar="DIR",
-    )
-    robots: Path | None = setting(
-        None,
-        "folder with the public key of every robot that is let in, read again when it changes "
-        "(default: robots in the folder of --keys)",
-        metavar="DIR",
-    )
-    token_file: Path | None = setting(
-        None, "file with the bearer token that HTTP asks for, but for /health and /ready"
-    )
-    insecure: bool = setting(
-        False, "without keys or token let in anybody from beyond loopback; warns every minute"
-    )
-    executor: str = setting("threads", "where tasks run", choices=("threads", "processes"))
-    workers: int = setting(
-        len(os.sched_getaffinity(0)), "tasks that run at the same time", minimum=1, maximum=1024, metavar="W"
     )
     tasks: tuple[str, ...] = setting(
         ("offboard.common.planning.planner",),
-        "modules that register tasks, comma-separated",
+        "modules that register tasks, separated by commas",
+        group=TASKS,
         metavar="MODULE,MODULE",
+    )
+    executor: str = setting(
+        "threads",
+        "what runs the tasks: threads share memory; processes survive a task that crashes",
+        group=TASKS,
+        choices=("threads", "processes"),
+    )
+    workers: int = setting(
+        len(os.sched_getaffinity(0)),
+        "tasks that run at the same time",
+        group=TASKS,
+        minimum=1,
+        maximum=1024,
+        metavar="W",
+    )
+    keys: Path | None = setting(
+        None,
+        "folder with server.key_secret, made by `cloud-server keys`; encrypts everything (CURVE)",
+        group=ACCESS,
+        metavar="DIR",
+    )
+    token_file: Path | None = setting(
+        None, "file with the bearer token that HTTP needs, except for /health and /ready", group=ACCESS
+    )
+    insecure: bool = setting(
+        False,
+        "accept anybody from beyond loopback without keys or token; logs a warning every minute",
+        group=ACCESS,
+    )
+    robots: Path | None = setting(
+        None,
+        "folder with the public key of each robot that may connect, read again when it changes "
+        "(default: robots in the folder of --keys)",
+        group=ACCESS,
+        rare=True,
+        metavar="DIR",
+    )
+    log: str = setting(
+        "info",
+        "least severe messages that are logged",
+        group=OUTPUT,
+        choices=("debug", "info", "warning", "error"),
     )
     worker_memory: int = setting(
         2048,
-        "MiB of memory that a worker process may take; a task that asks for more fails",
+        "memory that one worker process may use, in MiB; a task that needs more fails",
+        group=LIMITS,
+        rare=True,
         minimum=256,
         maximum=2**20,
         metavar="MIB",
     )
-    queue_max: int = setting(64, "waiting requests; beyond it the answer is busy", minimum=1, maximum=100_000)
-    blob_mib: int = setting(
-        256, "memory for large arguments kept for later requests", minimum=1, maximum=2**20
-    )
-    message_mib: int = setting(64, "largest message taken or sent", minimum=1, maximum=2**11 - 1)
-    robot_mib_s: int = setting(
+    queue_max: int = setting(
         64,
-        "MiB a second that one robot may send, a message counting for 64 KiB at least; else busy",
+        "requests that may wait; further requests are answered busy",
+        group=LIMITS,
+        rare=True,
+        minimum=1,
+        maximum=100_000,
+    )
+    blob_mib: int = setting(
+        256,
+        "memory for large arguments that are kept for later requests, in MiB",
+        group=LIMITS,
+        rare=True,
         minimum=1,
         maximum=2**20,
     )
-    drain_s: float = setting(10.0, "time for accepted tasks after SIGTERM or Ctrl-C", minimum=0, maximum=3600)
-    log: str = setting("info", "log level", choices=("debug", "info", "warning", "error"))
+    message_mib: int = setting(
+        64,
+        "largest message that is received or sent, in MiB",
+        group=LIMITS,
+        rare=True,
+        minimum=1,
+        maximum=2**11 - 1,
+    )
+    robot_mib_s: int = setting(
+        64,
+        "data that one robot may send, in MiB per second; each message counts for at least 64 KiB; "
+        "further requests are answered busy",
+        group=LIMITS,
+        rare=True,
+        minimum=1,
+        maximum=2**20,
+    )
+    drain_s: float = setting(
+        10.0,
+        "time to finish accepted tasks after SIGTERM or Ctrl-C, in seconds",
+        group=LIMITS,
+        rare=True,
+        minimum=0,
+        maximum=3600,
+    )
 
     def __post_init__(self) -> None:
         check(self)
         host_and_port("--listen", self.listen, _LISTEN, "tcp://HOST:PORT or tcp://*:PORT")
         host_and_port("--http", self.http, _HTTP, "HOST:PORT")
         if self.robots is not None and self.keys is None:
-            raise ConfigError(f"--robots: {self.robots} needs --keys, the server's own")
+            raise ConfigError(f"--robots: {self.robots} needs --keys, the keys of the server")
         for way in () if self.insecure else self.open_ways:
             raise ConfigError(f"{way}: {OPEN_REMEDY}")
         if self.blob_mib < self.message_mib:
@@ -91,7 +146,6 @@ class ServerConfig:
                 f"--blob-mib: {self.blob_mib} is below --message-mib {self.message_mib}; "
                 "a large argument would never fit"
             )
-
         if self.executor == "processes" and self.worker_memory < self.blob_mib + 2 * self.message_mib:
             raise ConfigError(
                 f"--worker-memory: {self.worker_memory} is below --blob-mib {self.blob_mib} and twice "
@@ -100,7 +154,7 @@ class ServerConfig:
 
     @property
     def open_ways(self) -> tuple[str, ...]:
-        """What anybody may use who reaches this computer, and why."""
+        """What anybody who reaches this computer may use, with the flags that say so."""
         listen_host = host_and_port("--listen", self.listen, _LISTEN, "tcp://HOST:PORT or tcp://*:PORT")[0]
         ways = []
         if self.keys is None and not on_loopback(listen_host):
@@ -139,7 +193,7 @@ class ServerConfig:
 
 
 def host_and_port(flag: str, text: str, pattern: re.Pattern[str], allowed: str) -> tuple[str, int]:
-    """Both parts of an address, or ConfigError naming the flag."""
+    """Both parts of an address; a ConfigError names the flag of a wrong one."""
     match = pattern.fullmatch(text)
     if match is None or int(match[2]) > PORT_MAX:
         raise ConfigError(f"{flag}: {text!r} is not {allowed} with a port 0 to {PORT_MAX}")

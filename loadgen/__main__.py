@@ -1,50 +1,49 @@
-"""`loadgen`: the bench's commands, each loaded when it is called."""
+"""`loadgen`: the commands of the test bench. Each one imports what it needs when it is called."""
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from offboard.common.config import CommandParser, RawHelp, add_flags, check, resolve, run_command, setting
+from offboard.common.command_line import Command, CommandParser, add_flags, run_commands
+from offboard.common.config import check, resolve, setting
 from offboard.robot_client import policies, predictors
 
 C = TypeVar("C")
 
-ENVIRONMENT = "LOADGEN"
+PREFIX = "LOADGEN"
+SCENARIO, CHANGES = "scenario", "changes to the scenario"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    listing = "\n".join(f"  {name:<9}{command.__doc__}" for name, command in COMMANDS.items())
-    parser = CommandParser(
-        prog="loadgen",
-        usage="loadgen COMMAND ... (loadgen COMMAND --help says more)",
-        description="The test bench of Offboard.\n\ncommands:\n" + listing,
-        formatter_class=RawHelp,
-    )
-    parser.add_argument("command", choices=tuple(COMMANDS), metavar="COMMAND", help="one of the above")
-    command = parser.parse_args(arguments[:1]).command
-    return run_command(f"loadgen {command}", lambda: COMMANDS[command](arguments[1:]))
+    about = "The test bench of Offboard: plays scenarios, compares policies, makes tables and reports."
+    return run_commands("loadgen", about, COMMANDS, sys.argv[1:] if argv is None else argv)
 
 
 @dataclass(frozen=True)
 class RunConfig:
     """How a scenario is played."""
 
-    out: Path = setting(Path("out/run"), "folder for all that the run writes", metavar="DIR")
+    out: Path = setting(Path("out/run"), "folder for all files of the run", group=SCENARIO, metavar="DIR")
     testbed: str = setting(
-        "local", "where it is played: processes, or containers", choices=("local", "docker")
+        "local",
+        "where the parts run: local processes or docker containers",
+        group=SCENARIO,
+        choices=("local", "docker"),
     )
     measure: str = setting(
-        "scenario", "run every task on both sites, or as the scenario says", choices=("scenario", "both")
+        "scenario",
+        "run each task as the scenario says, or on both sites",
+        group=CHANGES,
+        choices=("scenario", "both"),
     )
-    seed: int | None = setting(None, "instead of the scenario's own", minimum=0)
-    tasks: int | None = setting(None, "instead of the scenario's own", minimum=1)
-    policy: str | None = setting(None, f"instead of the scenario's own: {policies.HELP}", metavar="NAME")
+    seed: int | None = setting(None, "another seed", group=CHANGES, minimum=0)
+    tasks: int | None = setting(None, "another number of tasks per robot", group=CHANGES, minimum=1)
+    policy: str | None = setting(None, f"another policy: {policies.HELP}", group=CHANGES, metavar="NAME")
     predictor: str | None = setting(
-        None, f"instead of the scenario's or the policy's own: {predictors.HELP}", metavar="NAME"
+        None, f"another predictor: {predictors.HELP}", group=CHANGES, metavar="NAME"
     )
 
     def __post_init__(self) -> None:
@@ -55,29 +54,24 @@ class RunConfig:
 class DemoConfig:
     """How the demo is played."""
 
-    out: Path = setting(Path("out/demo"), "folder for trace.jsonl, table.md and logs", metavar="DIR")
+    out: Path = setting(Path("out/demo"), "folder for trace.jsonl, table.md and the logs", metavar="DIR")
 
 
 def _demo(argv: Sequence[str]) -> int:
-    """350 plans on a real map, three processes on loopback, and the paper's table"""
-    parser = CommandParser(prog="loadgen demo", description=_demo.__doc__)
-    add_flags(parser, DemoConfig, ENVIRONMENT)
-    config = resolve(DemoConfig, parser.parse_args(argv), environ=os.environ, prefix=ENVIRONMENT)
+    config = _config("demo", DemoConfig, argv)
     from offboard.loadgen.play.play import play_demo
 
     return play_demo(config.out)
 
 
 def _run(argv: Sequence[str]) -> int:
-    """play a scenario: its trace, the truth about its link, its events and the verdict of its checks"""
     from offboard.loadgen.scenario.scenario import find_scenario, read_scenario, shipped
 
-    parser = CommandParser(prog="loadgen run", description=_run.__doc__)
-    help = f"TOML file, or a shipped one: {', '.join(shipped())}"
-    parser.add_argument("scenario", metavar="SCENARIO", help=help)
-    add_flags(parser, RunConfig, ENVIRONMENT)
+    parser = _parser("run", "SCENARIO")
+    parser.add_argument("scenario", metavar="SCENARIO", help=f"TOML file, or one of {', '.join(shipped())}")
+    add_flags(parser, RunConfig, PREFIX)
     flags = parser.parse_args(argv)
-    config = resolve(RunConfig, flags, environ=os.environ, prefix=ENVIRONMENT)
+    config = resolve(RunConfig, flags, environ=os.environ, prefix=PREFIX)
     from offboard.loadgen.play.play import play
 
     _find_modules_here()
@@ -95,98 +89,105 @@ def _run(argv: Sequence[str]) -> int:
 
 
 def _compare(argv: Sequence[str]) -> int:
-    """play scenarios once per policy and seed, in turn, and compare the policies with intervals"""
     from offboard.loadgen.compare.compare import CompareConfig, run_compare
     from offboard.loadgen.scenario.scenario import shipped
 
-    parser = CommandParser(prog="loadgen compare", description=_compare.__doc__)
-    help = f"TOML files, or shipped ones: {', '.join(shipped())}"
+    parser = _parser("compare", "SCENARIO ...")
+    help = f"TOML files, or some of {', '.join(shipped())}"
     parser.add_argument("scenarios", metavar="SCENARIO", nargs="+", help=help)
-    add_flags(parser, CompareConfig, ENVIRONMENT)
+    add_flags(parser, CompareConfig, PREFIX)
     flags = parser.parse_args(argv)
     _find_modules_here()
-    return run_compare(flags.scenarios, resolve(CompareConfig, flags, environ=os.environ, prefix=ENVIRONMENT))
+    return run_compare(flags.scenarios, resolve(CompareConfig, flags, environ=os.environ, prefix=PREFIX))
 
 
 def _table(argv: Sequence[str]) -> int:
-    """the paper's Table II, and what it left out, from a trace or CSV"""
     from offboard.loadgen.table.table_two import TableConfig, run_table
 
-    return run_table(*_file_and_config("table", _table.__doc__, TableConfig, argv))
+    return run_table(*_file_and_config("table", TableConfig, argv))
 
 
 def _replay(argv: Sequence[str]) -> int:
-    """what each policy would have made of the tasks of a trace or CSV"""
     from offboard.loadgen.table.replay import ReplayConfig, run_replay
 
-    return run_replay(*_file_and_config("replay", _replay.__doc__, ReplayConfig, argv))
+    return run_replay(*_file_and_config("replay", ReplayConfig, argv))
 
 
 def _report(argv: Sequence[str]) -> int:
-    """a run as one HTML page of charts and tables, and the charts as PNGs"""
     from offboard.loadgen.report.report import ReportConfig, run_report
 
-    parser = CommandParser(prog="loadgen report", description=_report.__doc__)
-    parser.add_argument("run", type=Path, metavar="DIR", help="a run's folder; or a trace or CSV file")
-    add_flags(parser, ReportConfig, ENVIRONMENT)
+    parser = _parser("report", "DIR")
+    parser.add_argument("run", type=Path, metavar="DIR", help="folder of a run, or a trace or CSV file")
+    add_flags(parser, ReportConfig, PREFIX)
     flags = parser.parse_args(argv)
-    return run_report(flags.run, resolve(ReportConfig, flags, environ=os.environ, prefix=ENVIRONMENT))
+    return run_report(flags.run, resolve(ReportConfig, flags, environ=os.environ, prefix=PREFIX))
 
 
 def _dataset(argv: Sequence[str]) -> int:
-    """measure a scenario's plans on both sites: NAME.csv, and how it was measured"""
     from offboard.loadgen.play.dataset import DatasetConfig, run_dataset
 
-    parser = CommandParser(prog="loadgen dataset", description=_dataset.__doc__)
-    parser.add_argument("scenario", metavar="SCENARIO", help="TOML file, or a shipped one: paper, congested")
-    add_flags(parser, DatasetConfig, ENVIRONMENT)
+    parser = _parser("dataset", "SCENARIO")
+    help = "TOML file, or a shipped scenario such as paper or congested"
+    parser.add_argument("scenario", metavar="SCENARIO", help=help)
+    add_flags(parser, DatasetConfig, PREFIX)
     flags = parser.parse_args(argv)
-    config = resolve(DatasetConfig, flags, environ=os.environ, prefix=ENVIRONMENT)
+    config = resolve(DatasetConfig, flags, environ=os.environ, prefix=PREFIX)
     return run_dataset(flags.scenario, config, ["loadgen", "dataset", *argv])
 
 
 def _export(argv: Sequence[str]) -> int:
-    """the tasks of a trace that ran on both sites, as a CSV dataset"""
     from offboard.loadgen.play.dataset import ExportConfig, run_export
 
-    return run_export(*_file_and_config("export", _export.__doc__, ExportConfig, argv))
-
-
-def _file_and_config(name: str, about: str | None, cls: type[C], argv: Sequence[str]) -> tuple[Path, C]:
-    """The arguments of a command that reads one file of measured times."""
-    parser = CommandParser(prog=f"loadgen {name}", description=about)
-    parser.add_argument(
-        "trace", type=Path, metavar="TRACE", help="trace.jsonl, or CSV size,onboard_s,cloud_s"
-    )
-    add_flags(parser, cls, ENVIRONMENT)
-    flags = parser.parse_args(argv)
-    return flags.trace, resolve(cls, flags, environ=os.environ, prefix=ENVIRONMENT)
-
-
-def _find_modules_here() -> None:
-    """As `python -m` does, so that a scenario's task may be a module of the user's."""
-    sys.path.insert(0, str(Path.cwd()))
+    return run_export(*_file_and_config("export", ExportConfig, argv))
 
 
 def _wan(argv: Sequence[str]) -> int:
-    """the relay between robot and cloud: delay, jitter, loss, bandwidth, outage and other faults"""
     from offboard.loadgen.relay.wan import WanConfig, run_wan
 
-    parser = CommandParser(prog="loadgen wan", description=_wan.__doc__)
-    add_flags(parser, WanConfig, "WAN")
-    return run_wan(resolve(WanConfig, parser.parse_args(argv), environ=os.environ, prefix="WAN"))
+    return run_wan(_config("wan", WanConfig, argv, prefix="WAN"))
 
 
-COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
-    "demo": _demo,
-    "run": _run,
-    "compare": _compare,
-    "table": _table,
-    "replay": _replay,
-    "report": _report,
-    "dataset": _dataset,
-    "export": _export,
-    "wan": _wan,
+def _parser(name: str, operands: str = "") -> CommandParser:
+    about = COMMANDS[name].about
+    return CommandParser(
+        prog=f"loadgen {name}", description=f"{about[0].upper()}{about[1:]}.", operands=operands
+    )
+
+
+def _config(name: str, cls: type[C], argv: Sequence[str], prefix: str = PREFIX) -> C:
+    """The settings of a command that has flags only."""
+    parser = _parser(name)
+    add_flags(parser, cls, prefix)
+    return resolve(cls, parser.parse_args(argv), environ=os.environ, prefix=prefix)
+
+
+def _file_and_config(name: str, cls: type[C], argv: Sequence[str]) -> tuple[Path, C]:
+    """The file and the settings of a command that reads one file of measured times."""
+    parser = _parser(name, "TRACE")
+    help = "trace.jsonl of a run, or a CSV file with the columns size,onboard_s,cloud_s"
+    parser.add_argument("trace", type=Path, metavar="TRACE", help=help)
+    add_flags(parser, cls, PREFIX)
+    flags = parser.parse_args(argv)
+    return flags.trace, resolve(cls, flags, environ=os.environ, prefix=PREFIX)
+
+
+def _find_modules_here() -> None:
+    """Let the task of a scenario be in a module of the current folder, as `python -m` does."""
+    sys.path.insert(0, str(Path.cwd()))
+
+
+COMMANDS = {
+    "demo": Command("make 350 plans on a real map, with three processes on loopback, and Table II", _demo),
+    "run": Command("play a scenario, and judge its checks", _run),
+    "compare": Command("play scenarios with several policies and seeds, and compare the policies", _compare),
+    "table": Command("make Table II of the paper from a trace or CSV file", _table),
+    "replay": Command("show what each policy would have done with the tasks of a trace or CSV file", _replay),
+    "report": Command("make an HTML page and PNG charts of a run", _report),
+    "dataset": Command(
+        "measure the plans of a scenario on both sites, and write them as a CSV file", _dataset
+    ),
+    "export": Command("write the tasks of a trace that ran on both sites as a CSV file", _export),
+    "wan": Command("relay between robot and cloud, with delay, jitter, loss, outages and other faults", _wan),
 }
 
 if __name__ == "__main__":

@@ -1,4 +1,7 @@
-"""`robot-client`: a simulated robot that plans on a real map, or calls of a task; where its policy says."""
+"""`robot-client`: its commands, and the parts that they are built from.
+
+What a command does is in `simulated` (drive, call), `check` and `common.security.keys`.
+"""
 
 import gc
 import os
@@ -6,127 +9,167 @@ import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
-from offboard.common.config import as_dict, load, run_command
+from offboard.common.command_line import Command, load, run_commands
+from offboard.common.config import as_dict
 from offboard.common.errors import ConfigError, OffloadError
-from offboard.robot_client.simulated.config import RobotConfig
+from offboard.robot_client.simulated.config import CallConfig, DriveConfig, RobotConfig
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, PORT_MAX
 
 if TYPE_CHECKING:
+    from offboard.robot_client.offloader import Offloader
     from offboard.robot_client.records.lines import Lines
     from offboard.robot_client.records.trace import Record
+    from offboard.robot_client.simulated.answers import Answers
+    from offboard.robot_client.simulated.work import Work
+
+C = TypeVar("C", bound=RobotConfig)
+Observer = Callable[["Record"], None]
+
+PREFIX = "ROBOT"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    arguments = sys.argv[1:] if argv is None else argv
-    command = _make_keys if arguments[:1] == ["keys"] else _run
-    return run_command("robot-client", lambda: command(arguments))
+    about = "Runs tasks onboard or in the cloud, wherever they finish first."
+    return run_commands("robot-client", about, COMMANDS, sys.argv[1:] if argv is None else argv)
+
+
+def _drive(argv: Sequence[str]) -> int:
+    about = "Drive a simulated robot on a map. Each of its paths is planned onboard or in the cloud."
+    return _run(_load(DriveConfig, argv, "drive", about))
+
+
+def _call(argv: Sequence[str]) -> int:
+    about = (
+        "Call a task with numbers, one after the other or at a rate. Each call runs onboard or in the cloud."
+    )
+    config = _load(CallConfig, argv, "call", about)
+    _find_modules_here()
+    return _run(config)
 
 
 def _make_keys(argv: Sequence[str]) -> int:
     from offboard.common.security.keys import ROBOT, run_keys
 
-    run_keys(ROBOT, argv[1:], prog="robot-client keys", prefix="ROBOT_KEYS", environ=os.environ)
+    run_keys(ROBOT, argv, prog="robot-client keys", prefix="ROBOT_KEYS", environ=os.environ)
     return 0
 
 
-def _run(argv: Sequence[str]) -> int:
-    config = load(
-        RobotConfig,
-        argv,
-        prog="robot-client",
-        description="Drive a simulated robot over a map, or call a task; each runs onboard or in the cloud. "
-        "`robot-client keys` makes its keys.",
-        environ=os.environ,
-        prefix="ROBOT",
-    )
+def _load(cls: type[C], argv: Sequence[str], command: str, about: str) -> C:
+    prog = f"robot-client {command}"
+    config = load(cls, argv, prog=prog, description=about, environ=os.environ, prefix=PREFIX)
     import logging  # not for --help
 
     logging.basicConfig(level=config.log.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    logging.getLogger("offboard.robot_client").info("config %s", as_dict(config))
+    logging.getLogger("offboard.robot_client").info("settings: %s", as_dict(config))
     signal.signal(signal.SIGTERM, _interrupt)
-    return _drive(config)
+    return config
 
 
-def _drive(config: RobotConfig) -> int:
-    # Loaded after the flags are read: --help answers without compiling anything.
-    from offboard.robot_client.offloader import Offloader
-    from offboard.robot_client.records.trace import Trace, alone_path, reference_path
+def _find_modules_here() -> None:
+    """Let modules in the current folder be imported, as `python -m` does."""
+    sys.path.insert(0, str(Path.cwd()))
+
+
+def _run(config: RobotConfig) -> int:
+    """Run the tasks, then measure those of --alone."""
+    # These are imported after the flags are read, so that --help compiles nothing.
+    from offboard.robot_client.records.trace import Trace, alone_path
+    from offboard.robot_client.simulated.alone import measure_alone
     from offboard.robot_client.simulated.answers import Answers
-    from offboard.robot_client.simulated.drive import Drive, OwnRecord
-    from offboard.robot_client.simulated.references import References
-    from offboard.robot_client.simulated.task_source import make_work
+    from offboard.robot_client.simulated.work import make_work
 
-    if config.task is not None:
-        sys.path.insert(0, str(Path.cwd()))  # as `python -m` does, so that --task finds the user's modules
-    own = OwnRecord()
-    connect = partial(Offloader.connect, config.cloud, timeout_s=config.timeout_s, keys=config.keys)
     answers = Answers(config.answers) if config.answers else None
-    if answers and answers.done and config.map and not config.jump:
+    if answers and answers.done and isinstance(config, DriveConfig) and not config.jump:
         raise ConfigError(
-            f"--answers: {answers.path} holds {len(answers.done)} answers; going on needs --jump"
+            f"--answers: {answers.path} holds {len(answers.done)} answers; going on after them needs --jump"
         )
     trace = Trace(config.trace) if config.trace else None
     alone = Trace(alone_path(config.trace)) if config.trace and config.alone else None
-    files: list[Answers | Lines] = [file for file in (answers, trace, alone) if file]
-    observers: list[Callable[[Record], None]] = [own, *([trace.write] if trace else []), *_metrics(config)]
+    files: list[Answers | Lines] = [file for file in (answers, trace) if file]
     try:
+        observers: list[Observer] = [*([trace.write] if trace else []), *_metrics(config)]
         work = make_work(config)
-        with ExitStack() as stack:
-            offload = stack.enter_context(
-                connect(
-                    sites=config.sites(),
-                    policy=config.policy,
-                    predictor=config.predictor,
-                    window=config.window,
-                    seed=config.seed,
-                    objective=config.goal(),
-                    energy=config.energy(),
-                    allowance=config.allowance(),
-                    memory=config.memory,
-                    observers=observers,
-                )
-            )
-            again, references = None, None
-            if config.trace and config.reference:
-                again = stack.enter_context(connect(sites=config.sites()))
-                sites = [ONBOARD, CLOUD, *config.sites()]
-                path, every = reference_path(config.trace), config.reference
-                references = References(path, again, sites, every=every, tasks=config.tasks, seed=config.seed)
-                files.append(references)
-            for file in files:
-                if file is not alone:  # closed before the sites are: what is given up then has no record
-                    stack.callback(file.close)
-            drive = Drive(config, work, offload, own, print, answers=answers, references=references)
-            with connect(sites=config.sites()) as unseen:
-                absent = unseen.wait_for_sites(work.function, config.connect_s)
-                drive.warm(unseen)
-            absent = absent or offload.wait_for_sites(work.function, config.connect_s)
-            if again:
-                absent = absent or again.wait_for_sites(work.function, config.connect_s)
-                drive.warm(again)
-            _say_absent("starting", absent)
-            gc.collect()
-            gc.freeze()  # what is there before the first task stays: no collection looks at it again
-            drive.run()
+        _run_tasks(config, work, answers, observers=observers, files=files)
         if alone:
-            # An offloader of its own: what the run learnt, wrote and counted is of the run alone.
-            with connect(observers=[alone.write]) as offload:
-                _say_absent("measuring", offload.wait_for_sites(work.function, config.connect_s))
-                drive.run_alone(offload)
+            # With its own offloader: what the run learns, records and counts is about the run only.
+            with _connect(config, observers=[alone.write]) as offload:
+                _warn_of_absent("measuring", offload.wait_for_sites(work.function, config.connect_s))
+                measure_alone(config, work, offload, print)
     finally:
+        files += [alone] if alone else []
         for file in files:
             file.close()
     for file in files:
         if file.lost:
-            raise OffloadError(f"{file.lost} tasks are not in {file.path}")
+            raise OffloadError(f"{file.lost} tasks could not be written to {file.path}")
     return 0
 
 
-def _say_absent(doing: str, absent: Mapping[str, str]) -> None:
+def _run_tasks(
+    config: RobotConfig,
+    work: "Work",
+    answers: "Answers | None",
+    *,
+    observers: Sequence[Observer],
+    files: "list[Answers | Lines]",
+) -> None:
+    """Run the tasks of `work`, then close `files`, to which the file of --reference is added."""
+    from offboard.robot_client.records.trace import reference_path
+    from offboard.robot_client.simulated.references import References
+    from offboard.robot_client.simulated.run import OwnRecord, Run
+
+    own, sites = OwnRecord(), config.sites()
+    with ExitStack() as stack:
+        offload = stack.enter_context(
+            _connect(
+                config,
+                sites=sites,
+                policy=config.policy,
+                predictor=config.predictor,
+                window=config.window,
+                seed=config.seed,
+                objective=config.goal(),
+                energy=config.energy(),
+                allowance=config.allowance(),
+                memory=config.memory,
+                observers=[own, *observers],
+            )
+        )
+        again, references = None, None
+        if config.trace and config.reference:
+            again = stack.enter_context(_connect(config, sites=sites))
+            path, names = reference_path(config.trace), [ONBOARD, CLOUD, *sites]
+            references = References(
+                path, again, names, every=config.reference, tasks=config.tasks, seed=config.seed
+            )
+            files.append(references)
+        for file in files:
+            # Before the sites are closed: tasks that are given up by then have no record.
+            stack.callback(file.close)
+        run = Run(config, work, offload, own=own, say=print, answers=answers, references=references)
+        with _connect(config, sites=sites) as unseen:
+            absent = unseen.wait_for_sites(work.function, config.connect_s)
+            run.warm(unseen)
+        absent = absent or offload.wait_for_sites(work.function, config.connect_s)
+        if again:
+            absent = absent or again.wait_for_sites(work.function, config.connect_s)
+            run.warm(again)
+        _warn_of_absent("starting", absent)
+        gc.collect()
+        gc.freeze()  # so that collections during the run do not look at what exists now
+        run.run()
+
+
+def _connect(config: RobotConfig, **options: Any) -> "Offloader":
+    from offboard.robot_client.offloader import Offloader
+
+    return Offloader.connect(config.cloud, timeout_s=config.timeout_s, keys=config.keys, **options)
+
+
+def _warn_of_absent(doing: str, absent: Mapping[str, str]) -> None:
     import logging
 
     for site, why in absent.items():
@@ -135,7 +178,8 @@ def _say_absent(doing: str, absent: Mapping[str, str]) -> None:
         )
 
 
-def _metrics(config: RobotConfig) -> "list[Callable[[Record], None]]":
+def _metrics(config: RobotConfig) -> list[Observer]:
+    """The observer that serves metrics, if an address is given for it."""
     if config.metrics is None:
         return []
     from prometheus_client import CollectorRegistry
@@ -156,6 +200,12 @@ def _metrics(config: RobotConfig) -> "list[Callable[[Record], None]]":
 def _interrupt(*_: object) -> NoReturn:
     raise KeyboardInterrupt
 
+
+COMMANDS = {
+    "drive": Command("drive a simulated robot on a map", _drive),
+    "call": Command("call a task of yours with numbers", _call),
+    "keys": Command("make the keys of this robot", _make_keys),
+}
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -14,7 +14,7 @@ from typing import Any
 
 WAN = """
 import sys
-from offboard.common.config import load, run_command
+from offboard.common.command_line import load, run_command
 from offboard.loadgen.relay.wan import WanConfig, run_wan
 settings = dict(prog="wan", description="", environ={}, prefix="WAN")
 sys.exit(run_command("wan", lambda: run_wan(load(WanConfig, sys.argv[1:], **settings))))

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from offboard.common.config import INTERRUPTED_EXIT
+from offboard.common.command_line import INTERRUPTED_EXIT
 from offboard.loadgen.testbed.testbed import Setup, Testbed
 from offboard.robot_client.records.trace import read
 
@@ -50,7 +50,7 @@ def setups(out: Path) -> dict[str, Setup]:
     common = {"map": MAP, "resolution": 0.05, "window": 2, "timeout": 0.5, "connect": 20.0}
 
     def robot(name: str, **flags: Any) -> Setup:
-        return Setup(common | flags | {"trace": out / f"{name}.jsonl"})
+        return Setup(common | flags | {"trace": out / f"{name}.jsonl"}, command="drive")
 
     return {
         "cloud": Setup(cpus=1.0),

@@ -16,7 +16,8 @@ from pathlib import Path
 import zmq
 from zmq.utils import z85
 
-from offboard.common.config import CommandParser, add_flags, resolve, setting
+from offboard.common.command_line import CommandParser, add_flags
+from offboard.common.config import resolve, setting
 from offboard.common.errors import ConfigError
 from offboard.common.security.guard import PRIVATE_BYTES_MAX, read_private
 

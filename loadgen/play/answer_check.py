@@ -16,7 +16,7 @@ from offboard.common.planning.planner import Plan, scan_hits
 from offboard.loadgen.scenario.outcome import Answered
 from offboard.loadgen.scenario.scenario import Workload
 from offboard.robot_client.simulated import answers
-from offboard.robot_client.simulated.task_source import Work, make_work
+from offboard.robot_client.simulated.work import Work, make_work
 
 COST_SHARE = 1e-6  # two sums of the same steps differ by no more
 

@@ -100,7 +100,8 @@ def _conditions(scenario: Scenario, testbed: str) -> str:
 def _asked(workload: Workload) -> str:
     if workload.map is None:
         return f"task {workload.task}, sizes {','.join(workload.sizes)}"
-    return f"{workload.map.name} at {workload.resolution:g} m"
+    cells = "" if workload.resolution is None else f" at {workload.resolution:g} m"
+    return f"{workload.map.name}{cells}"
 
 
 def _settings(scenario: Scenario) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import Any, Self
 
 from offboard.common.errors import ConfigError, OffloadError
 from offboard.loadgen.scenario.outcome import Reading
-from offboard.loadgen.scenario.scenario import Scenario
+from offboard.loadgen.scenario.scenario import Scenario, Workload
 from offboard.loadgen.scenario.timeline import ON_A_PART, Event, Timeline, absent_at_first
 from offboard.loadgen.table.disturbance import WAYS
 from offboard.loadgen.testbed.part import USAGE_EXIT
@@ -73,30 +73,29 @@ def setups(scenario: Scenario, out: Path, *, shown: bool = True) -> dict[str, Se
     }
     for files in Files.of(scenario, out):
         first = files.robot == ROBOT
-        parts[files.robot] = Setup(_robot_flags(scenario, files, first), scenario.robot.cpus, shown and first)
+        parts[files.robot] = Setup(
+            _robot_flags(scenario, files, first),
+            scenario.robot.cpus,
+            shown=shown and first,
+            command="call" if workload.map is None else "drive",
+        )
     return parts
 
 
 def _robot_flags(scenario: Scenario, files: Files, first: bool) -> Mapping[str, Any]:
-    """Flags of `robot-client`; only the first robot measures beside its run."""
+    """Flags of `robot-client drive` or `call`; only the first robot measures --alone and --reference."""
     workload, robot = scenario.workload, scenario.robot
     flags = {
-        "map": workload.map,
-        "task": workload.task,
+        **(_map_flags(workload) if workload.map else {"task": workload.task}),
         "sizes": _sizes(workload.sizes),
-        "resolution": workload.resolution,
-        "planner": workload.planner,
         "tasks": workload.tasks,
         "arrivals": workload.arrivals,
         "rate": workload.rate,
         "burst": workload.burst,
         "in_flight": workload.in_flight,
-        "jump": workload.jump if workload.map else None,
         "measure": workload.measure,
         "alone": workload.alone if first else 0,
         "reference": workload.reference if first else 0,
-        "obstacles": workload.obstacles,
-        "radius": workload.radius_m,
         "policy": robot.policy,
         "predictor": robot.predictor,
         "window": robot.window,
@@ -106,6 +105,17 @@ def _robot_flags(scenario: Scenario, files: Files, first: bool) -> Mapping[str, 
         "answers": files.answers,
     }
     return {name: value for name, value in flags.items() if value is not None}
+
+
+def _map_flags(workload: Workload) -> Mapping[str, Any]:
+    return {
+        "map": workload.map,
+        "resolution": workload.resolution,
+        "planner": workload.planner,
+        "jump": workload.jump,
+        "obstacles": workload.obstacles,
+        "radius": workload.radius_m,
+    }
 
 
 def _sizes(texts: tuple[str, ...]) -> str | Path | None:

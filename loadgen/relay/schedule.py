@@ -10,8 +10,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Protocol
 
-from offboard.common.config import line_of, read_toml, unknown
 from offboard.common.errors import ConfigError, DataError
+from offboard.common.toml_file import line_of, read_toml, unknown
 from offboard.loadgen.relay.link.link import Link, LinkConditions
 
 EVENTS_MAX = 10_000

@@ -1,6 +1,6 @@
-"""The command `loadgen wan`: the relay between robot and cloud, its settings and its HTTP side together.
+"""`loadgen wan`: its settings, and the relay and the HTTP servers that it runs.
 
-The sockets are in `relay.py`, the HTTP side is `control.py`.
+The relay is in `tcp.relay`, its HTTP side in `http_control`.
 """
 
 import asyncio
@@ -22,40 +22,66 @@ from offboard.loadgen.relay.tcp.relay import PreciseSelector, Relay
 from offboard.loadgen.relay.toxiproxy.proxies import Proxies, RelaySettings
 from offboard.loadgen.relay.toxiproxy.toxiproxy_api import toxiproxy_app
 
-END_S = 1.0  # for the connections to end when the relay does
+END_S = 1.0  # time for the connections to end when the relay stops
+ADDRESSES, ACCESS, RUN, LIMITS = "addresses", "access", "run", "limits"
 
 
-@dataclass(frozen=True, slots=True)
-class WanConfig(LinkFlags):
-    """Settings of `loadgen wan`: the link at start, and everything else."""
+@dataclass(frozen=True)
+class AddressFlags:
+    """Where the relay listens, and who may change it."""
 
-    to: str = setting("127.0.0.1:5555", "where connections are relayed to", metavar="HOST:PORT")
-    listen: str = setting("127.0.0.1:5556", "where the robot connects", metavar="HOST:PORT")
+    to: str = setting("127.0.0.1:5555", "address of the server", group=ADDRESSES, metavar="HOST:PORT")
+    listen: str = setting(
+        "127.0.0.1:5556", "address where robots connect", group=ADDRESSES, metavar="HOST:PORT"
+    )
     http: str = setting(
         "127.0.0.1:8001",
-        "where the link is read and changed; beyond loopback --token-file is needed",
+        "address of the HTTP API that reads and changes the link; beyond loopback it needs --token-file",
+        group=ADDRESSES,
+        metavar="HOST:PORT",
+    )
+    toxiproxy: str | None = setting(
+        None,
+        "address that speaks the API of Toxiproxy, whose own port is 8474; loopback only",
+        group=ADDRESSES,
+        rare=True,
         metavar="HOST:PORT",
     )
     token_file: Path | None = setting(
-        None, "file with the bearer token that --http asks for, but for /health"
+        None, "file with the bearer token that --http needs, except for /health", group=ACCESS
     )
     insecure: bool = setting(
-        False, "without a token let anybody beyond loopback change the link; warns every minute"
+        False,
+        "let anybody beyond loopback change the link without a token; logs a warning every minute",
+        group=ACCESS,
+        rare=True,
     )
+
+
+# The help shows the fields of the last base class first.
+@dataclass(frozen=True)
+class WanConfig(LinkFlags, AddressFlags):
+    """The settings of `loadgen wan`."""
+
     schedule: Path | None = setting(
-        None, "TOML file of changes of the link: [[event]] at_s = 5.0, loss = 0.1"
+        None, "TOML file of changes of the link, such as [[event]] at_s = 5.0, loss = 0.1", group=RUN
     )
-    truth: Path | None = setting(None, "file to write what the link did to each chunk, as JSON Lines")
-    seed: int = setting(0, "seed of jitter and loss")
-    connections_max: int = setting(256, "connections at a time; further ones are closed", minimum=1)
-    toxiproxy: str | None = setting(
-        None,
-        "where Toxiproxy's API makes further relays for its clients; loopback only; their own port is 8474",
-        metavar="HOST:PORT",
+    truth: Path | None = setting(
+        None, "write what the link did to each chunk to this file, as JSON Lines", group=RUN
+    )
+    seed: int = setting(0, "seed of jitter and loss", group=RUN)
+    connections_max: int = setting(
+        256,
+        "connections at the same time; further ones are closed",
+        group=LIMITS,
+        rare=True,
+        minimum=1,
     )
     buffer_bytes: int = setting(
         8 << 20,
-        "bytes under way in one direction of a connection; then the sender waits",
+        "bytes on their way in one direction of a connection; with more, the sender has to wait",
+        group=LIMITS,
+        rare=True,
         minimum=CHUNK_BYTES,
     )
 
@@ -66,7 +92,7 @@ class WanConfig(LinkFlags):
         if self.toxiproxy is not None and not on_loopback(address("--toxiproxy", self.toxiproxy)[0]):
             raise ConfigError(
                 f"--toxiproxy: {self.toxiproxy!r} is not on loopback ({LOOPBACK}):"
-                " whoever reaches it commands the relay"
+                " anybody who reaches it can control the relay"
             )
         for way in () if self.insecure else self.open_ways:
             raise ConfigError(f"{way}: {OPEN_REMEDY}")
@@ -77,14 +103,14 @@ class WanConfig(LinkFlags):
 
     @property
     def open_ways(self) -> tuple[str, ...]:
-        """Why anybody may command the relay who reaches this computer."""
+        """The flags that let anybody who reaches this computer control the relay."""
         if self.token_file is not None or self.http_on_loopback:
             return ()
         return (f"--http: {self.http} is beyond loopback and without --token-file",)
 
 
 def run_wan(config: WanConfig) -> int:
-    """Relay until SIGTERM or SIGINT."""
+    """Relay until SIGTERM or Ctrl-C."""
     with asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(PreciseSelector())) as runner:
         runner.run(_serve(config))
     return 0

@@ -5,8 +5,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from offboard.common.config import check, from_table, line_of, setting, unknown
+from offboard.common.config import check, from_table, setting
 from offboard.common.errors import ConfigError, DataError
+from offboard.common.toml_file import line_of, unknown
 from offboard.loadgen.scenario.outcome import FIGURES, Outcome
 
 CHECKS_MAX = 100

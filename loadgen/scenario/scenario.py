@@ -9,9 +9,10 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from offboard.common.config import check, from_table, read_toml, setting, unknown_key
+from offboard.common.config import check, from_table, setting
 from offboard.common.errors import ConfigError, DataError
 from offboard.common.planning.planner_names import DIJKSTRA, PLANNERS
+from offboard.common.toml_file import read_toml, unknown_key
 from offboard.loadgen.relay.link.link_settings import LinkFlags
 from offboard.loadgen.scenario.check import Check, check_computable, parse_checks
 from offboard.loadgen.scenario.outcome import FIGURES
@@ -20,7 +21,7 @@ from offboard.loadgen.scenario.timeline import AT_TASK_MAX, Event, parse_events
 from offboard.loadgen.testbed.cpu_quota import CPUS_MAX, CPUS_MIN
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN
 from offboard.robot_client import policies, predictors
-from offboard.robot_client.simulated.config import RobotConfig
+from offboard.robot_client.simulated.config import CallConfig, DriveConfig, RobotConfig
 
 SHIPPED = Path(__file__).parents[1] / "scenarios"
 ROBOTS_MAX = 64
@@ -35,7 +36,9 @@ class Workload:
 
     map: Path | None = setting(None, "map.yaml or MovingAI .map to plan on")
     task: str | None = setting(None, "MODULE:FUNCTION in place of a map: a task of one number, its size")
-    resolution: float = setting(0.025, "metres a cell to plan at", minimum=0.001)
+    resolution: float | None = setting(
+        None, "metres a cell to plan at, unless that of the map", minimum=0.001
+    )
     planner: str = setting(DIJKSTRA, "how paths are searched", choices=PLANNERS)
     tasks: int = setting(200, "tasks of each robot", minimum=1, maximum=AT_TASK_MAX)
     sizes: tuple[str, ...] = setting((), "input sizes, as `robot-client --sizes` takes them")
@@ -67,8 +70,9 @@ class Workload:
 
     def robot(self, seed: int) -> RobotConfig:
         """The settings of a robot that asks for this; ConfigError where they contradict each other."""
-        shared = {f.name for f in fields(RobotConfig)} & {f.name for f in fields(self)}
-        return RobotConfig(
+        config = CallConfig if self.map is None else DriveConfig
+        shared = {f.name for f in fields(config)} & {f.name for f in fields(self)}
+        return config(
             **{name: getattr(self, name) for name in shared},
             seed=seed,
             cloud="tcp://relay:1",

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from offboard.common.config import line_of, unknown
 from offboard.common.errors import ConfigError, DataError
+from offboard.common.toml_file import line_of, unknown
 from offboard.loadgen.relay.link.link import Link
 from offboard.loadgen.testbed.cpu_quota import CPUS_MAX, CPUS_MIN
 from offboard.loadgen.testbed.testbed import WAN, Testbed

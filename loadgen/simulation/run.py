@@ -18,7 +18,7 @@ from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.offloader import BOTH, Offloader
 from offboard.robot_client.records.trace import Record, as_dict
-from offboard.robot_client.simulated.drive import OwnRecord
+from offboard.robot_client.simulated.run import OwnRecord
 from offboard.robot_client.simulated.workload import CLOSED, due_instants
 from offboard.robot_client.sites import heartbeat
 from offboard.robot_client.sites.runner import CLOUD

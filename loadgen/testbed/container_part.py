@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from offboard.common.config import BROKEN_PIPE_EXIT, INTERRUPTED_EXIT
+from offboard.common.command_line import BROKEN_PIPE_EXIT, INTERRUPTED_EXIT
 from offboard.common.errors import ConfigError
 from offboard.loadgen.testbed.cpu_quota import CGROUP_PERIOD_S, CGROUP_QUOTA_S_MIN, check_cpus
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, Usage

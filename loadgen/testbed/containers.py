@@ -268,7 +268,7 @@ class DockerTestbed:
             options["networking_config"] = {self._networks[first].name: endpoint}
         container = self._client.containers.create(
             kind.image,
-            [*kind.command, *as_flags(flags)],
+            [*setup.command.split(), *kind.command, *as_flags(flags)],
             name=f"{PREFIX}-{self.run}-{name}",
             labels=self._labels(),
             environment={PART: name},

@@ -62,7 +62,8 @@ class LocalTestbed:
                 flags, http, ready = {"listen": relay, "to": cloud, "http": wan_http}, wan_http, "/health"
             else:
                 flags, http, ready = {"cloud": self.endpoint}, None, ""
-            command = (*commands[name.partition("-")[0]], *as_flags({**flags, **setup.flags}))
+            start = commands[name.partition("-")[0]]
+            command = (*start, *setup.command.split(), *as_flags({**flags, **setup.flags}))
             self.parts[name] = Part(name, command, http, ready, setup.cpus, setup.shown)
         self._relay = RelayClient(wan_http)
         self._children: dict[str, Child] = {}

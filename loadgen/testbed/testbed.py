@@ -16,6 +16,8 @@ PART = "OFFBOARD_PART"  # in the environment of each part: its name
 class Setup:
     """How a part is started: flags of its command by name, and the CPUs that it is held to.
 
+    `command` is the sub-command that the flags belong to: `drive` or `call` of a robot.
+
     Where it listens, and whom it calls, is the testbed's. A Path among the flags is a file that the testbed
     lets the part see: to write where it is under the run's folder, else to read, with its folder. The output
     of a `shown` part goes where ours does, that of others to logs/NAME.log.
@@ -24,6 +26,7 @@ class Setup:
     flags: Mapping[str, Any] = field(default_factory=dict)
     cpus: float | None = None
     shown: bool = False
+    command: str = ""
 
 
 @dataclass(frozen=True, slots=True)

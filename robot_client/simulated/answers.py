@@ -1,4 +1,7 @@
-"""The answers file: one JSON line a task, what was answered and when; a run that died goes on from it."""
+"""The answers file: one JSON line per task, with its answer and its times; a run that died continues from it.
+
+What is asked, and when, is decided in `run`.
+"""
 
 import hashlib
 import json
@@ -16,24 +19,24 @@ from offboard.common.wire.values import encode
 from offboard.robot_client.records import lines
 from offboard.robot_client.records.lines import VERSION, Lines
 
-if TYPE_CHECKING:  # the planner is compiled where it is imported, and a robot may run other tasks
+if TYPE_CHECKING:  # importing the planner compiles it, which a robot without a map does not need
     from offboard.common.planning.planner import Plan
 
 BEGIN_S = 0.25
-# (row, col) of each step; its digit counts eighths of a turn from along the row (the map's x) towards
-# higher rows (the map's y).
+# (row, col) of each step. The index of a step is its digit in the file: eighths of a turn, from the direction
+# of the row (x of the map) towards higher rows (y of the map).
 STEPS = ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1))
 _OFFSETS = np.array(STEPS, np.int32)
-_NINE = np.array((3, 1), np.int32)  # a step to a neighbour times this is a number from -4 to 4: an index
+_NINE = np.array((3, 1), np.int32)  # dot product with a step to a neighbour: -4 to 4, used as an index
 _DIGITS = np.full(9, ord("?"), np.uint8)
 _DIGITS[_OFFSETS @ _NINE] = [ord(str(digit)) for digit in range(len(STEPS))]
-STRAY = "the path steps to a cell that is no neighbour"
+STRAY = "the path steps to a cell that is not a neighbour"
 _FIELDS = ("i", "id", "due_s", "began_s", "ended_s", "error", "answer")
 
 
 @dataclass(frozen=True, slots=True)
 class Answered:
-    """Task `i` of the workload: `id` is that of its record; times in s since the first task was due."""
+    """The answer to task `i`. `id` is the id of its record; times are in s after the first task was due."""
 
     i: int
     id: str | None
@@ -45,9 +48,9 @@ class Answered:
 
 
 class Answers:
-    """The answers of one run in `path`; `done` are the tasks that an earlier run has answered there.
+    """The answers of one run in the file `path`; `done` are the tasks that an earlier run answered there.
 
-    A new file is made by `begin`: whoever waits for the run to begin waits for the file.
+    `begin` creates the file: a bench that waits for the run to begin can wait for the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -64,11 +67,11 @@ class Answers:
 
     @property
     def lost(self) -> int:
-        """Answers that could not be written."""
+        """Number of answers that could not be written."""
         return self._lines.lost if self._lines else 0
 
     def begin(self) -> None:
-        """The first task is due BEGIN_S after a new file is there: whoever waits for it has time to act."""
+        """Create the file, BEGIN_S before the first task is due, which gives a waiting bench time to act."""
         if self._lines is None:
             new = not self.path.exists()
             self._lines = Lines("answers", self.path)
@@ -84,15 +87,15 @@ class Answers:
 
 
 def read(path: Path) -> Iterator[dict[str, Any]]:
-    """Each line's fields, as `trace.read`; `i` is a whole number from 0."""
+    """The fields of each line, as `trace.read` returns them; `i` is checked to be a whole number from 0."""
     for fields in lines.read(path, _FIELDS):
         if type(fields["i"]) is not int or fields["i"] < 0:
-            raise DataError(f"{path}: i = {json.dumps(fields['i'])} is not the number of a task")
+            raise DataError(f"{path}: i = {json.dumps(fields['i'])} is not a task number")
         yield fields
 
 
 def of_plan(plan: "Plan") -> dict[str, Any]:
-    """A plan as its line holds it; every cell of the path can be had again by `cells_of`."""
+    """A plan as a line of the file holds it; `cells_of` restores every cell of the path."""
     start = [int(place) for place in plan.cells[0]] if len(plan.cells) else None
     return {
         "status": plan.status,
@@ -104,7 +107,7 @@ def of_plan(plan: "Plan") -> dict[str, Any]:
 
 
 def of_value(value: Any, types: Sequence[type]) -> dict[str, Any]:
-    """Any other result: the SHA-256 of the bytes that would cross the wire, arrays included."""
+    """Any other result as a line holds it: the SHA-256 of its bytes on the wire, arrays included."""
     digest = hashlib.sha256()
     for frame in encode(value, types).frames:
         digest.update(frame)
@@ -112,12 +115,12 @@ def of_value(value: Any, types: Sequence[type]) -> dict[str, Any]:
 
 
 def cells_of(answer: Mapping[str, Any]) -> NDArray[np.int32]:
-    """The cells (row, col) of a plan's path, K x 2, from its start and steps."""
+    """The cells (row, col) of the path of a plan, K x 2, from its start and its steps."""
     if answer["start"] is None:
         return np.zeros((0, 2), np.int32)
     digits = np.frombuffer(answer["steps"].encode(), np.uint8) - ord("0")
     if (digits >= len(STEPS)).any():
-        raise DataError(f"steps {answer['steps']!r:.80} hold another sign than 0 to {len(STEPS) - 1}")
+        raise DataError(f"steps {answer['steps']!r:.80} contain a character other than 0 to {len(STEPS) - 1}")
     return np.concatenate((np.array([answer["start"]], np.int32), _OFFSETS[digits])).cumsum(0, np.int32)
 
 

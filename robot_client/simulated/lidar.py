@@ -1,6 +1,7 @@
-"""A simulated LiDAR: beams cast through an occupancy grid, exact to the surface of the cell they meet.
+"""A simulated LiDAR: casts beams through an occupancy grid, up to the surface of the first occupied cell.
 
-Unknown cells are passed through, as nothing is known to be there; a beam that leaves the map returns nothing.
+Beams pass through unknown cells, and a beam that leaves the map returns infinity. What a scan means for a
+plan is decided in `planner`.
 """
 
 import math
@@ -18,7 +19,7 @@ RANGE_MAX_M = 10.0
 
 
 def cast_scan(truth: GridMap, pose: Pose, *, beams: int = BEAMS, range_max: float = RANGE_MAX_M) -> Scan:
-    """One turn of beams from `pose`, the first straight ahead; infinity where a beam met nothing."""
+    """One turn of beams from `pose`, the first one straight ahead; infinity if a beam meets nothing."""
     row, col = truth.position(pose.x, pose.y)
     increment = 2 * math.pi / beams
     angles = pose.yaw - truth.origin[2] + increment * np.arange(beams)
@@ -35,7 +36,7 @@ def cast(
     to_col: NDArray[np.float64],
     reach: float,
 ) -> NDArray[np.float64]:
-    """Length of each beam in cells until it enters an occupied one, visiting every cell on its way."""
+    """The length of each beam in cells, up to the first occupied cell; visits every cell on the way."""
     lengths = np.full(to_row.size, np.inf)
     height, width = cells.shape
     for k in range(to_row.size):
@@ -56,7 +57,7 @@ def cast(
 
 @kernel
 def _axis(start: float, direction: float) -> Any:
-    """Along one axis: the cell step, the length to the first cell border, the length between borders."""
+    """Along one axis: step from cell to cell, length to the first cell border, length between borders."""
     if direction == 0.0:
         return 0, np.inf, np.inf
     border = math.floor(start) + (1 if direction > 0 else 0)

@@ -1,6 +1,6 @@
-"""References: a task of the run again on each site alone, to know what the better site would have taken.
+"""References: a task of the run is run again on each site alone, to know how long the better site takes.
 
-An offloader of their own runs them: the run learns nothing of them, and they nothing of the run.
+They have their own offloader, so that they and the run learn nothing from each other.
 """
 
 import contextlib
@@ -19,7 +19,10 @@ _FIELDS = ("i", "waited_s", "used", "chosen", "both", "sites")
 
 
 class References(Lines):
-    """Writes a line for every `every`-th of `tasks`; `sites` are those of `offload`, in turning order."""
+    """Measures every `every`-th of `tasks` tasks and writes one line for each.
+
+    `sites` are the sites of `offload`; their order changes from task to task.
+    """
 
     def __init__(
         self, path: Path, offload: Offloader, sites: Sequence[str], *, every: int, tasks: int, seed: int
@@ -30,7 +33,7 @@ class References(Lines):
         self._orders = orders(tasks // every, seed, sites)
 
     def due(self, number: int) -> bool:
-        """Whether task `number` is one of those."""
+        """Whether task `number` is to be measured."""
         return number % self._every == self._every - 1
 
     def measure(
@@ -42,7 +45,7 @@ class References(Lines):
         waited_s: float,
         record: Record,
     ) -> None:
-        """Run the request again; `record` is of the run, which waited so long for its answer."""
+        """Run the request again on each site; `record` and `waited_s` say how the run itself fared."""
         order = self._orders[number // self._every]
         found = {site: self._alone(site, function, request) for site in order}
         fields = {
@@ -59,8 +62,8 @@ class References(Lines):
     def _alone(
         self, site: str, function: Callable[..., Any], request: Sequence[Any]
     ) -> dict[str, Any] | None:
-        """The execution there; None where the site could not take the task."""
-        with contextlib.suppress(TaskError):  # the task's own failure is in the execution
+        """The execution on the site; None if the site could not take the task."""
+        with contextlib.suppress(TaskError):  # the execution holds the failure of the task
             self._offload(function, *request, where=site)
         record = self._offload.last
         assert record is not None
@@ -71,14 +74,14 @@ class References(Lines):
 
 
 def read(path: Path) -> Iterator[dict[str, Any]]:
-    """Each line's fields, as `trace.read`."""
+    """The fields of each line, as `trace.read` returns them."""
     return lines.read(path, _FIELDS)
 
 
 def orders(count: int, seed: int, ways: Sequence[str]) -> list[tuple[str, ...]]:
-    """An order of `ways` for each of so many tasks; in every `len(ways)` each way is in each place once.
+    """An order of `ways` for each of `count` tasks; in every `len(ways)` tasks, each way has each place once.
 
-    Whatever a run leaves behind for the next one, warm caches or a spent quota, meets all ways alike.
+    One execution may leave warm caches or a spent quota to the next; this way no way gains from it.
     """
     random = Random(seed)
     found: list[tuple[str, ...]] = []

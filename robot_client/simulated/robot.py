@@ -1,6 +1,6 @@
-"""A simulated robot: stands on a map with obstacles that its prior map lacks, asks for paths, drives them.
+"""A simulated robot: it asks for paths on its map, and drives them in a world with more obstacles.
 
-Where its paths are planned is the business of the `Offloader`.
+Where the paths are planned is decided by the offloader.
 """
 
 import math
@@ -18,17 +18,17 @@ from offboard.robot_client.simulated.lidar import BEAMS, RANGE_MAX_M, cast_scan
 OBSTACLE_SIDE_M = (0.3, 1.0)
 LOOK_EVERY_M = 0.5
 TRIES_MAX = 5  # plans for one goal before another is picked
-FAILURES_MAX = 3  # goals in a row without a path before the robot is set down elsewhere
-CANDIDATES = 32  # random cells of which the next goal is one
+FAILURES_MAX = 3  # goals in a row without a path before the robot is put elsewhere
+CANDIDATES = 32  # random cells from which the next goal is chosen
 
 Request = tuple[GridMap, Scan, Pose, Point, float, None, str]
 
 
 class SimulatedRobot:
-    """A robot of `radius_m` on `prior`, in a world with `obstacles` boxes more; all random by `seed`.
+    """A robot on the map `prior`, in a world with `obstacles` more boxes; `seed` decides everything random.
 
-    `truth` is that world; `stops` counts the paths that it could not drive to their end. Wherever a `size`
-    is taken, it is the input size d that the next goal shall have as nearly as the candidates allow.
+    `truth` is that world. `stops` counts the paths that the robot could not drive to their end. Methods with
+    a `size` choose, of the candidates, the next goal whose input size d is nearest to it.
     """
 
     def __init__(
@@ -44,8 +44,8 @@ class SimulatedRobot:
         planner: str = DIJKSTRA,
     ) -> None:
         if radius_m > RADIUS_CELLS_MAX * prior.resolution:
-            allowed = f"at most {RADIUS_CELLS_MAX} cells of {prior.resolution:g} m"
-            raise ConfigError(f"a radius of {radius_m:g} m is not allowed, {allowed}")
+            allowed = f"{RADIUS_CELLS_MAX} cells of {prior.resolution:g} m"
+            raise ConfigError(f"--radius: {radius_m:g} m is too large, the maximum is {allowed}")
         self.prior, self.radius_m, self._planner = prior, radius_m, planner
         self._beams, self._range_max = beams, range_max
         self._random = np.random.default_rng(seed)
@@ -58,13 +58,13 @@ class SimulatedRobot:
         self._pick_goal(size)
 
     def request(self) -> Request:
-        """The arguments of `plan_path`, from where the robot stands; asking twice changes nothing."""
+        """The arguments of `plan_path` from the place of the robot; a second call returns the same."""
         return self.prior, self._scan(), self.pose, self.goal, self.radius_m, None, self._planner
 
     def drive(self, plan: Plan, size: float | None = None) -> NDArray[np.int32]:
-        """Follow the plan, looking again every half metre; stop before what was not there when it was made.
+        """Follow the plan with a new scan every half metre; stop before obstacles that it did not know.
 
-        Returns the cells (row, col) it drove, K x 2.
+        Returns the cells (row, col) that the robot drove, K x 2.
         """
         if plan.status != "NONE":
             self.give_up_goal(size)
@@ -79,19 +79,19 @@ class SimulatedRobot:
         return driven
 
     def jump(self, size: float | None = None) -> None:
-        """Stand at the goal, turned at random, and pick the next one: nothing of it depends on an answer."""
+        """Put the robot at its goal, in a random direction, and pick the next goal; needs no answer."""
         self.pose = Pose(self.goal.x, self.goal.y, float(self._random.uniform(-math.pi, math.pi)))
         self._pick_goal(size)
 
     def give_up_goal(self, size: float | None = None) -> None:
-        """There is no path to the goal: pick another one, from another place if that went on for long."""
+        """Pick another goal, as this one has no path; after FAILURES_MAX of them, another place as well."""
         self._failures += 1
         if self._failures == FAILURES_MAX:
             self._set_down()
         self._pick_goal(size)
 
     def _follow(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Drive cell by cell; those before the first that is not safe."""
+        """Drive up to the first cell that is not safe; return the cells driven."""
         stride = max(1, round(LOOK_EVERY_M / self.prior.resolution))
         for first in range(0, len(cells), stride):
             stretch = cells[first : first + stride]
@@ -102,9 +102,9 @@ class SimulatedRobot:
         return cells
 
     def _safe_length(self, stretch: NDArray[np.int32]) -> int:
-        """How many of the next cells are clear of all that a scan from here sees.
+        """How many of the next cells are clear of everything that a scan from here sees.
 
-        It does not see round a corner: the bumper stops before a cell that is truly occupied.
+        The scan does not see round corners: there the bumper stops the robot before an occupied cell.
         """
         hits = scan_hits(self.prior, self._scan(), self.pose, self.radius_m)
         seen = covered(stretch[:, 0], stretch[:, 1], hits.rows, hits.cols, hits.reach)
@@ -124,10 +124,10 @@ class SimulatedRobot:
         return cast_scan(self.truth, self.pose, beams=self._beams, range_max=self._range_max)
 
     def _free(self, grid: GridMap) -> NDArray[np.int32]:
-        # Row after row: from any other order a draw of a few cells copies them all first.
+        # C order, since drawing a few cells from another order first copies all of them.
         free = np.argwhere(largest_component(passable(grid, self.radius_m))).astype(np.int32, order="C")
         if len(free) < 2:
-            raise ConfigError(f"the map has no room for a robot of radius {self.radius_m} m")
+            raise ConfigError(f"--radius: the map has no room for a robot of radius {self.radius_m:g} m")
         return free
 
     def _set_down(self) -> None:
@@ -136,7 +136,7 @@ class SimulatedRobot:
         self._failures = 0
 
     def _pick_goal(self, size: float | None) -> None:
-        """Of some random cells the one nearest to `size`; without, to a distance drawn evenly."""
+        """Of CANDIDATES cells, pick the one nearest to `size`, or without it to a uniform random distance."""
         points = self.prior.metres(self._random.choice(self._standable, CANDIDATES))
         distances = np.hypot(*(points - (self.pose.x, self.pose.y)).T)
         if size is None:
@@ -152,7 +152,7 @@ class SimulatedRobot:
 
 
 def _with_boxes(prior: GridMap, free: NDArray[np.int32], count: int, random: np.random.Generator) -> GridMap:
-    """The map with `count` occupied boxes centred on free cells."""
+    """The map with `count` boxes on it, centred on free cells."""
     cells = prior.cells.copy()
     for row, col in random.choice(free, count):
         high, wide = np.ceil(random.uniform(*OBSTACLE_SIDE_M, 2) / prior.resolution).astype(int)

@@ -1,4 +1,7 @@
-"""What the robot says of its run at the end, and of each task on the way."""
+"""The lines that a run prints: one for each task as it goes, and the summary at its end.
+
+The records that are summed up come from the offloader.
+"""
 
 import statistics
 import sys
@@ -9,15 +12,14 @@ from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.runner import ONBOARD
 
 PROGRESS_EVERY = 10  # tasks
-LATE_S = 0.01  # a task that begins less late than this began on time
+LATE_S = 0.01  # a task that starts later than this counts as late
 
 
 class Summary:
-    """Keeps two floats a task, in arrays: a long run must not grow.
+    """Sums up a run. It keeps two floats per task, in arrays, because runs may be long.
 
-    `found` is what was got from those that `got` something.
-
-    `due` says that tasks had an instant at which they should begin.
+    `found` is what a good answer brings, such as a path (None: nothing to say). `due` is true if the tasks
+    had instants at which they should start.
     """
 
     def __init__(self, *, found: str | None, due: bool) -> None:
@@ -26,10 +28,12 @@ class Summary:
         self._got = 0
         self._failed = 0
         self._late = array("d")  # seconds after the due instant
-        self._both: list[tuple[float | None, float | None]] = []  # seconds onboard, and of the fastest other
-        self._waited: dict[str, array[float]] = {}  # by the chosen site
+        self._both: list[
+            tuple[float | None, float | None]
+        ] = []  # seconds onboard and on the fastest other site
+        self._waited: dict[str, array[float]] = {}  # seconds by the chosen site
         self._fallbacks = 0
-        self._seconds = 0  # tasks that ran on a second site too
+        self._seconds = 0  # tasks that also ran on a second site
 
     def add(self, record: Record, *, got: bool, late_s: float = 0.0) -> None:
         self._got += got
@@ -45,7 +49,7 @@ class Summary:
             self._fallbacks += len(ran) > 1 and record.decision.second not in ran
 
     def add_failure(self, *, late_s: float = 0.0) -> None:
-        """A task that has no answer."""
+        """Count a task without an answer."""
         self._failed += 1
         self._late.append(late_s)
 
@@ -68,14 +72,14 @@ class Summary:
     def _times(self) -> str:
         waited = [1e3 * seconds for times in self._waited.values() for seconds in times]
         mean = statistics.fmean(waited)
-        twice = f"; {self._seconds} on a second site too" if self._seconds else ""
+        twice = f"; {self._seconds} also ran on the second site" if self._seconds else ""
         return f"mean {mean:.1f} ms, P95 {_p95(waited):.1f} ms; {self._fallbacks} fell back {ONBOARD}{twice}"
 
     def _lateness(self) -> str:
         late = sum(late_s > LATE_S for late_s in self._late)
         return (
-            f"began over {LATE_S * 1e3:g} ms after they were due: {late} of {len(self._late)}; "
-            f"P95 of all {_p95(self._late) * 1e3:.1f} ms"
+            f"started over {LATE_S * 1e3:g} ms after they were due: {late} of {len(self._late)} tasks; "
+            f"P95 of the delay: {_p95(self._late) * 1e3:.1f} ms"
         )
 
 
@@ -89,7 +93,7 @@ def describe(record: Record) -> str:
 
 
 def show_progress(done: int, total: int, about: Callable[[], str]) -> None:
-    """One line that is written over on a terminal; every so many tasks a line elsewhere."""
+    """On a terminal, overwrite one line; elsewhere, print a line every PROGRESS_EVERY tasks."""
     if sys.stdout.isatty():
         print(f"\r\x1b[K{done}/{total} {about()}"[:160], end="", flush=True)
         if done == total:

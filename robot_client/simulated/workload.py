@@ -1,4 +1,7 @@
-"""When tasks come and how big they are: pure, from specs and a seed; the one file read is a CSV of sizes."""
+"""When tasks arrive and which input sizes they have, computed from specs and a seed.
+
+The only file that is read here is a CSV file of sizes. What the tasks are is defined in `work`.
+"""
 
 import itertools
 import math
@@ -17,22 +20,22 @@ if TYPE_CHECKING:
 
 CLOSED, CONSTANT, POISSON, BURSTS = "closed", "constant", "poisson", "bursts"
 ARRIVALS = (CLOSED, CONSTANT, POISSON, BURSTS)
-SIZE_MAX = 1e15  # a whole number that float64 holds exactly
+SIZE_MAX = 1e15  # float64 holds every whole number up to here exactly
 SIGMA_MAX = 10.0
 ROWS_MAX = 1_000_000
 COLUMN = "size"
 
-_DUE_STREAM, _SIZE_STREAM = 1, 2  # random streams of one seed, apart from the robot's
+_DUE_STREAM, _SIZE_STREAM = 1, 2  # so that arrivals, sizes and the robot draw from different random streams
 _NUMBERS = {"constant": 1, "uniform": 2, "lognormal": 2}
-_ALLOWED = (
+SIZES_ALLOWED = (
     "constant:X, uniform:LOW:HIGH, lognormal:MEDIAN:SIGMA or a CSV file with a size column; "
-    "K= before it: from task K on"
+    "K=SPEC holds from task K on"
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Phase:
-    """Sizes from task `first` on: of a `shape` with its `numbers`, or the rows of `file`."""
+    """The sizes from task `first` on: drawn from a `shape` with its `numbers`, or read from `file`."""
 
     first: int
     shape: str | None
@@ -41,9 +44,9 @@ class Phase:
 
 
 def due_instants(arrivals: str, rate: float, burst: int, seed: int) -> Iterator[float]:
-    """When each task is due, in seconds after the first one, at `rate` tasks a second; without end.
+    """When each task is due, in seconds after the first one, at `rate` tasks per second; endless.
 
-    Constant and bursts are computed from the start, so nothing adds up.
+    Constant arrivals and bursts are computed from the start instant, so that rounding errors do not add up.
     """
     if arrivals == CONSTANT:
         yield from (n / rate for n in itertools.count())
@@ -58,21 +61,21 @@ def due_instants(arrivals: str, rate: float, burst: int, seed: int) -> Iterator[
 
 
 def parse_sizes(specs: Sequence[str]) -> tuple[Phase, ...]:
-    """The phases in their order; ConfigError names the spec that cannot be. No file is opened."""
+    """The phases in the order of their tasks; a ConfigError names a wrong spec. No file is opened."""
     phases = sorted((_phase(spec) for spec in specs), key=lambda phase: phase.first)
     firsts = [phase.first for phase in phases]
     twice = [first for first, other in itertools.pairwise(firsts) if first == other]
     if twice:
-        raise ConfigError(f"--sizes: {_joined(specs)}: more than one holds from task {twice[0]} on")
+        raise ConfigError(f"--sizes: {_joined(specs)}: more than one spec holds from task {twice[0]} on")
     if firsts and firsts[0] != 0:
-        raise ConfigError(f"--sizes: {_joined(specs)}: none holds from task 0 on")
+        raise ConfigError(f"--sizes: {_joined(specs)}: no spec holds from task 0 on")
     return tuple(phases)
 
 
 def sizes(phases: Sequence[Phase], seed: int) -> Iterator[float]:
-    """The size of each task from task 0 on, without end; files are read before the first one.
+    """The size of each task from task 0 on, endless. Files are read before the first size is returned.
 
-    Each phase has a random stream of its own, so that changing one leaves the others as they are.
+    Each phase has its own random stream, so that a change of one phase does not change the others.
     """
     draws = [_draws(phase, _stream(seed, _SIZE_STREAM, n)) for n, phase in enumerate(phases)]
     lengths = [after.first - phase.first for phase, after in itertools.pairwise(phases)]
@@ -81,7 +84,7 @@ def sizes(phases: Sequence[Phase], seed: int) -> Iterator[float]:
 
 
 def _stream(*key: int) -> "np.random.Generator":
-    import numpy as np  # where something is drawn: not for --help
+    import numpy as np  # not for --help
 
     return np.random.default_rng(key)
 
@@ -97,7 +100,7 @@ def _phase(spec: str) -> Phase:
     except ValueError:
         numbers = ()
     if len(numbers) != _NUMBERS[shape] or not all(0 <= number <= SIZE_MAX for number in numbers):
-        raise ConfigError(f"--sizes: {spec!r} is not {_ALLOWED}, with numbers from 0 to {SIZE_MAX:g}")
+        raise ConfigError(f"--sizes: {spec!r} is not {SIZES_ALLOWED}, with numbers from 0 to {SIZE_MAX:g}")
     if shape == "uniform" and numbers[0] > numbers[1]:
         raise ConfigError(f"--sizes: {spec!r}: LOW {numbers[0]:g} is above HIGH {numbers[1]:g}")
     if shape == "lognormal" and not (numbers[0] > 0 and numbers[1] <= SIGMA_MAX):
@@ -114,26 +117,26 @@ def _draws(phase: Phase, random: "np.random.Generator") -> Iterator[float]:
         low, high = phase.numbers
         return (float(random.uniform(low, high)) for _ in itertools.count())
     median, sigma = phase.numbers
-    # Of the logarithm: a median of 1e-300 with any sigma is still a number.
+    # The normal draw is around the logarithm, so that a median of 1e-300 works with any sigma.
     return (min(math.exp(float(random.normal(math.log(median), sigma))), SIZE_MAX) for _ in itertools.count())
 
 
 def _read_column(path: Path) -> list[float]:
-    """The `size` column; DataError names file and line where a row has none."""
-    import csv  # where a file is read: not for --help
+    """The `size` column; a DataError names the file and the line of a row without a size."""
+    import csv  # not for --help
 
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = csv.DictReader(file)
             if COLUMN not in (rows.fieldnames or ()):
-                raise DataError(f"--sizes: {path}:1: no column {COLUMN!r}")
+                raise DataError(f"--sizes: {path}:1: there is no column {COLUMN!r}")
             found = [_size(f"--sizes: {path}:{rows.line_num}", row[COLUMN]) for row in _bounded(path, rows)]
     except FileNotFoundError:
-        raise DataError(f"--sizes: {str(path)!r} is not {_ALLOWED}") from None
+        raise DataError(f"--sizes: {str(path)!r} is not {SIZES_ALLOWED}") from None
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"--sizes: {path}: {getattr(error, 'strerror', None) or error}") from error
     if not found:
-        raise DataError(f"--sizes: {path}: no row after the header")
+        raise DataError(f"--sizes: {path}: there is no row after the header")
     return found
 
 

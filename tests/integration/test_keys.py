@@ -323,7 +323,17 @@ def test_the_robot_command_takes_keys(keys: Keys, serve: Serve, tmp_path: Path) 
     """`robot-client --keys` runs its tasks in the cloud; the environment says the same."""
     served = serve(keys)
     folder, answers = keys.add("arm"), tmp_path / "trace.jsonl"
-    flags = ["--task", "tests.probes:nap", "--sizes", "constant:0", "--policy", "cloud", "--tasks", "3"]
+    flags = [
+        "call",
+        "--task",
+        "tests.probes:nap",
+        "--sizes",
+        "constant:0",
+        "--policy",
+        "cloud",
+        "--tasks",
+        "3",
+    ]
     flags += ["--cloud", served.endpoint, "--trace", str(answers)]
     done = run("robot_client", *flags, ROBOT_KEYS=str(folder))
     assert done.returncode == 0, done.stderr
@@ -338,7 +348,15 @@ def test_a_private_key_that_others_may_use_is_refused(keys: Keys, tmp_path: Path
         (folder / f"{name}{PRIVATE}").chmod(mode)
     token = token_file(tmp_path)
     token.chmod(mode)
-    nap_flags = ["--task", "tests.probes:nap", "--sizes", "constant:0", "--cloud", "tcp://127.0.0.1:1"]
+    nap_flags = [
+        "call",
+        "--task",
+        "tests.probes:nap",
+        "--sizes",
+        "constant:0",
+        "--cloud",
+        "tcp://127.0.0.1:1",
+    ]
     for package, flags, flag, path in (
         ("cloud_server", ["--keys", keys.server], "--keys", keys.server / f"server{PRIVATE}"),
         ("cloud_server", ["--token-file", token], "--token-file", token),
@@ -346,7 +364,7 @@ def test_a_private_key_that_others_may_use_is_refused(keys: Keys, tmp_path: Path
     ):
         done = run(package, *map(str, flags))
         assert done.returncode == 2
-        prog = package.replace("_", "-")
+        prog = package.replace("_", "-") + (" call" if package == "robot_client" else "")
         assert done.stderr == (
             f"{prog}: {flag}: {path} has mode {mode:04o}, so group or others may use it: chmod 600 {path}\n"
         )
@@ -486,7 +504,7 @@ def test_keys_are_made_once(tmp_path: Path) -> None:
         again = run(*flags)
         assert again.returncode == 2
         assert again.stderr == (
-            f"{package.replace('_', '-')}: --out: {tmp_path / f'{name}{PRIVATE}'} exists already, "
+            f"{package.replace('_', '-')} keys: --out: {tmp_path / f'{name}{PRIVATE}'} exists already, "
             "and is not overwritten\n"
         )
         assert (tmp_path / f"{name}{PRIVATE}").read_bytes() == private

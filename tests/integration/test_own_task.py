@@ -1,4 +1,4 @@
-"""A scenario of a stranger: a task module of their own, beside the scenario, by the installed command."""
+"""A scenario of a user, with a task module next to it, played by the installed command."""
 
 import subprocess
 import sys
@@ -29,8 +29,8 @@ at_most = 0.001
 """
 
 
-def test_a_module_beside_the_scenario_is_found_by_all_parts(tmp_path: Path) -> None:
-    """Robot, server and the judge of answers load it; the check that cannot hold is exit 1, and says so."""
+def test_all_parts_find_a_module_in_the_current_folder(tmp_path: Path) -> None:
+    """Robot, server and the check of answers load it; a check that does not hold is named, exit code 1."""
     (tmp_path / "mytask.py").write_text(TASK)
     (tmp_path / "mine.toml").write_text(SCENARIO)
     loadgen = Path(sys.executable).with_name("loadgen")

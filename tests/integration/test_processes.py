@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
 WAIT_S = 10.0
 WAN = """
 import sys
-from offboard.common.config import load, run_command
+from offboard.common.command_line import load, run_command
 from offboard.loadgen.relay.wan import WanConfig, run_wan
 settings = dict(prog="wan", description="", environ={}, prefix="WAN")
 sys.exit(run_command("wan", lambda: run_wan(load(WanConfig, sys.argv[1:], **settings))))
@@ -241,7 +241,7 @@ def test_wrong_usage_of_a_part_is_wrong_usage(tmp_path: Path, commands: Any) -> 
     """A part's exit code 2 becomes ConfigError with the part's own line."""
     with (
         LocalTestbed(tmp_path / "out", bed(-1), commands=commands) as testbed,
-        pytest.raises(ConfigError, match=r"^wan: --delay-ms: -1.0 is below 0, the least allowed$"),
+        pytest.raises(ConfigError, match=r"^wan: --delay-ms: -1.0 is below 0, the minimum$"),
     ):
         testbed.start("wan")
 

@@ -1,4 +1,4 @@
-"""`robot-client` with a workload of its own, against a real server: answers, references, open arrivals."""
+"""`robot-client drive` and `call` against a real server: answers, references and open arrivals."""
 
 import signal
 import subprocess
@@ -19,7 +19,7 @@ from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
 
 ROOT = Path(__file__).parents[2]
-MAP = ("--map", str(ROOT / "maps/depot.yaml"), "--resolution", "0.05", "--jump")
+MAP = ("drive", "--map", str(ROOT / "maps/depot.yaml"), "--resolution", "0.05", "--jump")
 POISSON = ("--arrivals", "poisson", "--rate", "60")
 KILL_AFTER = 40  # answers
 WAIT_S = 60.0
@@ -30,24 +30,24 @@ def command(*flags: object) -> list[str]:
 
 
 def robot(*flags: object, code: int = 0) -> str:
-    """Run the robot to its end; what it said."""
+    """Run the robot to its end; return its output."""
     done = subprocess.run(command(*flags), capture_output=True, text=True, timeout=WAIT_S, cwd=ROOT)
     assert done.returncode == code, done.stdout + done.stderr
     return done.stdout
 
 
 def by_number(path: Path) -> dict[int, Any]:
-    """What each task was answered; each has one line."""
+    """The answer to each task, which must have one line."""
     found = list(answers.read(path))
     assert len({line["i"] for line in found}) == len(found)
     return {line["i"]: line["answer"] for line in found}
 
 
 @pytest.mark.parametrize("arrivals", [(), POISSON], ids=["closed", "open"])
-def test_a_killed_run_goes_on_where_it_was(
+def test_a_killed_run_continues_after_its_answers(
     testbed: Callable[..., LocalTestbed], tmp_path: Path, arrivals: tuple[str, ...]
 ) -> None:
-    """kill -9, and again on the same files: each task is answered once, as in a run that nobody killed."""
+    """After kill -9 and a restart, each task has one answer, the same as in a run that was not killed."""
     bed = testbed({"tasks": "offboard.common.planning.planner"})
     flags = [*MAP, *arrivals, "--cloud", bed.endpoint, "--tasks", 150, "--sizes", "uniform:0:3", "--seed", 7]
     robot(*flags, "--answers", tmp_path / "whole.jsonl")
@@ -65,7 +65,7 @@ def test_a_killed_run_goes_on_where_it_was(
         killed.kill()
         killed.wait()
     with path.open("ab") as file:
-        file.write(b'{"v":1,"i":')  # as a crash of the machine may leave it
+        file.write(b'{"v":1,"i":')  # a torn line, as a crash of the computer may leave it
     before = {line["i"] for line in answers.read(path)}
     assert KILL_AFTER <= len(before) < 150
     ran_before = len(list(trace.read(kept)))
@@ -78,17 +78,25 @@ def test_a_killed_run_goes_on_where_it_was(
     lines = list(answers.read(path))[len(before) :]
     assert min(line["due_s"] for line in lines) == pytest.approx(0, abs=1e-3)
     if arrivals:
-        assert "began over 10 ms after they were due: " in said
+        assert "started over 10 ms after they were due: " in said
         assert all(line["due_s"] <= line["began_s"] <= line["ended_s"] for line in lines)
 
 
-def test_an_interrupted_run_records_what_it_answered(
-    testbed: Callable[..., LocalTestbed], tmp_path: Path
-) -> None:
-    """Ctrl-C with tasks in flight: trace and answers hold the same tasks, none of them given up."""
+def test_an_interrupted_run_keeps_its_answers(testbed: Callable[..., LocalTestbed], tmp_path: Path) -> None:
+    """After Ctrl-C, trace and answers have the same tasks, and none that was in flight."""
     bed = testbed(delay_ms=40.0)
     path, kept = tmp_path / "answers.jsonl", tmp_path / "trace.jsonl"
-    flags = ["--task", "tests.probes:zeros", "--sizes", "constant:9", "--tasks", 10_000, "--policy", CLOUD]
+    flags = [
+        "call",
+        "--task",
+        "tests.probes:zeros",
+        "--sizes",
+        "constant:9",
+        "--tasks",
+        10_000,
+        "--policy",
+        CLOUD,
+    ]
     flags += ["--arrivals", "constant", "--rate", 100, "--cloud", bed.endpoint]
     run = subprocess.Popen(
         command(*flags, "--answers", path, "--trace", kept),
@@ -103,17 +111,19 @@ def test_an_interrupted_run_records_what_it_answered(
         assert time.monotonic() < until
         time.sleep(0.005)
     run.send_signal(signal.SIGINT)
-    assert run.communicate(timeout=WAIT_S)[1] == "robot-client: interrupted\n"
+    assert run.communicate(timeout=WAIT_S)[1] == "robot-client call: interrupted\n"
     assert run.returncode == 130
     lines, records = list(answers.read(path)), list(trace.read(kept))
     assert len(lines) >= KILL_AFTER
     assert {line["id"] for line in lines} <= {record["id"] for record in records}
-    assert len(records) <= len(lines) + 16  # those that ended in the instant of the signal
+    assert len(records) <= len(lines) + 16  # tasks that ended at the instant of the signal
     assert all(record["used"] == CLOUD for record in records)
 
 
-def test_references_are_of_each_site_alone(testbed: Callable[..., LocalTestbed], tmp_path: Path) -> None:
-    """Every fifth plan again onboard and in the cloud; the trace of the run holds only the run."""
+def test_references_are_measured_on_each_site_alone(
+    testbed: Callable[..., LocalTestbed], tmp_path: Path
+) -> None:
+    """Every fifth plan runs again onboard and in the cloud; the trace of the run has only the run."""
     bed = testbed({"tasks": "offboard.common.planning.planner"}, delay_ms=5.0)
     kept = tmp_path / "trace.jsonl"
     flags = ["--cloud", bed.endpoint, "--tasks", 20, "--window", 4, "--trace", kept, "--reference", 5]
@@ -134,11 +144,22 @@ def test_references_are_of_each_site_alone(testbed: Callable[..., LocalTestbed],
         assert line["sites"][CLOUD]["seconds"] > 0.010  # the link alone
 
 
-def test_a_task_is_called_by_size(testbed: Callable[..., LocalTestbed], tmp_path: Path) -> None:
-    """Calls at a Poisson rate with sizes of a CSV, on both sites alike; those that fail are said."""
+def test_a_task_is_called_with_its_sizes(testbed: Callable[..., LocalTestbed], tmp_path: Path) -> None:
+    """Sizes come from a CSV file, calls at a Poisson rate; both sites answer the same, and failures count."""
     bed = testbed()
-    (tmp_path / "sizes.csv").write_text("size\n1000\n2500.7\n1e15\n")  # the last is more memory than there is
-    flags = ["--task", "tests.probes:zeros", "--sizes", tmp_path / "sizes.csv", "--tasks", 30, *POISSON]
+    (tmp_path / "sizes.csv").write_text(
+        "size\n1000\n2500.7\n1e15\n"
+    )  # no computer has the memory for the last one
+    flags = [
+        "call",
+        "--task",
+        "tests.probes:zeros",
+        "--sizes",
+        tmp_path / "sizes.csv",
+        "--tasks",
+        30,
+        *POISSON,
+    ]
     found = {}
     for policy in (ONBOARD, CLOUD):
         path = tmp_path / f"{policy}.jsonl"

@@ -679,7 +679,7 @@ def test_a_task_that_hangs_does_not_hold_the_exit(folder: Path, join: Join, pipe
         (["--listen", "udp://x:1"], "--listen: 'udp://x:1' is not tcp://HOST:PORT or tcp://*:PORT with"),
         (["--listen", "tcp://x:65536"], "--listen: 'tcp://x:65536' is not tcp://HOST:PORT"),
         (["--http", "8000"], "--http: '8000' is not HOST:PORT with a port 0 to 65535"),
-        (["--workers", "0"], "--workers: 0 is below 1, the least allowed"),
+        (["--workers", "0"], "--workers: 0 is below 1, the minimum"),
         (["--executor", "ray"], "--executor: 'ray' is not one of threads, processes"),
         (["--blob-mib", "1"], "--blob-mib: 1 is below --message-mib 64; a large argument would never fit"),
         (

@@ -1,4 +1,4 @@
-"""The answers file: what a line holds, and what is left of it after a crash."""
+"""The answers file: what a line holds, and how a run continues from it after a crash."""
 
 import json
 import logging
@@ -39,7 +39,7 @@ def write(path: Path, *numbers: int) -> Path:
 
 
 def done(path: Path) -> frozenset[int]:
-    """The tasks that a restarted run finds answered."""
+    """The tasks that have an answer for a restarted run."""
     answers = Answers(path)
     answers.close()
     return answers.done
@@ -62,7 +62,7 @@ def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
 
 
 def test_the_file_is_made_when_the_run_begins(tmp_path: Path) -> None:
-    """Opening makes nothing; beginning makes an empty file; beginning twice is once."""
+    """`begin` creates an empty file, once; opening alone creates nothing."""
     path = tmp_path / "answers.jsonl"
     answers = Answers(path)
     assert not path.exists()
@@ -73,8 +73,8 @@ def test_the_file_is_made_when_the_run_begins(tmp_path: Path) -> None:
     assert done(path) == frozenset()
 
 
-def test_what_is_there_is_done(tmp_path: Path) -> None:
-    """A restarted run knows the answered tasks, a torn last line is no answer and is cut off."""
+def test_a_restarted_run_continues_after_the_answers(tmp_path: Path) -> None:
+    """It knows the answered tasks; a torn last line is cut off and does not count."""
     path = write(tmp_path / "answers.jsonl", 0, 3, 1)
     whole = path.read_bytes()
     with path.open("a") as file:
@@ -94,13 +94,13 @@ def test_what_is_there_is_done(tmp_path: Path) -> None:
         ('{"v":1,"i":0,"id":"s-0","kind":"echo"}\n', DataError, ":1: no field 'due_s'"),
         ('{"v":2}\n', DataError, ":1: v = 2"),
         ('{"v":1,"i":-1,"id":"","due_s":0,"began_s":0,"ended_s":0,"error":"","answer":0}\n',
-         DataError, "i = -1 is not the number of a task"),
+         DataError, "i = -1 is not a task number"),
     ],
 )  # fmt: skip
-def test_another_file_is_refused_and_left_alone(
+def test_a_file_of_another_kind_is_refused_and_not_changed(
     tmp_path: Path, text: str, error: type[Exception], message: str
 ) -> None:
-    """A trace or a text in the place of the answers is named, and is what it was."""
+    """A trace or a text in place of the answers is an error that names it."""
     path = tmp_path / "file.jsonl"
     path.write_text(text)
     with pytest.raises(error, match=message):
@@ -108,8 +108,8 @@ def test_another_file_is_refused_and_left_alone(
     assert path.read_text() == text
 
 
-def test_a_full_disk_is_logged_and_tasks_go_on(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """An answer that does not fit is counted, leaves no torn line, and is asked again by the next run."""
+def test_a_full_disk_loses_answers_but_ends_no_run(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """An answer that does not fit is logged and counted, leaves no torn line, and is asked again later."""
     path = write(tmp_path / "answers.jsonl", 0)
     answers = Answers(path)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -128,7 +128,7 @@ def test_a_full_disk_is_logged_and_tasks_go_on(tmp_path: Path, caplog: pytest.Lo
 
 @pytest.mark.parametrize("seed", range(5))
 def test_the_steps_of_a_plan_are_its_cells(seed: int) -> None:
-    """A real path with turns in all directions comes back cell by cell, through JSON."""
+    """A real path with turns in all directions survives JSON, cell by cell."""
     random = np.random.default_rng(seed)
     grid = GridMap(np.where(random.random((60, 60)) < 0.25, 100, 0).astype(np.int8), 0.5)
     free = grid.metres(np.argwhere(grid.cells == 0).astype(np.int32))
@@ -140,7 +140,7 @@ def test_the_steps_of_a_plan_are_its_cells(seed: int) -> None:
 
 
 def test_each_digit_is_its_step() -> None:
-    """Digits count eighths of a turn; a path of one cell has no step, no path has no start."""
+    """Digits count eighths of a turn; a path of one cell has no steps, no path has no start."""
 
     def plan(cells: list[tuple[int, int]]) -> Plan:
         return Plan("NONE", np.array(cells, np.int32).reshape(-1, 2), np.zeros((0, 2), np.float32), 1.0, 1)
@@ -154,12 +154,12 @@ def test_each_digit_is_its_step() -> None:
     assert of_plan(plan([]))["start"] is None
     assert cells_of(of_plan(plan([]))).shape == (0, 2)
     for jump in ((5, 7), (5, 5), (3, 4)):
-        with pytest.raises(DataError, match="no neighbour"):
+        with pytest.raises(DataError, match="not a neighbour"):
             of_plan(plan([(5, 5), jump]))
 
 
-def test_a_value_is_named_by_its_bytes() -> None:
-    """Equal results have equal digests, whichever site they came from; an array's content counts."""
+def test_a_value_is_named_by_the_digest_of_its_bytes() -> None:
+    """Equal results have equal digests, and another content of an array has another digest."""
     numbers = np.arange(5.0)
     digest = of_value({"a": (1, 2), "b": numbers}, ())["sha256"]
     assert len(digest) == 64
@@ -170,8 +170,8 @@ def test_a_value_is_named_by_its_bytes() -> None:
         of_value(object(), ())
 
 
-def test_a_place_that_cannot_be_written_is_a_config_error(tmp_path: Path) -> None:
-    """A directory in the file's place is said at start."""
+def test_a_folder_in_place_of_the_file_is_a_config_error(tmp_path: Path) -> None:
+    """The error is raised at start."""
     with pytest.raises(ConfigError, match="Is a directory"):
         Answers(tmp_path)
     assert list(tmp_path.iterdir()) == []

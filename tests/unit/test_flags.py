@@ -1,4 +1,4 @@
-"""The link's conditions as flags, in a scenario and over HTTP: all there, under the same names."""
+"""The conditions of the link have the same names as flags, in a scenario and over HTTP."""
 
 from dataclasses import fields
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from offboard.common.config import load
+from offboard.common.command_line import load
 from offboard.common.errors import ConfigError, DataError
 from offboard.loadgen.relay.http_control import Change
 from offboard.loadgen.relay.link.link import Link, LinkConditions
@@ -32,30 +32,30 @@ def flags(*argv: str) -> LinkFlags:
     return load(LinkFlags, argv, prog="wan", description="", environ={}, prefix="WAN")
 
 
-def test_every_condition_has_its_flags() -> None:
-    """All but the outage, which is for a running relay, can be set for both directions and for each."""
+def test_each_condition_has_its_flags() -> None:
+    """All but the outage, which only a running relay has, can be set for both directions and for one."""
     both = NAMES - {"outage"}
     wanted = both | {f"up_{name}" for name in both} | {f"down_{name}" for name in both}
     assert {field.name for field in fields(LinkFlags)} == wanted
     assert set(Change.model_fields) == NAMES
 
 
-def test_without_flags_the_effects_are_off() -> None:
-    """The link at start is the paper's, with none of the other effects."""
+def test_without_flags_the_link_is_that_of_the_paper() -> None:
+    """It has a delay and a bandwidth, and none of the other effects."""
     conditions = LinkConditions(delay_ms=15, bandwidth_mbps=400)
     assert flags().link == Link(conditions, conditions)
 
 
-def test_a_direction_has_its_own() -> None:
-    """A flag of one direction wins over that of both, off over on too."""
+def test_a_flag_of_one_direction_takes_precedence() -> None:
+    """It overrides the flag of both directions, also with --no-."""
     link = flags("--loss=0.1", "--up-loss=0.2", "--hang", "--no-down-hang", "--down-truncate-bytes=9").link
     assert (link.up.loss, link.down.loss) == (0.2, 0.1)
     assert (link.up.hang, link.down.hang) == (True, False)
     assert (link.up.truncate_bytes, link.down.truncate_bytes) == (0, 9)
 
 
-def test_samples_are_the_distribution_unless_another_is_named(tmp_path: Path) -> None:
-    """--samples alone draws from the file; with --distribution they are there to switch to."""
+def test_samples_are_used_unless_another_distribution_is_named(tmp_path: Path) -> None:
+    """--samples alone draws from the file; with --distribution the file is kept for a later change."""
     file = tmp_path / "delays.txt"
     file.write_text("3\n1\n")
     link = flags("--up-samples", str(file)).link
@@ -69,14 +69,14 @@ def test_samples_are_the_distribution_unless_another_is_named(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["--loss", "2"], "--loss: 2.0 is above 1, the most allowed"),
-        (["--up-loss-burst", "0.5"], "--up-loss-burst: 0.5 is below 1, the least allowed"),
+        (["--loss", "2"], "--loss: 2.0 is above 1, the maximum"),
+        (["--up-loss-burst", "0.5"], "--up-loss-burst: 0.5 is below 1, the minimum"),
         (["--distribution", "gamma"], "--distribution: 'gamma' is not one of constant, uniform"),
         (["--truncate-bytes", "1.5"], "--truncate-bytes: '1.5' is not a whole number"),
     ],
 )
-def test_a_bad_flag_is_named(argv: list[str], message: str) -> None:
-    """A value that cannot be is refused with flag and value."""
+def test_a_wrong_flag_is_named(argv: list[str], message: str) -> None:
+    """The error names the flag and its value."""
     with pytest.raises(ConfigError) as caught:
         flags(*argv)
     assert str(caught.value).startswith(message)
@@ -85,13 +85,13 @@ def test_a_bad_flag_is_named(argv: list[str], message: str) -> None:
 @pytest.mark.parametrize(
     "settings", [{"hang": True}, {"up_hang": False}, {"loss": 0.02, "distribution": "pareto", "up_loss": 0.0}]
 )
-def test_settings_become_flags(settings: dict[str, Any]) -> None:
-    """A command line made of settings is read as the same settings."""
+def test_settings_survive_a_command_line(settings: dict[str, Any]) -> None:
+    """Settings that are written as flags are read as the same settings."""
     assert flags(*as_flags(settings)) == LinkFlags(**settings)
 
 
-def test_a_scenario_has_all_conditions(tmp_path: Path) -> None:
-    """[link] takes facts, numbers and files, these relative to the scenario's own."""
+def test_a_scenario_takes_all_conditions(tmp_path: Path) -> None:
+    """[link] takes booleans, numbers and files; files are relative to the scenario."""
     grid = Path(__file__).parents[1] / "samples" / "32room_000-crop.map"
     (tmp_path / "delays.txt").write_text("5\n")
     file = tmp_path / "rough.toml"

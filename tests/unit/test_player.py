@@ -8,16 +8,16 @@ from typing import Any
 import pytest
 
 from offboard.cloud_server.config import ServerConfig
-from offboard.common.config import load
+from offboard.common.command_line import load
 from offboard.loadgen.play.player import Files, Lines, make_room, setups
 from offboard.loadgen.relay.link.link_settings import as_flags
 from offboard.loadgen.relay.wan import WanConfig
 from offboard.loadgen.scenario.scenario import Scenario, Workload, find_scenario, read_scenario, shipped
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN
 from offboard.robot_client.records.trace import alone_path, reference_path
-from offboard.robot_client.simulated.config import RobotConfig
+from offboard.robot_client.simulated.config import CallConfig, DriveConfig
 
-CONFIGS = {CLOUD: ServerConfig, WAN: WanConfig, ROBOT: RobotConfig}
+CONFIGS = {CLOUD: ServerConfig, WAN: WanConfig, "drive": DriveConfig, "call": CallConfig}
 
 
 def scenario(**workload: Any) -> Scenario:
@@ -28,23 +28,25 @@ def scenario(**workload: Any) -> Scenario:
 def test_the_parts_take_what_the_scenario_says(name: str, tmp_path: Path) -> None:
     """Every flag of every part is one that its command knows, and carries the scenario's value."""
     read = read_scenario(find_scenario(name))
-    made = {part: setup.flags for part, setup in setups(read, tmp_path).items()}
+    made = setups(read, tmp_path)
     configs = {
         part: load(
-            CONFIGS[part.partition("-")[0]],
-            [*as_flags(flags), *(["--cloud=tcp://wan:5555"] if part not in (CLOUD, WAN) else [])],
+            CONFIGS[setup.command or part],
+            [*as_flags(setup.flags), *(["--cloud=tcp://wan:5555"] if part not in (CLOUD, WAN) else [])],
             prog="",
             description="",
             environ={},
             prefix="X",
         )
-        for part, flags in made.items()
+        for part, setup in made.items()
     }
     robot, wan = configs[ROBOT], configs[WAN]
-    assert isinstance(robot, RobotConfig)
+    assert isinstance(robot, DriveConfig | CallConfig)
     assert isinstance(wan, WanConfig)
     assert (robot.tasks, robot.seed, robot.alone) == (read.workload.tasks, read.seed, read.workload.alone)
-    assert (robot.map, robot.sizes) == (read.workload.map, read.workload.sizes)
+    assert robot.sizes == read.workload.sizes
+    if isinstance(robot, DriveConfig):
+        assert (robot.map, robot.resolution) == (read.workload.map, 0.025)
     assert (robot.trace, robot.answers) == (tmp_path / "trace.jsonl", tmp_path / "answers.jsonl")
     assert (wan.delay_ms, wan.seed) == (read.link["delay_ms"], read.seed)
     assert len(configs) == 2 + read.workload.robots

@@ -1,4 +1,4 @@
-"""The simulated robot with the real planner on Willow: its world, its requests, and what it drives."""
+"""The simulated robot with the real planner on the Willow map: its world, its requests and its drives."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +21,7 @@ SimulatedRobot(GridMap(np.zeros((30, 30), np.int8), 0.1), seed=0, obstacles=0).r
 
 @dataclass
 class Ride:
-    """One request: where from and to, the plan, and the cells driven."""
+    """One request: pose, goal, plan, and the cells that the robot drove."""
 
     pose: Pose
     goal: Point
@@ -30,7 +30,7 @@ class Ride:
 
 
 def run(robot: SimulatedRobot, count: int) -> list[Ride]:
-    """So many requests, planned and driven."""
+    """Plan and drive `count` requests."""
     done = []
     for _ in range(count):
         _, _, pose, goal, *_ = request = robot.request()
@@ -40,13 +40,13 @@ def run(robot: SimulatedRobot, count: int) -> list[Ride]:
 
 
 def changed(robot: SimulatedRobot, done: list[Ride]) -> int:
-    """How many plans differ from the plan on the prior map, without the scan."""
+    """How many plans differ from the plan on the prior map without a scan."""
     blind = [plan_path(WILLOW, None, one.pose, one.goal, robot.radius_m) for one in done]
     return sum(a.cells.tolist() != one.plan.cells.tolist() for a, one in zip(blind, done, strict=True))
 
 
 def test_scans_change_plans_and_nothing_is_hit() -> None:
-    """Of 100 plans at least 10 differ from the plan on the prior map, and no driven cell is occupied."""
+    """At least 10 of 100 plans differ from the plan on the prior map, and no driven cell is occupied."""
     robot = SimulatedRobot(WILLOW, seed=1)
     done = run(robot, 100)
     assert 10 <= changed(robot, done) < 100
@@ -58,8 +58,8 @@ def test_scans_change_plans_and_nothing_is_hit() -> None:
     assert [one.plan.status for one in done].count("NONE") >= 95
 
 
-def test_a_world_without_obstacles_leaves_plans_alone() -> None:
-    """Walls that the prior map holds do not change a plan when the scan shows them."""
+def test_without_obstacles_scans_change_no_plan() -> None:
+    """A scan of walls that are on the prior map does not change a plan."""
     robot = SimulatedRobot(WILLOW, seed=1, obstacles=0)
     done = run(robot, 40)
     assert changed(robot, done) <= 1
@@ -67,7 +67,7 @@ def test_a_world_without_obstacles_leaves_plans_alone() -> None:
 
 
 def test_the_seed_decides_everything() -> None:
-    """The same seed gives the same world and requests; another seed others."""
+    """One seed always gives the same world and requests, and seeds differ."""
 
     def story(seed: int) -> list[object]:
         robot = SimulatedRobot(WILLOW, seed=seed)
@@ -91,8 +91,8 @@ def test_goals_are_near_and_far() -> None:
     assert low * 5 < middle < high / 2
 
 
-def test_jumping_asks_the_same_whatever_was_answered() -> None:
-    """A robot that jumps stands at each goal next; between jumps nothing that it drives changes its tasks."""
+def test_the_tasks_of_a_jumping_robot_do_not_depend_on_answers() -> None:
+    """A jump puts the robot at its goal; requests between jumps do not change later tasks."""
 
     def story(size: float | None, drives: bool) -> list[object]:
         robot = SimulatedRobot(WILLOW, seed=5, size=size)
@@ -112,8 +112,8 @@ def test_jumping_asks_the_same_whatever_was_answered() -> None:
     assert len({pose.yaw for pose, _, _ in story(None, False)}) == 10
 
 
-def test_a_goal_is_the_candidate_nearest_in_size() -> None:
-    """With a size each goal is, of the same candidates, the one whose d is nearest to it."""
+def test_the_goal_is_the_candidate_with_the_nearest_size() -> None:
+    """With a size, the goal is the candidate whose input size is nearest to it."""
     for wanted in (0.0, 0.05, 0.5, 3.0, 1e9):
         robot, twin = (SimulatedRobot(WILLOW, seed=6, size=wanted) for _ in range(2))
         for _ in range(5):
@@ -127,16 +127,16 @@ def test_a_goal_is_the_candidate_nearest_in_size() -> None:
             assert abs(got - wanted) == min(abs(size - wanted) for size in made)
 
 
-def test_asking_twice_changes_nothing() -> None:
-    """A request is the same until the robot drives."""
+def test_a_second_request_is_the_same() -> None:
+    """A request changes only when the robot drives."""
     robot = SimulatedRobot(WILLOW, seed=3)
     first, again = robot.request(), robot.request()
     assert first[1].ranges.tolist() == again[1].ranges.tolist()
     assert (first[2:], first[0]) == (again[2:], WILLOW)
 
 
-def test_obstacles_lie_in_free_space_the_robot_could_reach() -> None:
-    """The world is the prior map plus boxes of 0.3 to 1 m, and robot and goal stand clear of all."""
+def test_obstacles_stand_in_free_space_that_the_robot_can_reach() -> None:
+    """The world is the prior map plus boxes of 0.3 to 1 m; robot and goal stand clear of them."""
     robot = SimulatedRobot(WILLOW, seed=4, obstacles=25)
     added = (robot.truth.cells == 100) & (WILLOW.cells != 100)
     assert 25 * 6**2 / 2 < added.sum() < 25 * 21**2
@@ -148,13 +148,13 @@ def test_obstacles_lie_in_free_space_the_robot_could_reach() -> None:
         assert clear[cell]
 
 
-def test_a_blocked_robot_keeps_its_goal_for_a_few_tries() -> None:
-    """A path that a box blocks stops the robot before it; the goal stays, and changes after so many tries."""
+def test_a_blocked_robot_keeps_its_goal_for_some_tries() -> None:
+    """The robot stops before a box on its path, and picks another goal after TRIES_MAX tries."""
     cells = np.full((40, 100), 100, np.int8)
     cells[1:-1, 1:-1] = 0
     robot = SimulatedRobot(GridMap(cells, 0.1), seed=1, obstacles=0)
     blocked = cells.copy()
-    blocked[1:-1, 50] = 100  # shut after the plans were made: no way round
+    blocked[1:-1, 50] = 100  # a wall that was not there when the plan was made
     robot.truth = GridMap(blocked, 0.1)
     straight = np.array([[20, col] for col in range(10, 90)], np.int32)
     plan = Plan("NONE", straight, robot.prior.metres(straight).astype(np.float32), 8.0, 1)
@@ -166,8 +166,8 @@ def test_a_blocked_robot_keeps_its_goal_for_a_few_tries() -> None:
     assert robot.goal != goal
 
 
-def test_the_bumper_stops_where_no_scan_could_see() -> None:
-    """With a blind LiDAR the robot still ends before the occupied cell."""
+def test_the_bumper_stops_before_an_unseen_obstacle() -> None:
+    """With a blind LiDAR the robot still stops before the occupied cell."""
     cells = np.full((40, 100), 100, np.int8)
     cells[1:-1, 1:-1] = 0
     robot = SimulatedRobot(GridMap(cells, 0.1), seed=1, obstacles=0, range_max=0.01)
@@ -179,8 +179,8 @@ def test_the_bumper_stops_where_no_scan_could_see() -> None:
     assert driven[-1].tolist() == [20, 49]
 
 
-def test_without_paths_another_goal_and_then_another_place() -> None:
-    """Each failure picks a new goal; a robot that finds none is set down elsewhere."""
+def test_goals_without_a_path_lead_to_another_goal_and_then_to_another_place() -> None:
+    """Each failure picks a new goal; after FAILURES_MAX the robot is put elsewhere."""
     robot = SimulatedRobot(WILLOW, seed=7)
     start = robot.pose
     for _ in range(FAILURES_MAX - 1):
@@ -193,6 +193,6 @@ def test_without_paths_another_goal_and_then_another_place() -> None:
 
 
 def test_a_map_without_room_is_refused() -> None:
-    """A robot that fits nowhere is a ConfigError that says so."""
+    """The ConfigError names the radius of a robot that fits nowhere."""
     with pytest.raises(ConfigError, match="no room for a robot"):
         SimulatedRobot(GridMap(np.full((9, 9), 100, np.int8), 0.1), seed=0)

@@ -13,7 +13,7 @@ from offboard.loadgen.play.answer_check import verified, wrong_plan
 from offboard.loadgen.scenario.outcome import Answered
 from offboard.loadgen.scenario.scenario import Workload
 from offboard.robot_client.simulated import answers
-from offboard.robot_client.simulated.task_source import make_work
+from offboard.robot_client.simulated.work import make_work
 
 MAP = Path(__file__).parents[1] / "samples" / "32room_000-crop.map"
 SEED = 3

@@ -1,4 +1,4 @@
-"""The two kinds of work: plans of a robot on a map, and calls of a function by size."""
+"""The two kinds of work: plans for a robot on a map, and calls of a function with a size."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,8 +13,8 @@ from offboard.common.planning.planner_names import PLANNERS
 from offboard.loadgen.scenario.hash_tasks import MUCH, RARE, hash_rarely_long, hash_rounds, rounds_on
 from offboard.loadgen.testbed.testbed import PART
 from offboard.robot_client.simulated.answers import cells_of
-from offboard.robot_client.simulated.config import RobotConfig
-from offboard.robot_client.simulated.task_source import Work, make_work
+from offboard.robot_client.simulated.config import CallConfig, DriveConfig
+from offboard.robot_client.simulated.work import Work, make_work
 from tests import probes
 from tests.mazes import warm
 
@@ -24,15 +24,15 @@ warm()  # compiles before the clock of any test runs
 
 
 def on_map(*sizes: str, seed: int = 3, jump: bool = True) -> Work:
-    return make_work(RobotConfig(map=DEPOT, resolution=0.05, seed=seed, jump=jump, sizes=sizes))
+    return make_work(DriveConfig(map=DEPOT, resolution=0.05, seed=seed, jump=jump, sizes=sizes))
 
 
 def calls(*sizes: str, task: str = "tests.probes:zeros", **settings: Any) -> Work:
-    return make_work(RobotConfig(task=task, sizes=sizes, **settings))
+    return make_work(CallConfig(task=task, sizes=sizes, **settings))
 
 
 def asked(work: Work, answers: Sequence[Any]) -> list[Any]:
-    """The requests that so many answers lead to, in numbers."""
+    """The requests that these answers lead to, as plain values."""
     found = []
     for answer in answers:
         _, scan, pose, goal, radius, *_ = work.request()
@@ -43,7 +43,7 @@ def asked(work: Work, answers: Sequence[Any]) -> list[Any]:
 
 @pytest.mark.parametrize("sizes", [(), ("uniform:0:3",)])
 def test_with_jumps_answers_do_not_change_later_requests(sizes: tuple[str, ...]) -> None:
-    """Answered, failed or never asked: the tasks of a seed are the same; another seed has others."""
+    """The tasks of a seed are the same if they are answered, failed or not asked; seeds differ."""
     first = asked(on_map(*sizes), [None] * 8)
     assert first == asked(on_map(*sizes), [NO_PATH] * 8)
     work = on_map(*sizes)
@@ -52,16 +52,16 @@ def test_with_jumps_answers_do_not_change_later_requests(sizes: tuple[str, ...])
 
 
 @pytest.mark.parametrize("name", PLANNERS)
-def test_plans_are_asked_for_by_the_planner_of_the_flag(name: str) -> None:
-    """The request names it; what it finds costs the same."""
-    config = RobotConfig(map=DEPOT, resolution=0.05, seed=3, planner=name)
+def test_requests_name_the_planner_of_the_flag(name: str) -> None:
+    """Each planner is named in the request, and its path has the same cost."""
+    config = DriveConfig(map=DEPOT, resolution=0.05, seed=3, planner=name)
     first, request = on_map().request(), make_work(config).request()
     assert request[-1] == name
     assert plan_path(*request).cost == plan_path(*first).cost > 0
 
 
-def test_without_jumps_the_robot_drives_what_it_gets() -> None:
-    """The robot stands where the plan took it, and goes for another goal where there was no answer."""
+def test_without_jumps_the_robot_drives_its_answers() -> None:
+    """The robot moves along the plan, and picks another goal if there was no answer."""
     work = on_map(jump=False)
     _, _, pose, goal, *_ = request = work.request()
     work.advance(plan_path(*request))
@@ -73,7 +73,7 @@ def test_without_jumps_the_robot_drives_what_it_gets() -> None:
 
 
 def test_goals_follow_the_sizes() -> None:
-    """Of 32 random goals the nearest in d: near ones for small sizes, from task 5 on far ones."""
+    """Goals are near for small sizes, and far for large sizes from task 5 on."""
     work = on_map("constant:0.02", "5=constant:2")
     found = []
     for _ in range(10):
@@ -84,7 +84,7 @@ def test_goals_follow_the_sizes() -> None:
 
 
 def test_calls_get_whole_sizes() -> None:
-    """Each call gets int() of its drawn size; asking twice changes nothing, nor does an answer."""
+    """Each call gets int() of its size; neither a second request nor an answer changes it."""
     work = calls("constant:2.9", "2=constant:7")
     assert work.function is probes.zeros
     found = []
@@ -96,8 +96,8 @@ def test_calls_get_whole_sizes() -> None:
     assert all(type(size) is int for (size,) in found)
 
 
-def test_the_same_seed_makes_the_same_calls() -> None:
-    """Sizes are those of the seed."""
+def test_the_seed_decides_the_calls() -> None:
+    """One seed always gives the same sizes, and seeds differ."""
 
     def story(seed: int) -> list[Any]:
         work = calls("lognormal:1000:1", seed=seed)
@@ -110,8 +110,8 @@ def test_the_same_seed_makes_the_same_calls() -> None:
     assert story(1) == story(1) != story(2)
 
 
-def test_answers_are_described_by_kind() -> None:
-    """A plan by its path, anything else by its digest; a plan without a path is an answer too."""
+def test_answers_are_described_for_the_file() -> None:
+    """A plan is described by its path, also if it has none; any other answer by its digest."""
     work = on_map()
     plan = plan_path(*work.request())
     assert cells_of(work.describe(plan)).tolist() == plan.cells.tolist()
@@ -135,8 +135,8 @@ def test_answers_are_described_by_kind() -> None:
         ("offboard.common.planning.planner:plan_path", "missing a required argument"),
     ],
 )
-def test_a_task_that_cannot_be_called_is_named(task: str, why: str) -> None:
-    """--task says its value, what is allowed and why not, in one line."""
+def test_a_task_that_cannot_be_called_is_refused(task: str, why: str) -> None:
+    """The error is one line with the value of --task, what is allowed, and the reason."""
     with pytest.raises(ConfigError) as caught:
         calls("constant:1", task=task)
     said = str(caught.value)
@@ -146,21 +146,21 @@ def test_a_task_that_cannot_be_called_is_named(task: str, why: str) -> None:
 
 
 @pytest.mark.parametrize("flag", ["measure", "alone", "reference"])
-def test_a_task_that_never_runs_twice_is_not_measured(flag: str) -> None:
-    """What is declared duplicate=False is refused where a flag would run it again."""
+def test_a_task_that_must_not_run_twice_is_not_measured(flag: str) -> None:
+    """A task declared duplicate=False is refused with a flag that would run it again."""
     settings: dict[str, Any] = {flag: 2, "cloud": "tcp://h:1", "trace": Path("t")}
     with pytest.raises(ConfigError, match=f"--{flag}: 2: task mark_once is declared duplicate=False"):
         calls("constant:1", task="tests.probes:mark_once", **settings)
 
 
-def test_bad_sizes_are_said_before_the_robot_is_made() -> None:
-    """A CSV that is not there is named."""
+def test_a_missing_file_of_sizes_is_named() -> None:
+    """The error is raised before the robot is made."""
     with pytest.raises(DataError, match=r"--sizes: 'none\.csv' is not"):
         on_map("none.csv")
 
 
-def test_a_rare_task_is_long_on_one_part_and_its_answer_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One size in RARE takes MUCH times the rounds, another one on each part; the answer is the same."""
+def test_a_rare_task_takes_long_on_one_part_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One size in RARE takes MUCH times the rounds, on each part another size; answers do not change."""
     for part in ("cloud", "robot"):
         rare = sum(rounds_on(part, rounds) == MUCH * rounds for rounds in range(1, 25_001))
         assert rare == pytest.approx(25_000 / RARE, rel=0.1)

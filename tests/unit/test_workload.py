@@ -1,4 +1,4 @@
-"""When tasks are due and how big they are, from specs and a seed."""
+"""When tasks are due and which sizes they have, from specs and a seed."""
 
 from itertools import islice, pairwise
 from pathlib import Path
@@ -27,7 +27,7 @@ def drawn(count: int, *specs: str, seed: int = 1) -> list[float]:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_poisson_gaps_are_exponential(seed: int) -> None:
-    """10,000 gaps have the mean of the rate (within 4 standard errors) and pass a KS test, as they come."""
+    """10,000 gaps match the rate within 4 standard errors, pass a KS test, and are not correlated."""
     rate, count = 20.0, 10_000
     instants = list(islice(due_instants(POISSON, rate, 1, seed), count + 1))
     gaps = np.diff(instants)
@@ -39,28 +39,28 @@ def test_poisson_gaps_are_exponential(seed: int) -> None:
     assert abs(np.corrcoef(gaps[1:], gaps[:-1])[0, 1]) < 4 / count**0.5
 
 
-def test_constant_arrivals_do_not_add_up_errors() -> None:
-    """Task n is due at n / rate exactly, however many came before."""
+def test_constant_arrivals_do_not_drift() -> None:
+    """Task n is due at exactly n / rate."""
     instants = list(islice(due_instants(CONSTANT, 30.0, 1, 1), 10_001))
     assert instants == [n / 30.0 for n in range(10_001)]
 
 
-def test_bursts_come_at_once_and_keep_the_rate() -> None:
-    """Four at once every 4 / 8 s, the first at the start."""
+def test_bursts_keep_the_rate() -> None:
+    """At 8 tasks per second, four tasks are due at once every 0.5 s, the first four at the start."""
     instants = list(islice(due_instants(BURSTS, 8.0, 4, 1), 12))
     assert instants == [0.0] * 4 + [0.5] * 4 + [1.0] * 4
 
 
 @pytest.mark.parametrize("arrivals", [CONSTANT, POISSON, BURSTS])
 def test_the_seed_decides_the_arrivals(arrivals: str) -> None:
-    """The same seed gives the same instants; only Poisson's depend on it."""
+    """The same seed gives the same instants; only Poisson arrivals depend on the seed."""
     first, again, other = (list(islice(due_instants(arrivals, 5.0, 3, seed), 50)) for seed in (1, 1, 2))
     assert first == again
     assert (first != other) == (arrivals == POISSON)
 
 
 def test_sizes_follow_their_law() -> None:
-    """Constant, uniform and lognormal (by its median) as the spec says, by KS tests."""
+    """Constant, uniform and lognormal sizes pass KS tests of their spec; MEDIAN is the median."""
     assert drawn(3, "constant:2.5") == [2.5] * 3
     uniform = drawn(5000, "uniform:10:30")
     assert stats.kstest(uniform, stats.uniform(10, 20).cdf).pvalue > 0.01
@@ -71,15 +71,15 @@ def test_sizes_follow_their_law() -> None:
 
 @pytest.mark.parametrize("spec", ["uniform:1:9", "lognormal:3:1"])
 def test_the_seed_decides_the_sizes(spec: str) -> None:
-    """The same seed gives the same sizes, seeds differ, and sizes are not the arrivals' draws."""
+    """One seed always gives the same sizes, seeds differ, and sizes are not correlated with arrivals."""
     assert drawn(40, spec) == drawn(40, spec)
     assert drawn(40, spec) != drawn(40, spec, seed=2)
     gaps = [b - a for a, b in pairwise(islice(due_instants(POISSON, 1.0, 1, 1), 41))]
     assert abs(np.corrcoef(drawn(40, spec), gaps)[0, 1]) < 0.6
 
 
-def test_a_phase_holds_from_its_task_on() -> None:
-    """K= changes the sizes from task K on, in whatever order the specs come, and no other phase's."""
+def test_a_phase_starts_at_its_task() -> None:
+    """K=SPEC changes the sizes from task K on, in any order of the specs, and leaves other phases alone."""
     found = drawn(9, "7=constant:9", "uniform:1:2", "3=constant:5")
     assert found[3:] == [5, 5, 5, 5, 9, 9]
     assert all(1 <= size <= 2 for size in found[:3])
@@ -87,8 +87,8 @@ def test_a_phase_holds_from_its_task_on() -> None:
     assert drawn(2, "0=constant:4") == [4, 4]
 
 
-def test_a_csv_is_read_in_order_and_again(tmp_path: Path) -> None:
-    """The size column, other columns aside, from the phase's own start and from the top at its end."""
+def test_a_csv_file_is_read_in_order_and_repeated(tmp_path: Path) -> None:
+    """Each phase reads the size column from the top, and starts again at the end of the file."""
     file = tmp_path / "sizes.csv"
     file.write_text("site,size\na,3\nb,1.5\nc,2\n")
     assert drawn(7, str(file)) == [3, 1.5, 2, 3, 1.5, 2, 3]
@@ -107,13 +107,13 @@ def test_a_csv_is_read_in_order_and_again(tmp_path: Path) -> None:
         (["uniform:3:2"], r"'uniform:3:2': LOW 3 is above HIGH 2"),
         (["lognormal:0:1"], r"'lognormal:0:1': MEDIAN is above 0 and SIGMA at most 10"),
         (["lognormal:1:11"], r"SIGMA at most 10"),
-        (["5=constant:1"], r"5=constant:1: none holds from task 0 on"),
-        (["constant:1", "uniform:1:2"], r"more than one holds from task 0 on"),
-        (["constant:1", "4=constant:1", "4=constant:2"], r"more than one holds from task 4 on"),
+        (["5=constant:1"], r"5=constant:1: no spec holds from task 0 on"),
+        (["constant:1", "uniform:1:2"], r"more than one spec holds from task 0 on"),
+        (["constant:1", "4=constant:1", "4=constant:2"], r"more than one spec holds from task 4 on"),
     ],
 )
-def test_a_bad_spec_is_named(specs: list[str], message: str) -> None:
-    """A spec that cannot be is a ConfigError of --sizes that shows it and what is allowed."""
+def test_a_wrong_spec_is_named(specs: list[str], message: str) -> None:
+    """The ConfigError names --sizes, the spec and what is allowed."""
     with pytest.raises(ConfigError, match=rf"^--sizes: .*{message}"):
         parse_sizes(specs)
 
@@ -122,16 +122,16 @@ def test_a_bad_spec_is_named(specs: list[str], message: str) -> None:
     ("text", "message"),
     [
         (None, r"\.csv' is not constant:X, .* or a CSV file with a size column"),
-        ("", r":1: no column 'size'"),
-        ("d\n1\n", r":1: no column 'size'"),
-        ("size\n", r"no row after the header"),
+        ("", r":1: there is no column 'size'"),
+        ("d\n1\n", r":1: there is no column 'size'"),
+        ("size\n", r"there is no row after the header"),
         ("size\n1\ntwo\n", r":3: size: 'two' is not a number from 0 to 1e\+15"),
         ("a,size\n1\n", r":2: size: None is not a number"),
         ("size\n-1\n", r":2: size: '-1' is not a number"),
     ],
 )
-def test_a_bad_csv_names_file_and_line(tmp_path: Path, text: str | None, message: str) -> None:
-    """The file is read before the first size is drawn."""
+def test_a_wrong_csv_file_is_named_with_its_line(tmp_path: Path, text: str | None, message: str) -> None:
+    """The error is raised before the first size is drawn."""
     file = tmp_path / "sizes.csv"
     if text is not None:
         file.write_text(text)

@@ -1,4 +1,7 @@
-"""The conditions of a link as flags of `loadgen wan`; a scenario's [link] holds them under the same names."""
+"""The conditions of a link as flags of `loadgen wan`; the [link] table of a scenario uses the same names.
+
+What a condition does to the data is in `link`.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -9,41 +12,70 @@ from offboard.common.config import check, setting
 from offboard.loadgen.relay.link.jitter import SAMPLES, read_samples
 from offboard.loadgen.relay.link.link import BOUNDS, NAMES, Link, LinkConditions
 
+LINK, FAULTS, UP, DOWN = "link", "faults", "from robot to cloud only", "from cloud to robot only"
 
-def _both(name: str, default: Any, help: str) -> Any:
+
+def _both(name: str, default: Any, help: str, *, group: str = LINK, rare: bool = False) -> Any:
     """A condition of both directions."""
     least, most = BOUNDS.get(name, (None, None))
     choices = NAMES if name == "distribution" else None
-    return setting(default, help, minimum=least, maximum=most, choices=choices)
+    return setting(default, help, group=group, rare=rare, minimum=least, maximum=most, choices=choices)
 
 
 def _up(name: str) -> Any:
-    return _both(name, None, f"--{name.replace('_', '-')} from robot to cloud alone")
+    return _both(name, None, f"--{name.replace('_', '-')} {UP}", group=UP, rare=True)
 
 
 def _down(name: str) -> Any:
-    return _both(name, None, f"--{name.replace('_', '-')} from cloud to robot alone")
+    return _both(name, None, f"--{name.replace('_', '-')} {DOWN}", group=DOWN, rare=True)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class LinkFlags:
-    """Each condition for both directions, and for one alone, which wins."""
+    """Each condition for both directions, and for each direction alone, which takes precedence."""
 
-    delay_ms: float = _both("delay_ms", 15.0, "delay one way, in each direction")
-    jitter_ms: float = _both("jitter_ms", 0.0, "spread of the delay, in each direction")
+    delay_ms: float = _both("delay_ms", 15.0, "delay in each direction, in ms")
+    jitter_ms: float = _both("jitter_ms", 0.0, "spread of the delay, in ms")
     distribution: str | None = _both(
-        "distribution", None, "how jitter is distributed (default: normal, or samples with --samples)"
+        "distribution",
+        None,
+        "distribution of the jitter (default: normal, or samples with --samples)",
+        rare=True,
     )
-    correlation: float = _both("correlation", 0.0, "of the jitter of neighbouring segments, 0 to 1")
-    samples: Path | None = _both("samples", None, "delays in ms, one a line, to add in place of jitter")
-    bandwidth_mbps: float = _both("bandwidth_mbps", 400.0, "bandwidth of each direction; 0 is unlimited")
-    loss: float = _both("loss", 0.0, "share of segments lost, 0 to 1; TCP sends them again after a stall")
-    loss_burst: float = _both("loss_burst", 1.0, "mean segments lost in a row; 1 is independent loss")
-    stall_ms: float = _both("stall_ms", 200.0, "how much later a lost segment comes; doubled if lost again")
-    hang: bool = _both("hang", False, "accept and take everything, answer nothing")
-    reset_after_ms: float = _both("reset_after_ms", 0.0, "reset connections after so long; 0 is never")
-    truncate_bytes: int = _both("truncate_bytes", 0, "close connections after so many bytes; 0 is never")
-    slow_close_ms: float = _both("slow_close_ms", 0.0, "how much later the end of a stream comes")
+    correlation: float = _both(
+        "correlation", 0.0, "correlation between the jitter of neighbouring segments, 0 to 1", rare=True
+    )
+    samples: Path | None = _both(
+        "samples", None, "file of delays in ms, one per line, that are added instead of jitter", rare=True
+    )
+    bandwidth_mbps: float = _both(
+        "bandwidth_mbps", 400.0, "bandwidth of each direction, in Mbit/s; 0 is unlimited"
+    )
+    loss: float = _both("loss", 0.0, "share of segments lost, 0 to 1; TCP sends them again after --stall-ms")
+    loss_burst: float = _both(
+        "loss_burst", 1.0, "mean number of segments lost in a row; 1 is independent loss", rare=True
+    )
+    stall_ms: float = _both(
+        "stall_ms", 200.0, "delay of a lost segment, in ms; doubled if it is lost again", rare=True
+    )
+    hang: bool = _both("hang", False, "accept connections and data, but deliver nothing", group=FAULTS)
+    reset_after_ms: float = _both(
+        "reset_after_ms",
+        0.0,
+        "reset each connection after this time, in ms; 0 is never",
+        group=FAULTS,
+        rare=True,
+    )
+    truncate_bytes: int = _both(
+        "truncate_bytes",
+        0,
+        "close each connection after this many bytes; 0 is never",
+        group=FAULTS,
+        rare=True,
+    )
+    slow_close_ms: float = _both(
+        "slow_close_ms", 0.0, "delay of the end of a stream, in ms", group=FAULTS, rare=True
+    )
 
     up_delay_ms: float | None = _up("delay_ms")
     up_jitter_ms: float | None = _up("jitter_ms")
@@ -75,11 +107,11 @@ class LinkFlags:
 
     def __post_init__(self) -> None:
         check(self)
-        _ = self.link  # what only fits together is checked there
+        _ = self.link  # checks that the conditions fit together
 
     @property
     def link(self) -> Link:
-        """The conditions at start; reads the files of samples."""
+        """The conditions at start; reads the files of --samples."""
         return Link(self._conditions("up"), self._conditions("down"))
 
     def _conditions(self, direction: str) -> LinkConditions:
@@ -95,7 +127,7 @@ class LinkFlags:
 
 
 def as_flags(settings: Mapping[str, Any]) -> list[str]:
-    """Settings by name as a command line."""
+    """Settings by name, as flags of a command line."""
     flags = []
     for name, value in settings.items():
         name = name.replace("_", "-")

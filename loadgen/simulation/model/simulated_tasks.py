@@ -12,7 +12,7 @@ from offboard.common.tasks import Kind, kind_of
 from offboard.common.wire import messages as wire
 from offboard.loadgen.scenario.scenario import Workload
 from offboard.loadgen.simulation.model.costs import COSTS, PARTS, PLANS, ROUNDS, Cost
-from offboard.robot_client.simulated.task_source import make_work
+from offboard.robot_client.simulated.work import make_work
 
 HASH_BYTES = bytes(32)  # a value as long as the answers of offboard.loadgen.scenario.hash_tasks
 OTHERS_TASKS_MAX = 50  # tasks of each other robot, which asks for them again and again

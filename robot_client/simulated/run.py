@@ -1,4 +1,7 @@
-"""The robot at work: asks for each task when it is due, notes what came back, goes on, and sums it up."""
+"""One run of tasks: asks for each task when it is due, records the answers and sums them up.
+
+The tasks come from `work`; where they run is decided by the offloader.
+"""
 
 import contextlib
 import itertools
@@ -18,21 +21,19 @@ from offboard.robot_client.offloader import BOTH, Offloader
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.simulated.answers import Answered, Answers
 from offboard.robot_client.simulated.config import RobotConfig
-from offboard.robot_client.simulated.references import References, orders
+from offboard.robot_client.simulated.references import References
 from offboard.robot_client.simulated.summary import Summary, describe, show_progress
-from offboard.robot_client.simulated.task_source import Work
+from offboard.robot_client.simulated.work import Work
 from offboard.robot_client.simulated.workload import CLOSED, due_instants
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
-MADE_MAX = 32  # tasks that wait, ready made, for their instant
-MADE_FIRST_MAX = 1000  # made before the first is asked for, where none depends on an answer
-WAYS = (ONBOARD, CLOUD, BOTH)  # in which `Drive.run_alone` runs each of its tasks
+MADE_MAX = 32  # tasks that are made ahead and wait for their instant
+MADE_FIRST_MAX = 1000  # tasks that are made before the first one starts, if none depends on an answer
 
 T = TypeVar("T")
 
 
 class OwnRecord(threading.local):
-    """An observer that keeps, for each thread, the record of the task that it asked for last."""
+    """An observer that keeps, for each thread, the record of the last task that this thread asked for."""
 
     record: Record | None = None
 
@@ -40,16 +41,16 @@ class OwnRecord(threading.local):
         self.record = record
 
     def take(self) -> Record | None:
-        """The record, once."""
+        """Return the record and forget it."""
         record, self.record = self.record, None
         return record
 
 
-class Drive:
+class Run:
     """Asks for `config.tasks` tasks of `work`, the first `config.measure` of them on both sites.
 
-    `own` is an observer of `offload`. With `answers` every task leaves a line there, those that have one
-    are not asked again, and a task that fails does not end the run.
+    `own` must be an observer of `offload`. With `answers`, each task leaves a line there, tasks that have a
+    line already are left out, and a failed task does not end the run.
     """
 
     def __init__(
@@ -57,9 +58,9 @@ class Drive:
         config: RobotConfig,
         work: Work,
         offload: Offloader,
+        *,
         own: OwnRecord,
         say: Callable[[str], None],
-        *,
         answers: Answers | None = None,
         references: References | None = None,
     ) -> None:
@@ -79,20 +80,20 @@ class Drive:
         self._start_s: float | None = None
 
     def warm(self, offload: Offloader) -> None:
-        """Get all sites ready for the first measured task; it is the same task afterwards.
+        """Run the first task once on all sites, so that they are ready for it; the run starts with it again.
 
-        `offload` is not the one of the run, which shall learn and record nothing of this.
+        `offload` must not be the offloader of the run, which must not learn from this or record it.
         """
         kind = kind_of(self._work.function)
         if kind.warm is not None:
             kind.warm()
-        cpu.used_s()  # the first call looks for what to read
+        cpu.used_s()  # the first call takes longer: it looks for the files to read
         if kind.duplicate:
-            with contextlib.suppress(TaskError):  # task 0 will say it again
+            with contextlib.suppress(TaskError):  # the run meets and reports the same failure
                 offload(self._work.function, *self._work.request(), where=BOTH)
 
     def run(self) -> None:
-        """All tasks that have no answer yet, and the summary."""
+        """Ask for all tasks that have no answer yet, then say the summary."""
         if self._done:
             self._say(
                 f"{self._config.tasks - self._left} of {self._config.tasks} tasks had their answer before"
@@ -104,33 +105,11 @@ class Drive:
         for line in self._summary.lines():
             self._say(line)
 
-    def run_alone(self, offload: Offloader) -> None:
-        """`config.alone` further tasks, each run in all WAYS one after the other, in turning order.
-
-        `offload` knows onboard and the cloud, and nobody else.
-        """
-        whole, what = 0, "plans" if self._config.map else "tasks"
-        for number, order in enumerate(orders(self._config.alone, self._config.seed, WAYS)):
-            request, ran = self._work.request(), 0
-            for n, way in enumerate(order, 1):
-                answer = offload(self._work.function, *request, where=way)
-                record = offload.last
-                assert record is not None
-                ran += _ran(record, way)
-                show_progress(
-                    number * len(WAYS) + n, self._config.alone * len(WAYS), partial(describe, record)
-                )
-            self._work.advance(answer)
-            whole += ran == len(WAYS)
-        missing = f"; the {CLOUD} did not answer for the others" if whole < self._config.alone else ""
-        self._say(
-            f"run on each site alone and on both at once: {whole} of {self._config.alone} {what}{missing}"
-        )
-
     def _run_closed(self) -> None:
-        """Each task when the last is answered.
+        """Start each task when the previous one has its answer.
 
-        Where they can, they are made before: what simulates a LiDAR is not to take the CPU of the robot.
+        Tasks that do not depend on answers are made before the first one starts: simulating the LiDAR must
+        not take the robot's CPU during the run.
         """
         if self._work.independent:
             requests = self._requests()
@@ -150,7 +129,7 @@ class Drive:
             self._work.advance(answer)
 
     def _run_open(self) -> None:
-        """Each task when it is due, or as soon as fewer than `config.in_flight` are under way."""
+        """Start each task when it is due, or as soon as fewer than `config.in_flight` tasks are running."""
         slots = threading.BoundedSemaphore(self._config.in_flight)
         pool = ThreadPoolExecutor(self._config.in_flight, thread_name_prefix="task")
         failures: deque[BaseException] = deque(maxlen=1)
@@ -161,8 +140,8 @@ class Drive:
             slots.release()
 
         try:
-            with contextlib.closing(made_ahead(self._made())) as made:
-                for number, request, due_s in made:
+            with contextlib.closing(made_ahead(self._due_tasks())) as due_tasks:
+                for number, request, due_s in due_tasks:
                     self._begin()
                     time.sleep(max(0.0, due_s - self._now_s()))
                     slots.acquire()
@@ -173,19 +152,19 @@ class Drive:
             if failures:
                 raise failures[0]
         except BaseException:  # Ctrl-C too
-            self._stopped = True  # what is given up now is not answered
+            self._stopped = True  # tasks that are given up now leave no answer
             pool.shutdown(wait=False, cancel_futures=True)
             raise
 
     def _requests(self) -> Iterator[tuple[int, tuple[Any, ...]]]:
-        """Number and arguments of each task without an answer; none depends on the one before."""
+        """Number and arguments of each task without an answer; no task depends on an earlier answer."""
         for number in range(self._config.tasks):
             if number not in self._done:
                 yield number, self._work.request()
             self._work.advance(None)
 
-    def _made(self) -> Iterator[tuple[int, tuple[Any, ...], float]]:
-        """Number, arguments and due instant, in s after that of the first, of each task without an answer."""
+    def _due_tasks(self) -> Iterator[tuple[int, tuple[Any, ...], float]]:
+        """Number, arguments and due instant of each task without an answer, in s after the first of them."""
         config, first_s = self._config, None
         assert config.rate is not None, "checked by the config"
         instants = enumerate(due_instants(config.arrivals, config.rate, config.burst, config.seed))
@@ -195,7 +174,7 @@ class Drive:
             yield number, request, due_s - first_s
 
     def _begin(self) -> None:
-        """The first task is due: times count from here."""
+        """Start the clock, at the first task."""
         if self._start_s is None:
             if self._answers:
                 self._answers.begin()
@@ -206,7 +185,7 @@ class Drive:
         return time.monotonic() - self._start_s
 
     def _ask(self, number: int, request: tuple[Any, ...], due_s: float | None = None) -> Any:
-        """Run the task now and note how it went; its answer, None where it has none."""
+        """Run the task now and record how it went; return its answer, None if it failed."""
         where = BOTH if number < self._config.measure else None
         answer, described, error = None, None, None
         began_s = self._now_s()
@@ -215,7 +194,7 @@ class Drive:
             answer = self._offload(self._work.function, *request, where=where)
             ended_s = self._now_s()
             described = self._work.describe(answer) if self._answers else None
-        except Exception as failure:  # also what the user's own size function raises
+        except Exception as failure:  # the size function of the user may raise anything
             if self._answers is None or isinstance(failure, ConfigError):
                 raise
             ended_s, answer, error = self._now_s(), None, errors.describe(failure)
@@ -225,14 +204,14 @@ class Drive:
         if self._answers:
             own_id = record.id if record else None
             self._answers.write(Answered(number, own_id, due_s, began_s, ended_s, error, described))
-        self._note(record, answer, error, began_s - due_s)
+        self._note(record, answer, error, late_s=began_s - due_s)
         if self._references and self._references.due(number) and record is not None:
             self._references.measure(
                 number, self._work.function, request, waited_s=ended_s - due_s, record=record
             )
         return answer
 
-    def _note(self, record: Record | None, answer: Any, error: str | None, late_s: float) -> None:
+    def _note(self, record: Record | None, answer: Any, error: str | None, *, late_s: float) -> None:
         with self._lock:
             if record is None or error is not None:
                 self._summary.add_failure(late_s=late_s)
@@ -245,7 +224,7 @@ class Drive:
 
 
 def made_ahead(tasks: Iterator[T]) -> Generator[T]:
-    """The same in the same order, made by one thread, up to MADE_MAX of them before they are asked for."""
+    """The same tasks in the same order, made in another thread, up to MADE_MAX of them ahead."""
     maker = ThreadPoolExecutor(1, thread_name_prefix="maker")
     try:
         made = deque(maker.submit(next, tasks, None) for _ in range(MADE_MAX))
@@ -255,9 +234,3 @@ def made_ahead(tasks: Iterator[T]) -> Generator[T]:
             yield task
     finally:
         maker.shutdown(cancel_futures=True)
-
-
-def _ran(record: Record, way: str) -> bool:
-    """Whether it ran well where it was sent, and nowhere else."""
-    sent = [ONBOARD, CLOUD] if way == BOTH else [way]
-    return sorted(one.site for one in record.executions if one.ok) == sorted(sent)

@@ -1,6 +1,6 @@
-"""What a run asks for, task by task: plans of a robot on a map, or calls of a function by size.
+"""The tasks of a run, one after the other: plans for a robot on a map, or calls of a function with a size.
 
-When it is asked, and by whom it is answered, is the business of `Drive`.
+When they are asked for is up to `run`; where they run is up to the offloader.
 """
 
 import inspect
@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 from offboard.common.errors import ConfigError, OffloadError
 from offboard.common.tasks import Kind, kind_of, load_modules
 from offboard.robot_client.simulated import answers
-from offboard.robot_client.simulated.config import RobotConfig
+from offboard.robot_client.simulated.config import CallConfig, DriveConfig, RobotConfig
 from offboard.robot_client.simulated.workload import parse_sizes, sizes
 
-if TYPE_CHECKING:  # the planner is compiled where it is imported: only where there is a map
+if TYPE_CHECKING:  # importing the planner compiles it, which only a run on a map needs
     from offboard.common.planning.maps import GridMap
     from offboard.robot_client.simulated.robot import SimulatedRobot
 
@@ -25,32 +25,35 @@ TASK_ALLOWED = "MODULE:FUNCTION with a @task function of one number"
 class Work(Protocol):
     """The tasks of one run in their order, for one thread at a time.
 
-    `found` says in the summary what was got (None: nothing to say); `got` tells which answers count;
-    `independent`: the tasks are the same whatever was answered.
+    `noun` is what a task is called in the summary, `found` what a good answer brings (None: nothing to say).
+    If the work is `independent`, its tasks do not depend on earlier answers.
     """
 
     function: Callable[..., Any]
+    noun: str
     found: str | None
     independent: bool
 
     def request(self) -> tuple[Any, ...]:
-        """The arguments of the present task; asking twice changes nothing."""
+        """The arguments of the present task; a second call returns the same."""
 
     def advance(self, answer: Any) -> None:
-        """Go on to the next task; None where the present one was not asked or has no answer."""
+        """Go on to the next task; `answer` is None if the present task was not asked for, or failed."""
 
-    def got(self, answer: Any) -> bool: ...
+    def got(self, answer: Any) -> bool:
+        """Whether the answer counts as `found`."""
 
     def describe(self, answer: Any) -> dict[str, Any]:
-        """The answer as the answers file holds it; an OffloadError where it is none."""
+        """The answer as the answers file holds it; raises an OffloadError if it cannot be written there."""
 
 
 class Plans:
-    """Plans of a robot, which drives each answer, or jumps to its goal without waiting for one.
+    """Plans for a robot, which drives each answer, or jumps to its goal without waiting for the answer.
 
-    `wanted` gives the input size of each task from the second on; without it goals are near and far alike.
+    `wanted` gives the input size of each task from the second on; without it, goals are near and far.
     """
 
+    noun = "plans"
     found: str | None = "a path was found"
 
     def __init__(self, robot: "SimulatedRobot", wanted: Iterator[float] | None, *, jump: bool) -> None:
@@ -81,8 +84,9 @@ class Plans:
 
 
 class Calls:
-    """Calls of a `@task` function with whole numbers, one of `wanted` each."""
+    """Calls of a `@task` function, each with the next whole number of `wanted`."""
 
+    noun = "tasks"
     found: str | None = None
     independent = True
 
@@ -95,10 +99,10 @@ class Calls:
     def request(self) -> tuple[Any, ...]:
         return (int(self._size),)
 
-    def advance(self, answer: Any) -> None:  # noqa: ARG002 - the next call is the same whatever came back
+    def advance(self, answer: Any) -> None:  # noqa: ARG002 - no call depends on an answer
         self._size = next(self._wanted)
 
-    def got(self, answer: Any) -> bool:  # noqa: ARG002 - any answer is what was asked for
+    def got(self, answer: Any) -> bool:  # noqa: ARG002 - every answer counts
         return True
 
     def describe(self, answer: Any) -> dict[str, Any]:
@@ -106,16 +110,15 @@ class Calls:
 
 
 def make_work(config: RobotConfig) -> Work:
-    """The work that the settings ask for; ConfigError or DataError where there is none such."""
-    wanted = sizes(parse_sizes(config.sizes), config.seed) if config.sizes else None
-    if config.task is not None:
-        assert wanted is not None, "checked by the config"
+    """The work that the settings ask for; a ConfigError or DataError if it cannot be made."""
+    if isinstance(config, CallConfig):
         function = _find_task(config.task)
         _check_repeats(config, kind_of(function))
-        return Calls(function, wanted)
+        return Calls(function, sizes(parse_sizes(config.sizes), config.seed))
     from offboard.robot_client.simulated.robot import SimulatedRobot
 
-    assert config.map is not None, "checked by the config"
+    assert isinstance(config, DriveConfig)
+    wanted = sizes(parse_sizes(config.sizes), config.seed) if config.sizes else None
     robot = SimulatedRobot(
         read_prior(config.map, config.resolution),
         seed=config.seed,
@@ -127,12 +130,15 @@ def make_work(config: RobotConfig) -> Work:
     return Plans(robot, wanted, jump=config.jump)
 
 
-def read_prior(path: Path, resolution: float) -> "GridMap":
-    """The map that the robot was given; ROS maps at the planning resolution."""
+def read_prior(path: Path, resolution: float | None) -> "GridMap":
+    """The map that the robot is given, in cells of `resolution` metres (None: those of the file).
+
+    A MovingAI map keeps its cells.
+    """
     from offboard.common.planning.maps import read_map, resampled
 
     grid = read_map(path)
-    return grid if path.suffix == ".map" else resampled(grid, resolution)
+    return grid if resolution is None or path.suffix == ".map" else resampled(grid, resolution)
 
 
 def _find_task(name: str) -> Callable[..., Any]:
@@ -152,7 +158,7 @@ def _find_task(name: str) -> Callable[..., Any]:
 
 
 def _check_repeats(config: RobotConfig, kind: Kind) -> None:
-    """A task that is never to run twice cannot be measured by running it again."""
+    """A ConfigError if the settings run a task twice that must not run twice."""
     for flag in ("measure", "alone", "reference"):
         if getattr(config, flag) and not kind.duplicate:
             raise ConfigError(

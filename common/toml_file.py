@@ -1,0 +1,50 @@
+"""Reads TOML files that people write; errors name the file, the line and the nearest known key.
+
+What the keys mean is said where the file is used.
+"""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from offboard.common.errors import DataError
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The tables of the file, or a DataError that names the file and the line."""
+    import tomllib  # not for --help
+
+    try:
+        return tomllib.loads(path.read_text())
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise DataError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+
+
+def unknown_key(path: Path, key: str, known: Sequence[str]) -> DataError:
+    """The error for a key that is not `known`; it names the line and the nearest known key."""
+    starts = (key, f"[{key}", f"[[{key}")
+    lines = enumerate(path.read_text().splitlines(), 1)
+    line = next((number for number, text in lines if text.strip().startswith(starts)), 1)
+    return DataError(f"{path}:{line}: {unknown('key', key, known)}")
+
+
+def unknown(what: str, name: str, known: Sequence[str]) -> str:
+    """Text for a name that is not `known`: the nearest known one, or all of them if none is near."""
+    import difflib  # loaded only after a mistake
+
+    near = difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(sorted(known))}"
+    return f"unknown {what} {name!r}; {hint}"
+
+
+def line_of(lines: Sequence[str], table: str, number: int, key: str) -> int:
+    """The line of `key` in the n-th [[table]]; the line of the table if the key is not found there."""
+    starts = [n for n, text in enumerate(lines, 1) if re.match(rf"\s*\[\[\s*{table}\s*\]\]", text)]
+    first = starts[number - 1] if 0 < number <= len(starts) else 1
+    tables = [n for n, text in enumerate(lines, 1) if re.match(r"\s*\[", text) and n > first]
+    named = re.compile(rf"(?<![\w-])[\"']?{re.escape(key)}[\"']?\s*[=.\]]")
+    last = min(tables, default=len(lines) + 1) - 1
+    return next((n for n in range(first, last + 1) if named.search(lines[n - 1])), first)

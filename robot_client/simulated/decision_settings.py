@@ -1,0 +1,138 @@
+"""The flags that say how a robot chooses a site: policy, predictor, objective and limits."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from offboard.common.config import setting
+from offboard.common.errors import ConfigError
+from offboard.robot_client import policies, predictors
+from offboard.robot_client.policies import objectives
+from offboard.robot_client.policies.allowance import DUPLICATES, Allowance
+from offboard.robot_client.policies.energy import Energy
+from offboard.robot_client.policies.objectives import OBJECTIVES, Objective
+from offboard.robot_client.predictors.window import WINDOW
+
+DECISIONS, OBJECTIVE, LIMITS = "decisions", "objective", "limits"
+MEAN = OBJECTIVES[0]
+NEEDS = {"deadline": "deadline_s", "energy": "s_per_joule"}  # the field that an objective cannot do without
+
+
+@dataclass(frozen=True)
+class DecisionSettings:
+    """How the robot decides where a task runs."""
+
+    policy: str = setting(
+        policies.DEFAULT, f"rule that chooses the site: {policies.HELP}", group=DECISIONS, metavar="NAME"
+    )
+    window: int = setting(
+        WINDOW, "executions remembered for each site", group=DECISIONS, minimum=2, maximum=1_000_000
+    )
+    predictor: str | None = setting(
+        None,
+        f"how times are predicted, instead of the way that the policy prefers: {predictors.HELP}",
+        group=DECISIONS,
+        rare=True,
+        metavar="NAME",
+    )
+    memory: Path | None = setting(
+        None, "file that keeps what the robot learns, and is read at start", group=DECISIONS, rare=True
+    )
+    objective: str = setting(
+        MEAN,
+        "what the policy minimises: mean time, time of the slowest 5 % (p95), missed deadlines, "
+        "or time and energy",
+        group=OBJECTIVE,
+        rare=True,
+        choices=OBJECTIVES,
+    )
+    deadline_s: float | None = setting(
+        None,
+        "with --objective deadline: time that a task may take, in seconds",
+        group=OBJECTIVE,
+        rare=True,
+        name="deadline",
+        minimum=0.001,
+        maximum=3600,
+    )
+    s_per_joule: float | None = setting(
+        None,
+        "with --objective energy: seconds that one joule is worth",
+        group=OBJECTIVE,
+        rare=True,
+        minimum=0.0,
+        maximum=1e6,
+    )
+    compute_watts: float = setting(
+        Energy().compute_w,
+        "power that one busy core draws above idle, in watts",
+        group=OBJECTIVE,
+        rare=True,
+        minimum=0.0,
+        maximum=1e4,
+    )
+    idle_watts: float = setting(
+        Energy().idle_w,
+        "power drawn while waiting for an answer, in watts",
+        group=OBJECTIVE,
+        rare=True,
+        minimum=0.0,
+        maximum=1e4,
+    )
+    radio_joules_byte: float = setting(
+        Energy().radio_j_byte,
+        "energy to send or receive one byte, in joules",
+        group=OBJECTIVE,
+        rare=True,
+        minimum=0.0,
+        maximum=1.0,
+    )
+    duplicates: float = setting(
+        DUPLICATES,
+        "share of tasks that may run on two sites, as probes or hedges",
+        group=LIMITS,
+        rare=True,
+        minimum=0.0,
+        maximum=1.0,
+        metavar="SHARE",
+    )
+    bytes_per_minute: float | None = setting(
+        None,
+        "bytes that may be sent and received in a minute; puts budget around the policy",
+        group=LIMITS,
+        rare=True,
+        minimum=0.0,
+        maximum=1e15,
+    )
+    joules_per_minute: float | None = setting(
+        None,
+        "joules that tasks may take from the battery in a minute; puts budget around the policy",
+        group=LIMITS,
+        rare=True,
+        minimum=0.0,
+        maximum=1e9,
+    )
+
+    def check_decisions(self) -> None:
+        policies.check_name(self.policy, "--policy")
+        if self.predictor is not None:
+            predictors.check_name(self.predictor, "--predictor")
+        for name, field in NEEDS.items():
+            value, flag = getattr(self, field), field.removesuffix("_s").replace("_", "-")
+            if self.objective == name and value is None:
+                raise ConfigError(f"--objective: {name} needs --{flag}")
+            if self.objective != name and value is not None:
+                raise ConfigError(f"--{flag}: {value:g} needs --objective {name}")
+        if self.objective != MEAN and not policies.weighs_cost(self.policy):
+            raise ConfigError(f"--objective: {self.objective} changes nothing with --policy {self.policy}")
+
+    def goal(self) -> Objective:
+        """What the policy minimises."""
+        return objectives.make(self.objective, deadline_s=self.deadline_s, s_a_joule=self.s_per_joule)
+
+    def energy(self) -> Energy:
+        """What tasks take from the battery."""
+        return Energy(self.compute_watts, self.idle_watts, self.radio_joules_byte)
+
+    def allowance(self) -> Allowance:
+        """What may be spent; a fresh one for each offloader."""
+        return Allowance(self.duplicates, self.bytes_per_minute, self.joules_per_minute)

@@ -1,0 +1,152 @@
+"""The settings of `robot-client drive` and `call`: which go together, and what is made from them."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from offboard.common.command_line import load
+from offboard.common.errors import ConfigError
+from offboard.robot_client.policies.allowance import DUPLICATES_MAX
+from offboard.robot_client.policies.energy import Energy
+from offboard.robot_client.policies.objectives import Mean, TimeAndEnergy
+from offboard.robot_client.policies.wrappers import STALE
+from offboard.robot_client.records import trace
+from offboard.robot_client.simulated.config import CallConfig, DriveConfig, RobotConfig
+
+MAP, TASK = {"map": Path("m.yaml")}, {"task": "m:f", "sizes": ("constant:1",)}
+OPEN = {"arrivals": "poisson", "rate": 5.0}
+TRACED = {"trace": Path("t"), "cloud": "tcp://h:1"}
+COSTS = {"policy": "greedy"}
+
+
+def config(settings: dict[str, Any]) -> RobotConfig:
+    """The config of `drive` or of `call`, whichever has these settings."""
+    return DriveConfig(**settings) if "map" in settings else CallConfig(**settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"task": "m:f"}, "--task: 'm:f' needs --sizes"),
+        (MAP | {"sizes": ("constant",)}, "--sizes: 'constant' is not constant:X"),
+        (MAP | {"arrivals": "often"}, "--arrivals: 'often' is not one of closed, constant, poisson, bursts"),
+        (TASK | {"arrivals": "bursts"}, "--arrivals: bursts needs --rate"),
+        (MAP | {"planner": "theta"}, "--planner: 'theta' is not one of dijkstra, astar, jps"),
+        (TASK | OPEN | {"rate": 0.0}, "--rate: 0.0 is below 0.001"),
+        (TASK | OPEN | {"burst": 0}, "--burst: 0 is below 1"),
+        (TASK | OPEN | {"in_flight": 0}, "--in-flight: 0 is below 1"),
+        (TASK | OPEN | {"in_flight": 1025}, "--in-flight: 1025 is above 1024"),
+        (MAP | OPEN, "--arrivals: poisson on a map needs --jump"),
+        (TASK | OPEN | {"measure": 1}, "--measure: 1 needs --arrivals closed"),
+        (TASK | OPEN | TRACED | {"alone": 2}, "--alone: 2 needs --arrivals closed"),
+        (TASK | OPEN | TRACED | {"reference": 3}, "--reference: 3 needs --arrivals closed"),
+        (TASK | TRACED | {"reference": 3, "trace": None}, "--reference: 3 needs --trace"),
+        (TASK | TRACED | {"reference": 3, "cloud": None}, "--reference: 3 needs --cloud"),
+        (MAP | TRACED | {"reference": 3}, "--reference: 3 on a map needs --jump"),
+        (MAP | {"reference": -1}, "--reference: -1 is below 0"),
+        (MAP | {"trace": Path("t"), "answers": Path("t")}, "--answers: t is also the file of --trace"),
+        (
+            MAP | {"trace": Path("t"), "memory": Path("t")},
+            "--memory: t is also the file of --trace or --answers",
+        ),
+        (
+            MAP | COSTS | {"objective": "fast"},
+            "--objective: 'fast' is not one of mean, p95, deadline, energy",
+        ),
+        (MAP | COSTS | {"objective": "deadline"}, "--objective: deadline needs --deadline"),
+        (MAP | COSTS | {"objective": "energy"}, "--objective: energy needs --s-per-joule"),
+        (MAP | COSTS | {"deadline_s": 0.5}, "--deadline: 0.5 needs --objective deadline"),
+        (MAP | COSTS | {"s_per_joule": 2.0}, "--s-per-joule: 2 needs --objective energy"),
+        (MAP | COSTS | {"objective": "deadline", "deadline_s": 0.0}, "--deadline: 0.0 is below 0.001"),
+        (
+            MAP | {"objective": "p95", "policy": "paper"},
+            "--objective: p95 changes nothing with --policy paper",
+        ),
+        (MAP | {"objective": "p95", "policy": "hedge:cloud"}, "--objective: p95 changes nothing with"),
+        (MAP | {"duplicates": 1.5}, "--duplicates: 1.5 is above 1"),
+        (MAP | {"compute_watts": -1.0}, "--compute-watts: -1.0 is below 0"),
+        (MAP | {"bytes_per_minute": -1.0}, "--bytes-per-minute: -1.0 is below 0"),
+        (MAP | {"joules_per_minute": float("nan")}, "--joules-per-minute: nan is below 0"),
+    ],
+)
+def test_flags_that_contradict_each_other_are_refused(settings: dict[str, Any], message: str) -> None:
+    """Flags that contradict each other are named with their values, before any file is opened."""
+    with pytest.raises(ConfigError) as caught:
+        config(settings)
+    assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        MAP,
+        TASK | OPEN,
+        MAP | OPEN | {"jump": True, "arrivals": "bursts"},
+        MAP | TRACED | {"jump": True, "reference": 10, "measure": 5, "alone": 5},
+        TASK | TRACED | {"reference": 1},
+        MAP | {"policy": "hedge:greedy", "objective": "deadline", "deadline_s": 0.2},
+        MAP | {"bytes_per_minute": 1e6, "joules_per_minute": 60.0, "duplicates": 0.0, "memory": Path("m")},
+    ],
+)
+def test_flags_that_fit_together_are_accepted(settings: dict[str, Any]) -> None:
+    """Flags that fit together are accepted."""
+    assert config(settings).in_flight == 16
+
+
+def test_objective_energy_and_limits_are_made_from_the_flags() -> None:
+    """Without flags they are the defaults of the library."""
+    plain = DriveConfig(**MAP)
+    assert isinstance(plain.goal(), Mean)
+    assert plain.energy() == Energy()
+    assert not plain.allowance().capped
+    flags = "--objective energy --s-per-joule 2 --compute-watts 3 --idle-watts 0.5 --radio-joules-byte 1e-6"
+    caps = "--policy greedy --bytes-per-minute 6000 --joules-per-minute 60 --duplicates 0.5"
+    config = load(
+        DriveConfig,
+        ["--map", "m", *flags.split(), *caps.split()],
+        prog="r",
+        description="",
+        environ={},
+        prefix="R",
+    )
+    assert config.goal() == TimeAndEnergy(2.0)
+    assert config.energy() == Energy(3.0, 0.5, 1e-6)
+    allowance = config.allowance()
+    allowance.begin(0.0)
+    assert (allowance.duplicates, allowance.bytes_left, allowance.joules_left) == (
+        DUPLICATES_MAX,
+        6000.0,
+        60.0,
+    )
+
+
+def test_a_second_run_starts_with_what_the_first_one_learnt(tmp_path: Path) -> None:
+    """With --memory, the second run has predictions from its first task on; a folder is refused."""
+    (tmp_path / "mine.py").write_text(
+        "from offboard.common.tasks import task\n"
+        "@task('mine', size=lambda number: number)\n"
+        "def mine(number: int) -> int:\n"
+        "    return number\n"
+    )
+    flags = "--task mine:mine --sizes uniform:1:9 --window 5 --memory memory.json --trace trace.jsonl --tasks"
+    for tasks in ("8", "1"):
+        command = [sys.executable, "-m", "offboard.robot_client", "call", *flags.split(), tasks]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=30, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+    records = list(trace.read(tmp_path / "trace.jsonl"))
+    assert records[0]["sites"]["onboard"]["predicted_s"] is None
+    assert records[8]["sites"]["onboard"]["predicted_s"] is not None
+    assert (records[8]["i"], records[8]["sites"]["onboard"]["age"]) == (0, STALE)
+    command = [
+        sys.executable,
+        "-m",
+        "offboard.robot_client",
+        "call",
+        *flags.replace("memory.json", ".").split(),
+        "1",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=30, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (2, "robot-client call: memory .: is a folder\n")

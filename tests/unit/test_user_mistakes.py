@@ -1,0 +1,149 @@
+"""Mistakes of users on the real command lines: one line that helps, never a traceback."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+YAML = "origin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
+FILES = {
+    "no-resolution.yaml": "image: map.pgm\n" + YAML,
+    "text-image.yaml": "image: words.txt\nresolution: 0.1\n" + YAML,
+    "words.txt": "not an image",
+    "bad.jsonl": '{"v": 1}\nnonsense\n',
+    "text.csv": "size,onboard_s,cloud_s\n1,2,3\n1,two,3\n",
+    "empty.csv": "",
+    "answers.jsonl": '{"v":1,"i":0,"id":"","due_s":0,"began_s":0,"ended_s":0,"error":"","answer":null}\n',
+    "open.map": "type octile\nheight 3\nwidth 3\nmap\n...\n...\n...\n",
+    "text-link.toml": 'name = "odd"\n[workload]\nmap = "open.map"\n[link]\ndelay_ms = "slow"\n',
+    "open.toml": 'name = "open"\n[workload]\nmap = "open.map"\n',
+    "alone.toml": 'name = "alone"\n[workload]\nmap = "open.map"\ntasks = 3\nalone = 4\n',
+    "no-map.toml": 'name = "odd"\n[workload]\nmap = "none.yaml"\n',
+    "odd.toml": 'name = "odd"\n[workload]\nmap = "m.yaml"\ntaks = 3\n',
+}
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (["robot_client", "drive"], "--map is missing"),
+        (["robot_client", "call"], "--task is missing"),
+        (["robot_client", "call", "--map", "open.map"], "unrecognized arguments: --map open.map"),
+        (["robot_client", "drive", "--task", "m:f"], "unrecognized arguments: --task m:f"),
+        (["robot_client", "drive", "--map", "none.yaml"], "none.yaml"),
+        (
+            ["robot_client", "call", "--task", "m:f", "--sizes", "constant:1"],
+            "--task: 'm:f' is not MODULE:FUNCTION",
+        ),
+        (["robot_client", "drive", "--map", "open.map", "--sizes", "none.csv"], "--sizes: 'none.csv' is not"),
+        (
+            ["robot_client", "drive", "--map", "open.map", "--radius", "0", "--answers", "answers.jsonl"],
+            "--answers: answers.jsonl holds 1 answers; going on after them needs --jump",
+        ),
+        (["robot_client", "drive", "--map", "no-resolution.yaml"], "no-resolution.yaml: resolution"),
+        (["robot_client", "drive", "--map", "text-image.yaml"], "words.txt"),
+        (
+            ["robot_client", "drive", "--map", "open.map", "--radius", "9"],
+            "no room for a robot of radius 9 m",
+        ),
+        (
+            ["robot_client", "drive", "--map", "open.map", "--metrics", "127.0.0.1:99999"],
+            "--metrics: '127.0.0.1:99999'",
+        ),
+        (
+            ["robot_client", "drive", "--map", "open.map", "--policy", "paper", "--objective", "p95"],
+            "--objective: p95 changes nothing with",
+        ),
+        (
+            ["robot_client", "drive", "--map", "open.map", "--trace", "words.txt"],
+            "words.txt: the file is there and is no",
+        ),
+        (["robot_client", "drive", "--map", "m.yaml", "--window", "0"], "--window: 0 is below 2"),
+        (
+            ["robot_client", "drive", "--map", "m.yaml", "--policy", "x"],
+            "'x' is not one of paper, onboard, cloud",
+        ),
+        (
+            ["robot_client", "drive", "--map", "m.yaml", "--cloud", "tcp:/x"],
+            "--cloud: 'tcp:/x' is not tcp://HOST:PORT",
+        ),
+        (
+            ["robot_client", "drive", "--map", "m.yaml", "--site", "edge"],
+            "--site: 'edge' is not NAME=tcp://HOST:PORT",
+        ),
+        (
+            ["robot_client", "drive", "--map", "m.yaml", "--trace", "t", "--alone", "3"],
+            "--alone: 3 needs --cloud",
+        ),
+        (
+            ["robot_client", "drive", "--map", "m.yaml", "--cloud", "tcp://h:1", "--alone", "3"],
+            "--alone: 3 needs --trace",
+        ),
+        (
+            ["robot_client", "drive", "--map", "m.yaml", "--tasks", "3", "--alone", "4"],
+            "--alone: 4 is above --tasks 3",
+        ),
+        (["loadgen", "run", "alone.toml"], "alone.toml: workload.alone: 4 is above workload.tasks 3"),
+        (["cloud_server", "--listen", "localhost"], "--listen: 'localhost'"),
+        (["cloud_server", "--tasks", "no.such.module"], "'no.such.module' cannot be imported"),
+        (["loadgen", "table", "none.csv"], "none.csv"),
+        (["loadgen", "table", "text.csv"], "text.csv:3: onboard_s"),
+        (["loadgen", "table", "empty.csv"], "empty.csv"),
+        (["loadgen", "table", "bad.jsonl"], "bad.jsonl:1: no field"),
+        (["loadgen", "table", "text.csv", "--windows", "0"], "--windows: '0'"),
+        (["loadgen", "run", "odd.toml"], "odd.toml:4: unknown key 'taks'; did you mean 'tasks'?"),
+        (["loadgen", "run", "no-map.toml"], "no-map.toml: workload.map: "),
+        (["cloud_server", "--tasks", "json"], "--tasks: json registers no task"),
+        (["cloud_server", "--config", "."], ".: Is a directory"),
+        (["loadgen", "run", "none"], "scenario 'none' is neither a file nor one of bandwidth, burst"),
+        (["loadgen", "run", "text-link.toml"], "text-link.toml: link.delay_ms: 'slow' is not a number"),
+        (["loadgen", "run", "open.toml", "--out", "words.txt"], "--out: words.txt cannot be written to"),
+        (["loadgen", "wan", "--delay-ms", "-1"], "--delay-ms: -1"),
+        (["loadgen", "wan", "--to", "nowhere"], "--to: 'nowhere' is not HOST:PORT"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(command: list[str], message: str, tmp_path: Path) -> None:
+    """The error is one line on stderr that names the mistake, without a traceback."""
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text)
+    done = subprocess.run(
+        [sys.executable, "-m", f"offboard.{command[0]}", *command[1:]],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        cwd=tmp_path,
+    )
+    assert done.returncode == 2, done.stderr
+    assert message in done.stderr
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert done.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("command", "extra"),
+    [(["cloud_server"], "cloud"), (["loadgen", "wan"], "bench")],
+)
+def test_a_missing_extra_is_named(command: list[str], extra: str) -> None:
+    """Without its optional libraries a command says what to install, with exit code 2."""
+    probe = (
+        "import runpy, sys\n"
+        "sys.modules['uvicorn'] = sys.modules['fastapi'] = None\n"
+        f"sys.argv = {command!r}\n"
+        "runpy.run_module(sys.argv[0], run_name='__main__')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, timeout=30)
+    assert done.returncode == 2
+    assert done.stderr.endswith(f"pip install 'offboard[{extra}]'\n")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_reader_that_stops_early_is_not_an_error(tmp_path: Path) -> None:
+    """`loadgen table ... | head -1` ends without a message."""
+    rows = "\n".join(f"{n},{n},1" for n in range(1, 40))
+    (tmp_path / "rows.csv").write_text(f"size,onboard_s,cloud_s\n{rows}\n")
+    table = f"{sys.executable} -m loadgen table rows.csv --windows {','.join(map(str, range(2, 35)))}"
+    done = subprocess.run(
+        f"{table} --format json | true", shell=True, cwd=tmp_path, capture_output=True, text=True, timeout=30
+    )
+    assert done.stderr == ""
