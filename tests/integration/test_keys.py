@@ -20,7 +20,7 @@ from offboard.common import VERSION
 from offboard.common.security.keys import PRIVATE, make_keys, robot_keys, server_keys
 from offboard.common.wire import messages as wire
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.sites.cloud import REFUSED, UNFIT
+from offboard.robot_client.sites.connection import NO_HANDSHAKE, UNKNOWN_ROBOT
 from tests.curves import ROOT, WAIT_S, Dealer, Served, clean_environ, recorded, says_until_closed, until
 from tests.probes import echo, mark_once, nap
 
@@ -122,7 +122,7 @@ def test_a_robot_without_keys_is_not_served(keys: Keys, serve: Serve, robot: Rob
     """No key: the handshake fails, the robot's tasks stay onboard, and the server reads nothing of it."""
     served = serve(keys)
     offload = robot(served.endpoint, None)
-    until(lambda: UNFIT in why_not(offload))
+    until(lambda: NO_HANDSHAKE in why_not(offload))
     stays_onboard(offload)
     assert metric(served, "bytes_in_total") == 0
 
@@ -131,7 +131,7 @@ def test_a_robot_that_is_not_known_is_refused(keys: Keys, serve: Serve, robot: R
     """Wrong key: refused, said on both sides and counted; once its key is there it is served."""
     served = serve(keys)
     offload = robot(served.endpoint, keys.make("stranger"))
-    until(lambda: REFUSED in why_not(offload))
+    until(lambda: UNKNOWN_ROBOT in why_not(offload))
     stays_onboard(offload)
     assert metric(served, "refused_total") > 0
     until(lambda: served.logged("refused a robot at 127.0.0.1"))
@@ -161,7 +161,7 @@ def test_a_removed_robot_is_cut_off(keys: Keys, serve: Serve, robot: Robot) -> N
     took_s = until(lambda: why_not(removed), within_s=CUT_S)
     print(f"cut off after {took_s:.2f} s")
     stays_onboard(removed)
-    until(lambda: REFUSED in why_not(removed))
+    until(lambda: UNKNOWN_ROBOT in why_not(removed))
     assert served.logged("cut off robot removed") == 1
     assert other(echo, 2) == 2
     assert other.last is not None
@@ -273,7 +273,7 @@ def test_a_server_with_another_key_gets_no_task(keys: Keys, serve: Serve, robot:
     make_keys(folder, "server")
     (folder / f"server{PRIVATE}").unlink()
     offload = robot(served.endpoint, folder)
-    until(lambda: UNFIT in why_not(offload))
+    until(lambda: NO_HANDSHAKE in why_not(offload))
     stays_onboard(offload)
     assert metric(served, "bytes_in_total") == 0
 
@@ -282,7 +282,7 @@ def test_a_plain_server_gets_no_task_from_a_robot_with_keys(keys: Keys, serve: S
     """A robot with keys does not fall back to plain text."""
     served = serve(None)
     offload = robot(served.endpoint, keys.add("arm"))
-    until(lambda: UNFIT in why_not(offload))
+    until(lambda: NO_HANDSHAKE in why_not(offload))
     assert metric(served, "bytes_in_total") == 0
 
 
@@ -401,7 +401,7 @@ def test_insecure_is_said(serve: Serve, robot: Robot, caplog: pytest.LogCaptureF
         lambda: served.logged("--insecure: --listen: tcp://0.0.0.0:0 is beyond loopback and without --keys;")
     )
     assert httpx.get(f"{served.http}/health").json()["insecure"] is True
-    with caplog.at_level(logging.WARNING, "offboard.robot_client.sites.cloud"):
+    with caplog.at_level(logging.WARNING, "offboard.robot_client.sites.cloud_socket"):
         for _ in range(2):
             offload = robot(served.endpoint.replace("127.0.0.1", "0.0.0.0"), None)
             assert offload.wait_for_sites(echo, WAIT_S) == {}
