@@ -35,8 +35,8 @@ type: $(DEV_READY) ## mypy, strict, on the unpacked wheel
 	$(BIN)/python -m build --wheel --no-isolation --outdir $(CACHE)/typed . >/dev/null
 	cd $(CACHE)/typed && $(BIN_ABS)/python -m zipfile -e offboard-*.whl . && $(BIN_ABS)/mypy --config-file $(CURDIR)/pyproject.toml --cache-dir $(CACHE)/mypy -p offboard
 
-# Tests that do not mind another one beside them.
-CROWDED := tests/unit $(addprefix tests/integration/test_,$(addsuffix .py,alone attacks blobs compare crashes dataset demo fuzz keys own_task processes robot_workload toxiproxy wheel))
+# Tests that may run in parallel with others.
+CROWDED := tests/unit tests/integration/keys $(addprefix tests/integration/test_,$(addsuffix .py,alone attacks blobs compare crashes dataset demo fuzz own_task processes robot_workload toxiproxy wheel))
 test: $(DEV_READY) ## every test that this machine can run; what is skipped says why
 	$(BIN)/pytest --numprocesses 2 $(CROWDED)
 	$(BIN)/pytest $(addprefix --ignore ,$(CROWDED))
