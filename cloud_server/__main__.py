@@ -22,6 +22,7 @@ DESCRIPTION = (
     "and /docs. `cloud-server keys` makes the keys of the server."
 )
 
+EMPTY_TASK_MODULE = "offboard.common.empty_task"
 SWITCH_S = 0.0005  # a thread that computes must let others run this often, so that replies are not delayed
 
 log = logging.getLogger("offboard.cloud_server")
@@ -72,13 +73,15 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
     load_modules(config.tasks)
     if not kinds():
         raise ConfigError(f"--tasks: {','.join(config.tasks)} registers no task")
+    modules = (*config.tasks, EMPTY_TASK_MODULE)  # for `robot-client check`
+    load_modules(modules)
     log.info("settings: %s", as_dict(config))
     log.info("up to %d files may be open; each connected robot needs one", files_max)
     metrics = Metrics()
     executor = EXECUTORS[config.executor]
     server = Server(
         config.listen,
-        executor(config.workers, config.tasks, config.blob_bytes_max, config.worker_memory_bytes),
+        executor(config.workers, modules, config.blob_bytes_max, config.worker_memory_bytes),
         metrics,
         queue_max=config.queue_max,
         blob_bytes_max=config.blob_bytes_max,

@@ -12,11 +12,11 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
-from offboard.common.command_line import Command, load, run_commands
-from offboard.common.config import as_dict
+from offboard.common.command_line import Command, CommandParser, add_flags, load, run_commands
+from offboard.common.config import as_dict, resolve
 from offboard.common.errors import ConfigError, OffloadError
 from offboard.robot_client.simulated.config import CallConfig, DriveConfig, RobotConfig
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, PORT_MAX
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, PORT_MAX, check_endpoint
 
 if TYPE_CHECKING:
     from offboard.robot_client.offloader import Offloader
@@ -48,6 +48,31 @@ def _call(argv: Sequence[str]) -> int:
     config = _load(CallConfig, argv, "call", about)
     _find_modules_here()
     return _run(config)
+
+
+def _check(argv: Sequence[str]) -> int:
+    from offboard.robot_client.check.check_config import CheckConfig
+
+    about = "Check step by step whether this robot can use a server. Each failed step comes with a remedy."
+    parser = CommandParser(prog="robot-client check", description=about, operands="ENDPOINT")
+    parser.add_argument("endpoint", metavar="ENDPOINT", help="tcp://HOST:PORT of the server")
+    add_flags(parser, CheckConfig, "ROBOT_CHECK")
+    flags = parser.parse_args(argv)
+    config = resolve(CheckConfig, flags, environ=os.environ, prefix="ROBOT_CHECK")
+    check_endpoint("ENDPOINT", flags.endpoint)
+    _find_modules_here()
+    import logging
+
+    from offboard.robot_client.check.outcome import FAIL
+    from offboard.robot_client.check.steps import Check
+
+    logging.disable(logging.WARNING)  # the lines say the same
+    check = Check(flags.endpoint, keys=config.keys, modules=config.tasks, timeout_s=config.timeout_s)
+    failed = False
+    for line in check.run():
+        print(line, flush=True)
+        failed = failed or line.status == FAIL
+    return int(failed)
 
 
 def _make_keys(argv: Sequence[str]) -> int:
@@ -204,6 +229,7 @@ def _interrupt(*_: object) -> NoReturn:
 COMMANDS = {
     "drive": Command("drive a simulated robot on a map", _drive),
     "call": Command("call a task of yours with numbers", _call),
+    "check": Command("check whether this robot can use a server", _check),
     "keys": Command("make the keys of this robot", _make_keys),
 }
 

@@ -36,6 +36,7 @@ FOLDERS: dict[str, set[str]] = {
         "robot_client/records",
         "robot_client/sites",
     },
+    "robot_client/check": {"robot_client/sites"},
     "robot_client/simulated": {
         "robot_client",
         "robot_client/policies",

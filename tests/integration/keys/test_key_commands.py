@@ -44,7 +44,15 @@ def test_a_private_key_that_others_may_use_is_refused(keys: Keys, tmp_path: Path
         (folder / f"{name}{PRIVATE}").chmod(mode)
     token = token_file(tmp_path)
     token.chmod(mode)
-    nap_flags = ["call", "--task", "tests.probes:nap", "--sizes", "constant:0", "--cloud", "tcp://127.0.0.1:1"]
+    nap_flags = [
+        "call",
+        "--task",
+        "tests.probes:nap",
+        "--sizes",
+        "constant:0",
+        "--cloud",
+        "tcp://127.0.0.1:1",
+    ]
     for package, flags, flag, path in (
         ("cloud_server", ["--keys", keys.server], "--keys", keys.server / f"server{PRIVATE}"),
         ("cloud_server", ["--token-file", token], "--token-file", token),

@@ -140,7 +140,17 @@ def test_the_robot_command_takes_keys(keys: Keys, serve: Serve, tmp_path: Path) 
     """`robot-client` takes its keys from ROBOT_KEYS as from --keys, and its tasks run in the cloud."""
     served = serve(keys)
     folder, answers = keys.add("arm"), tmp_path / "trace.jsonl"
-    flags = ["call", "--task", "tests.probes:nap", "--sizes", "constant:0", "--policy", "cloud", "--tasks", "3"]
+    flags = [
+        "call",
+        "--task",
+        "tests.probes:nap",
+        "--sizes",
+        "constant:0",
+        "--policy",
+        "cloud",
+        "--tasks",
+        "3",
+    ]
     flags += ["--cloud", served.endpoint, "--trace", str(answers)]
     done = run("robot_client", *flags, ROBOT_KEYS=str(folder))
     assert done.returncode == 0, done.stderr

@@ -1,0 +1,213 @@
+"""The steps of `robot-client check`: each one finds out one thing about a server, or fails with a remedy.
+
+How the questions are sent is in `network` and `session`.
+"""
+
+import statistics
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from offboard.common import VERSION as SOFTWARE
+from offboard.common.empty_task import EMPTY
+from offboard.common.security.keys import ROBOT, SERVER, robot_keys
+from offboard.common.tasks import kinds
+from offboard.common.wire import messages as wire
+from offboard.robot_client.check.network import Address, Listener, connect, identify, reason, resolve
+from offboard.robot_client.check.outcome import FAIL, OK, SKIP, Line, StepFailed
+from offboard.robot_client.check.session import ConnectionLost, Session
+from offboard.robot_client.check.task_comparison import compare, load_kinds
+from offboard.robot_client.sites.connection import UNKNOWN_ROBOT, HandshakeFailure
+from offboard.robot_client.sites.runner import CLOUD
+
+PINGS = 10
+
+
+class Check:
+    """One check of the server at `endpoint`. Each step uses what the steps before it found out.
+
+    `keys` is the folder of the robot's keys, `modules` register the tasks that are compared, `timeout_s`
+    bounds each step.
+    """
+
+    def __init__(self, endpoint: str, *, keys: Path | None, modules: Sequence[str], timeout_s: float) -> None:
+        self._endpoint = endpoint
+        self._address = Address.of(endpoint)
+        self._folder = keys
+        self._keys = None if keys is None else robot_keys(keys, CLOUD)
+        self._kinds = load_kinds(modules)
+        self._timeout_s = timeout_s
+        self._ip = ""
+        self._listener = Listener.OTHER
+        self._session: Session | None = None
+        self._server: wire.Hello | None = None
+
+    def run(self) -> Iterator[Line]:
+        """The line of each step, as soon as the step is over. After a failed step, all others are skipped."""
+        steps: dict[str, Callable[[], str]] = {
+            "name resolves": self._resolve,
+            "port is open": self._connect,
+            "server answers": self._identify,
+            "keys": self._shake_hands,
+            "hello": self._say_hello,
+            "tasks": self._compare_tasks,
+            "round trip": self._ping,
+            "empty task": self._run_empty_task,
+        }
+        failed = False
+        try:
+            for name, step in steps.items():
+                if failed:
+                    yield Line(SKIP, name)
+                    continue
+                line = self._take(name, step)
+                failed = line.status == FAIL
+                yield line
+        finally:
+            if self._session is not None:
+                self._session.close()
+
+    def _take(self, name: str, step: Callable[[], str]) -> Line:
+        try:
+            return Line(OK, name, step())
+        except StepFailed as failed:
+            return Line(FAIL, name, str(failed))
+        except ConnectionLost:
+            remedy = "look into the log of the server; it may have been stopped, or have cut this robot off"
+            return Line(FAIL, name, str(StepFailed("the server closed the connection", remedy)))
+
+    def _resolve(self) -> str:
+        host = self._address.host
+        try:
+            self._ip = resolve(self._address)
+        except OSError as error:
+            raise StepFailed(
+                f"{host}: {reason(error)}",
+                "correct the name, or add it to DNS or /etc/hosts; containers must share a network",
+            ) from error
+        return f"{host} -> {self._ip}"
+
+    def _connect(self) -> str:
+        port = self._address.port
+        try:
+            connect(self._ip, self._address, self._timeout_s)
+        except ConnectionRefusedError as error:
+            raise StepFailed(
+                f"nothing listens on port {port} of {self._ip}",
+                f"start the server with --listen tcp://*:{port}, or correct the port",
+            ) from error
+        except OSError as error:
+            raise StepFailed(
+                f"port {port} of {self._ip}: {reason(error)}",
+                "check that the computer is on and can be reached, and that no firewall blocks the port",
+            ) from error
+        return f"port {port} of {self._ip}"
+
+    def _identify(self) -> str:
+        try:
+            self._listener = identify(self._ip, self._address, self._timeout_s)
+        except OSError as error:
+            raise StepFailed(f"no second connection: {reason(error)}", "check again") from error
+        where = f"port {self._address.port}"
+        if self._listener is Listener.HTTP:
+            raise StepFailed(
+                f"an HTTP server listens on {where}",
+                "use the port of `cloud-server --listen`, 5555 by default, not that of --http",
+            )
+        if self._listener is Listener.CLOSING:
+            raise StepFailed(
+                f"{where} closes each connection at once",
+                "if it is a relay (loadgen wan), check its --to and the server there; else correct the port",
+            )
+        if self._listener is Listener.OTHER:
+            raise StepFailed(
+                f"a program that is not a cloud-server listens on {where}",
+                "use the port of `cloud-server --listen`, 5555 by default",
+            )
+        return "a ZMQ server"
+
+    def _shake_hands(self) -> str:
+        encrypted = self._listener is Listener.ENCRYPTED
+        if encrypted and self._keys is None:
+            raise StepFailed(
+                "the server wants keys, and this robot has none",
+                f"run `robot-client keys --out keys`, copy keys/{ROBOT}.key into the robots folder of the "
+                f"server as NAME.key, copy {SERVER}.key of the server into keys, and pass --keys keys",
+            )
+        if not encrypted and self._keys is not None:
+            raise StepFailed(
+                "the server has no keys, and this robot has some",
+                "start the server with --keys (`cloud-server keys` makes them), or leave out --keys here",
+            )
+        self._session = Session(self._endpoint, self._keys, self._timeout_s)
+        outcome = self._session.handshake()
+        if isinstance(outcome, HandshakeFailure) and outcome.text == UNKNOWN_ROBOT:
+            raise StepFailed(
+                "the server does not know the key of this robot",
+                f"copy {self._folder}/{ROBOT}.key into the robots folder of the server, as NAME.key",
+            )
+        if isinstance(outcome, HandshakeFailure) and encrypted:
+            raise StepFailed(
+                f"{self._folder}/{SERVER}.key is not the key of this server",
+                f"copy {SERVER}.key from the --keys folder of the server to {self._folder}",
+            )
+        if isinstance(outcome, HandshakeFailure) or outcome is None:
+            raise StepFailed("the handshake does not end", "check the network, and the log of the server")
+        return "encrypted (CURVE); each side knows the other" if encrypted else "none; nothing is encrypted"
+
+    def _say_hello(self) -> str:
+        assert self._session is not None
+        try:
+            self._server = self._session.hello({kind.name: kind.source_hash for kind in kinds()})
+        except wire.VersionMismatch as error:
+            remedy = f"install the same version of Offboard on both sides; this robot has {SOFTWARE}"
+            raise StepFailed(str(error), remedy) from error
+        if self._server is None:
+            raise StepFailed(
+                f"the server has not answered within {self._timeout_s:g} s",
+                "wait until it is ready (/ready of its --http address answers 200) and check again",
+            )
+        size = self._server.message_bytes_max / 2**20
+        versions = f"Offboard {self._server.software} there, {SOFTWARE} here"
+        return f"wire version {wire.VERSION}; {versions}; messages up to {size:g} MiB"
+
+    def _compare_tasks(self) -> str:
+        assert self._server is not None
+        return compare(self._kinds, self._server.tasks)
+
+    def _ping(self) -> str:
+        assert self._session is not None
+        round_trips_ms = []
+        for number in range(1, PINGS + 1):
+            seconds = self._session.ping(number)
+            if seconds is None:
+                raise StepFailed(
+                    f"ping {number} of {PINGS} got no answer within {self._timeout_s:g} s",
+                    "check the network between robot and server, or pass a longer --timeout",
+                )
+            round_trips_ms.append(1e3 * seconds)
+        median_ms = statistics.median(round_trips_ms)
+        return f"median {median_ms:.1f} ms, worst {max(round_trips_ms):.1f} ms of {PINGS}"
+
+    def _run_empty_task(self) -> str:
+        assert self._session is not None
+        assert self._server is not None
+        if EMPTY not in self._server.tasks:
+            raise StepFailed(
+                f"the server has no task {EMPTY}, which every server of this version has",
+                f"install Offboard {SOFTWARE} on the server",
+            )
+        reply = self._session.run(EMPTY)
+        if reply is None:
+            raise StepFailed(
+                f"no answer within {self._timeout_s:g} s",
+                "the workers may be busy: look at queue_depth in /metrics of the server, and check again",
+            )
+        if reply.status in ("busy", "expired"):
+            raise StepFailed(
+                f"the server is busy: {reply.error}", "check again later, or give it more --workers"
+            )
+        if reply.status != "ok":
+            raise StepFailed(f"{reply.status}: {reply.error}", "look into the log of the server")
+        return (
+            f"ran; it waited {1e3 * reply.queue_s:.1f} ms and took {1e3 * reply.run_s:.1f} ms on the server"
+        )

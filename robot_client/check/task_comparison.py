@@ -1,0 +1,56 @@
+"""Compares the tasks of this robot with those of a server, by name and by the hash of their source."""
+
+import contextlib
+from collections.abc import Mapping, Sequence
+
+from offboard.common.empty_task import EMPTY
+from offboard.common.errors import ConfigError
+from offboard.common.tasks import Kind, kinds, load_modules
+from offboard.robot_client.check.outcome import StepFailed
+
+HASH_SHOWN = 8  # characters of a source hash
+PLANNER = "offboard.common.planning.planner"
+
+
+def load_kinds(modules: Sequence[str]) -> tuple[Kind, ...]:
+    """The tasks of these modules; without modules those of the planner, if it is installed."""
+    if not modules:
+        with contextlib.suppress(ConfigError):  # the extra `planning` is not installed
+            return _registered_by([PLANNER])
+        return ()
+    found = _registered_by(modules)
+    if not found:
+        raise ConfigError(f"--tasks: {','.join(modules)} registers no task")
+    return found
+
+
+def compare(tasks: Sequence[Kind], there: Mapping[str, str]) -> str:
+    """What is the same on both sides; `there` holds the source hash of each task of the server."""
+    for kind in tasks:
+        module = kind.function.__module__
+        if kind.name not in there:
+            known = ", ".join(sorted(there.keys() - {EMPTY})) or "none"
+            raise StepFailed(
+                f"the server has no task {kind.name}; it has {known}",
+                f"start the server with --tasks {module}, or name the modules of your tasks with --tasks",
+            )
+        if not kind.source_hash == there[kind.name] != "":
+            hashes = f"{_short(kind.source_hash)} here, {_short(there[kind.name])} on the server"
+            raise StepFailed(
+                f"{kind.name} differs: its source is {hashes}",
+                f"install the same version of {module} on both sides, and restart the server",
+            )
+    if not tasks:
+        return "none to compare; name modules with --tasks"
+    return f"the same on both sides: {', '.join(kind.name for kind in tasks)}"
+
+
+def _registered_by(modules: Sequence[str]) -> tuple[Kind, ...]:
+    """The tasks that importing these modules registers, now or before."""
+    before = kinds()
+    load_modules(modules)
+    return tuple(kind for kind in kinds() if kind not in before or kind.function.__module__ in modules)
+
+
+def _short(source_hash: str) -> str:
+    return source_hash[:HASH_SHOWN] or "not readable"
