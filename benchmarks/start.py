@@ -15,7 +15,7 @@ from benchmarks.measure import Bar, Table, interleaved
 from benchmarks.servers import READY_S, Server, cloud_server, running
 from offboard.common.wire import messages as wire
 
-COMMANDS = {"robot-client": "robot_client", "cloud-server": "cloud_server", "loadgen": "loadgen"}
+COMMANDS = {"robot-client drive": "robot_client drive", "cloud-server": "cloud_server", "loadgen": "loadgen"}
 ROBOTS = 500  # that are connected and idle
 REST_S = 10.0
 HEAVY = ("zmq", "numba")
@@ -41,16 +41,16 @@ def tables() -> list[Table]:
 def _help() -> Table:
     python = [sys.executable]
     cases: dict[str, Callable[[], object]] = {"python -c pass": lambda: _run([*python, "-c", "pass"])}
-    for name, package in COMMANDS.items():
-        cases[f"{name} --help"] = lambda package=package: _run(
-            [*python, "-m", f"offboard.{package}", "--help"]
+    for name, words in COMMANDS.items():
+        cases[f"{name} --help"] = lambda words=words: _run(
+            [*python, "-m", *f"offboard.{words}".split(), "--help"]
         )
     seconds = interleaved(cases)
     least = seconds["python -c pass"]
     rows = [[name, f"{each * 1e3:.0f}", f"{each / least:.1f}"] for name, each in seconds.items()]
     bars = [Bar(f"{name} over nothing", each / least, 6.0) for name, each in seconds.items() if each != least]
-    for name, package in COMMANDS.items():
-        said = _run([*python, "-X", "importtime", "-m", f"offboard.{package}", "--help"])
+    for name, words in COMMANDS.items():
+        said = _run([*python, "-X", "importtime", "-m", *f"offboard.{words}".split(), "--help"])
         loaded = [heavy for heavy in HEAVY if f"| {heavy}\n" in said.replace(" " * 2, "")]
         bars.append(Bar(f"heavy libraries that {name} --help loads", len(loaded), 0))
     return Table("--help", ("command", "ms", "over nothing"), rows, bars)

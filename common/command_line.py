@@ -13,7 +13,7 @@ from typing import Any, NoReturn, TypeVar
 
 from offboard.common.config import REQUIRED, flag_of, resolve, settings_of, type_of
 from offboard.common.errors import ConfigError, DataError, OffloadError
-from offboard.common.toml_file import unknown
+from offboard.common.toml_file import nearest, unknown
 
 C = TypeVar("C")
 
@@ -101,6 +101,7 @@ class CommandParser(argparse.ArgumentParser):
             add_help=False,
             allow_abbrev=False,  # --task must not be taken for --tasks
         )
+        self.flags: list[str] = []  # those of `add_flags`
         self._rare: dict[argparse.Action, str] = {}
         about = "show this help, and exit"
         self._short_help = self.add_argument(*HELP, action=_ShowHelp, rare=False, help=about)
@@ -120,6 +121,9 @@ class CommandParser(argparse.ArgumentParser):
         return self.format_help()
 
     def error(self, message: str) -> NoReturn:
+        wrong = message.partition("unrecognized arguments: ")[2].split()
+        if wrong and (near := nearest(wrong[0].partition("=")[0], self.flags)):
+            message = f"{message}; did you mean {near}?"
         self.exit(USAGE_EXIT, f"{self.prog}: {message} (see {self.prog} --help)\n")
 
 
@@ -142,6 +146,7 @@ def add_flags(parser: CommandParser, cls: type, prefix: str) -> None:
             help=help.replace("%", "%%"),
             **_shape(field, cls),
         )
+        parser.flags.append(f"--{flag_of(field)}")
         if field.metadata["rare"]:
             parser.add_rare(action)
 

@@ -33,11 +33,16 @@ def unknown_key(path: Path, key: str, known: Sequence[str]) -> DataError:
 
 def unknown(what: str, name: str, known: Sequence[str]) -> str:
     """Text for a name that is not `known`: the nearest known one, or all of them if none is near."""
+    near = nearest(name, known)
+    hint = f"did you mean {near!r}?" if near else f"known: {', '.join(sorted(known))}"
+    return f"unknown {what} {name!r}; {hint}"
+
+
+def nearest(name: str, known: Sequence[str]) -> str | None:
+    """The known name that looks most like `name`, if one does."""
     import difflib  # loaded only after a mistake
 
-    near = difflib.get_close_matches(name, known, n=1)
-    hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(sorted(known))}"
-    return f"unknown {what} {name!r}; {hint}"
+    return next(iter(difflib.get_close_matches(name, known, n=1)), None)
 
 
 def line_of(lines: Sequence[str], table: str, number: int, key: str) -> int:

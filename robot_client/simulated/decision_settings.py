@@ -14,6 +14,10 @@ from offboard.robot_client.predictors.window import WINDOW
 
 DECISIONS, OBJECTIVE, LIMITS = "decisions", "objective", "limits"
 MEAN = OBJECTIVES[0]
+POLICY_HELP = (
+    f"{policies.HELP}. `default` stands for {policies.DEFAULT}: run a task where it should finish first, "
+    "try the other site now and then, and start the task there as well if the first site is late"
+)
 NEEDS = {"deadline": "deadline_s", "energy": "s_per_joule"}  # the field that an objective cannot do without
 
 
@@ -22,7 +26,7 @@ class DecisionSettings:
     """How the robot decides where a task runs."""
 
     policy: str = setting(
-        policies.DEFAULT, f"rule that chooses the site: {policies.HELP}", group=DECISIONS, metavar="NAME"
+        policies.DEFAULT, f"rule that chooses the site: {POLICY_HELP}", group=DECISIONS, metavar="NAME"
     )
     window: int = setting(
         WINDOW, "executions remembered for each site", group=DECISIONS, minimum=2, maximum=1_000_000

@@ -92,11 +92,14 @@ def test_operands_are_in_the_usage() -> None:
 
 
 def test_an_unknown_flag_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
-    """The error names the flag, and the command that explains the flags."""
+    """The error names the flag, the nearest known flag, and the command that explains the flags."""
     with pytest.raises(SystemExit) as caught:
         load(Settings, ["--spede", "3"], prog="tool", description="", environ={}, prefix="TOOL")
     assert caught.value.code == 2
-    assert capsys.readouterr().err == "tool: unrecognized arguments: --spede 3 (see tool --help)\n"
+    assert (
+        capsys.readouterr().err
+        == "tool: unrecognized arguments: --spede 3; did you mean --speed? (see tool --help)\n"
+    )
 
 
 @pytest.mark.parametrize(

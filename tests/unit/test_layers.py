@@ -206,15 +206,26 @@ def test_the_robot_library_needs_no_extra() -> None:
     assert done.stdout == "Offloader\n", done.stderr
 
 
-@pytest.mark.parametrize("command", ["robot_client", "cloud_server", "loadgen"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "robot_client",
+        "robot_client drive",
+        "robot_client call",
+        "robot_client check",
+        "cloud_server",
+        "loadgen",
+    ],
+)
 def test_help_loads_no_heavy_library(command: str) -> None:
     """--help answers with exit code 0 without importing numpy, zmq, numba, fastapi or what learns."""
     heavy = ("numpy", "zmq", "numba", "fastapi", "sklearn", "statsmodels", "river", "torch", "scipy")
+    package, *words = command.split()
     probe = (
         "import runpy, sys\n"
-        f"sys.argv = [{command!r}, '--help']\n"
+        f"sys.argv = {[package, *words, '--help']!r}\n"
         "try:\n"
-        f"    runpy.run_module('offboard.{command}', run_name='__main__')\n"
+        f"    runpy.run_module('offboard.{package}', run_name='__main__')\n"
         "except SystemExit as end:\n"
         "    assert end.code in (0, None), end.code\n"
         f"print([name for name in {heavy!r} if name in sys.modules], file=sys.stderr)\n"

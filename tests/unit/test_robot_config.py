@@ -9,6 +9,7 @@ import pytest
 
 from offboard.common.command_line import load
 from offboard.common.errors import ConfigError
+from offboard.robot_client import policies
 from offboard.robot_client.policies.allowance import DUPLICATES_MAX
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.objectives import Mean, TimeAndEnergy
@@ -121,6 +122,18 @@ def test_objective_energy_and_limits_are_made_from_the_flags() -> None:
         6000.0,
         60.0,
     )
+
+
+@pytest.mark.parametrize("cls", [DriveConfig, CallConfig])
+def test_the_help_explains_the_default_policy(
+    cls: type[RobotConfig], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It says what `default` stands for, and what that does."""
+    monkeypatch.setenv("COLUMNS", "1000")
+    with pytest.raises(SystemExit):
+        load(cls, ["--help"], prog="r", description="", environ={}, prefix="R")
+    help = capsys.readouterr().out
+    assert f"`default` stands for {policies.DEFAULT}: run a task where it should finish first" in help
 
 
 def test_a_second_run_starts_with_what_the_first_one_learnt(tmp_path: Path) -> None:

@@ -51,6 +51,43 @@ def test_with_jumps_answers_do_not_change_later_requests(sizes: tuple[str, ...])
     assert first != asked(on_map(*sizes, seed=4), [None] * 8)
 
 
+MAP_YAML = """image: map.pgm
+resolution: {resolution}
+origin: [0, 0, 0]
+negate: 0
+occupied_thresh: 0.65
+free_thresh: 0.2
+"""
+
+
+def small_map(folder: Path, resolution: float) -> Path:
+    """An empty room of 90 x 60 cells, as a map.yaml."""
+    rows = [bytes(90)] + [b"\0" + b"\xff" * 88 + b"\0"] * 58 + [bytes(90)]
+    (folder / "map.pgm").write_bytes(b"P5\n90 60\n255\n" + b"".join(rows))
+    path = folder / "map.yaml"
+    path.write_text(MAP_YAML.format(resolution=resolution))
+    return path
+
+
+@pytest.mark.parametrize("resolution", [0.02, 0.03, 0.05])
+def test_a_map_is_planned_at_its_own_resolution(tmp_path: Path, resolution: float) -> None:
+    """Without --resolution, the cells are those of the map, and the robot finds its paths."""
+    work = make_work(DriveConfig(map=small_map(tmp_path, resolution), obstacles=0, jump=True))
+    for _ in range(5):
+        grid, *_ = request = work.request()
+        assert (grid.resolution, grid.cells.shape) == (resolution, (60, 90))
+        assert plan_path(*request).status == "NONE"
+        work.advance(None)
+
+
+def test_a_resolution_must_divide_that_of_the_map(tmp_path: Path) -> None:
+    """0.03 m can be planned at 0.015 m; 0.025 m is refused."""
+    path = small_map(tmp_path, 0.03)
+    assert make_work(DriveConfig(map=path, obstacles=0, resolution=0.015)).request()[0].resolution == 0.015
+    with pytest.raises(DataError, match=r"resolution 0\.025"):
+        make_work(DriveConfig(map=path, obstacles=0, resolution=0.025))
+
+
 @pytest.mark.parametrize("name", PLANNERS)
 def test_requests_name_the_planner_of_the_flag(name: str) -> None:
     """Each planner is named in the request, and its path has the same cost."""
