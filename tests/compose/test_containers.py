@@ -96,7 +96,9 @@ def test_an_unknown_flag_is_the_parts_own_line(tmp_path: Path, monkeypatch: pyte
     monkeypatch.chdir(ROOT)
     with (
         DockerTestbed(tmp_path, {"wan": Setup({"dely_ms": 1.0})}) as bed,
-        pytest.raises(ConfigError, match=r"^loadgen wan: unrecognized arguments: --dely-ms=1.0 "),
+        pytest.raises(
+            ConfigError, match=r"^loadgen wan: unrecognized arguments: --dely-ms=1.0; did you mean --delay-ms"
+        ),
     ):
         bed.start("wan")
     assert made_by_docker(bed.run) == []

@@ -54,7 +54,9 @@ def test_an_unknown_flag_is_the_parts_own_line(tmp_path: Path) -> None:
     """A part that does not know a flag says so, as ConfigError."""
     with (
         LocalTestbed(tmp_path, {"wan": Setup({"dely_ms": 1.0})}) as bed,
-        pytest.raises(ConfigError, match=r"^loadgen wan: unrecognized arguments: --dely-ms=1.0 "),
+        pytest.raises(
+            ConfigError, match=r"^loadgen wan: unrecognized arguments: --dely-ms=1.0; did you mean --delay-ms"
+        ),
     ):
         bed.start("wan")
 
