@@ -668,7 +668,7 @@ def test_a_task_that_hangs_does_not_hold_the_exit(folder: Path, join: Join, pipe
     until(lambda: httpx.get(f"{command.http}/health").json()["running"] == 1)
     code, rest = command.end(signal.SIGINT)
     assert code == 1
-    assert "drain time of 0.1 s was over" in rest
+    assert "still running after the drain time of 0.1 s" in rest
 
 
 @pytest.mark.parametrize(

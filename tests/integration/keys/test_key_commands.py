@@ -77,7 +77,7 @@ OPEN, TO_ALL = "is beyond loopback and without", "0.0.0.0:0"
         ([*CLOUD, "--listen", "tcp://*:0"], f"--listen: tcp://*:0 {OPEN} --keys"),
         ([*CLOUD, "--http", TO_ALL], f"--http: {TO_ALL} {OPEN} --token-file"),
         ([*CLOUD, "--http", "[::]:0"], f"--http: [::]:0 {OPEN} --token-file"),
-        ([*CLOUD, "--robots", "."], "--robots: . needs --keys, the server's own"),
+        ([*CLOUD, "--robots", "."], "--robots: . needs --keys, the keys of the server"),
         ([*CLOUD, "--keys", "none"], "--keys: none/server.key_secret: No such file or directory"),
         ([*WAN, "--http", TO_ALL], f"--http: {TO_ALL} {OPEN} --token-file"),
         ([*WAN, "--token-file", "none"], "--token-file: none: No such file or directory"),
