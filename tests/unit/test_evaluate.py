@@ -174,10 +174,10 @@ def lines_of(markdown: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
 
 
-def section(heading: str, page: str = PAGE) -> str:
+def section(heading: str) -> str:
     """The text of the page below `heading`, up to the next one."""
-    found = re.search(rf"^#+ {re.escape(heading)}\n(.*?)(?=^#|\Z)", page, re.MULTILINE | re.DOTALL)
-    assert found, f"the page has no section {heading!r}"
+    found = re.search(rf"^#+ {re.escape(heading)}\n(.*?)(?=^#|\Z)", PAGE, re.MULTILINE | re.DOTALL)
+    assert found, f"docs/evaluation.md has no section {heading!r}"
     return found[1]
 
 
