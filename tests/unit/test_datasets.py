@@ -10,7 +10,7 @@ from offboard.loadgen.table.table_two import PAPER_WINDOWS, Evaluation, TableCon
 from tests.unit.test_evaluate import expected_table, lines_of, replay, rows_of
 
 FOLDER = Path(__file__).parents[2] / "loadgen" / "datasets"
-RESULTS = (FOLDER.parents[1] / "docs" / "results-h.md").read_text(encoding="utf-8")
+RESULTS = (FOLDER.parents[1] / "docs" / "results.md").read_text(encoding="utf-8")
 NAMES = ("congested", "paper")
 
 
