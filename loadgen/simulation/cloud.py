@@ -15,7 +15,7 @@ from offboard.loadgen.simulation.model.server import BUSY, NEED_BLOB, Key, Reply
 from offboard.loadgen.simulation.model.true_costs import Truth, number_of
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client.sites.cloud import PENDING_MAX
-from offboard.robot_client.sites.heartbeat import ALONG_S, Heartbeat, Told
+from offboard.robot_client.sites.heartbeat import EARLY_S, Heartbeat, ServerReport
 from offboard.robot_client.sites.own_cpu import OwnCpu
 from offboard.robot_client.sites.runner import CLOUD, Condition, Execution
 
@@ -77,7 +77,7 @@ class SimulatedCloud:
             self._end(pending, CloudBusy(f"{PENDING_MAX} tasks are in flight"), started=False)
         else:
             self._pending[task.id] = pending
-            if self._heartbeat.due_s <= now_s + ALONG_S:
+            if self._heartbeat.due_s <= now_s + EARLY_S:
                 self._say_beat()
             self._clock.after(self.sending_s, partial(self._send, pending))
             self._clock.at(pending.deadline_s, partial(self._expire, pending))
@@ -219,6 +219,6 @@ class SimulatedCloud:
         told = self._server.told
         self.connection.answer(BEAT_REPLY_BYTES, BEAT, number, partial(self._beat_heard, number, told))
 
-    def _beat_heard(self, number: int, told: Told) -> None:
+    def _beat_heard(self, number: int, told: ServerReport) -> None:
         self._heartbeat.answer(number, self._clock.now_s(), told)
         self._plan_beat()

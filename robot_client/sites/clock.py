@@ -1,4 +1,7 @@
-"""The offloader's time: what it reads, and how it waits. Simulations have a clock of their own."""
+"""The clock of the offloader: how it reads the time, and how it waits.
+
+Simulations have a clock of their own.
+"""
 
 import contextlib
 import threading
@@ -8,31 +11,31 @@ from concurrent import futures
 from concurrent.futures import CancelledError, Future
 from typing import Any, Protocol
 
-from offboard.robot_client.sites.turns import Answer
+from offboard.robot_client.sites.shared_reader import Answer
 
 
 class Clock(Protocol):
-    """Seconds from any start, never backwards."""
+    """Seconds since an arbitrary start; they never go backwards."""
 
     def now_s(self) -> float: ...
 
     def wait(self, pending: "Sequence[Future[Any]]", timeout_s: float | None = None) -> None:
-        """Return once one of these futures is done, or after `timeout_s`."""
+        """Return as soon as one of these futures is done, or after `timeout_s`."""
 
 
 class SystemClock:
-    """The time of this host."""
+    """The clock of this host."""
 
     now_s = staticmethod(time.perf_counter)
 
     def wait(self, pending: "Sequence[Future[Any]]", timeout_s: float | None = None) -> None:
         if timeout_s is not None:
-            timeout_s = min(timeout_s, threading.TIMEOUT_MAX)  # beyond it Python raises OverflowError
-        if len(pending) == 1:  # half the work of the general case
+            timeout_s = min(timeout_s, threading.TIMEOUT_MAX)  # a longer one raises OverflowError
+        if len(pending) == 1:  # takes half as long as the general case
             with contextlib.suppress(TimeoutError, CancelledError):
                 pending[0].exception(timeout_s)
             return
-        for one in pending:
-            if isinstance(one, Answer):
-                one.leave()
+        for future in pending:
+            if isinstance(future, Answer):
+                future.leave_to_thread()
         futures.wait(pending, timeout_s, futures.FIRST_COMPLETED)

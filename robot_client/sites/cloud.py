@@ -1,22 +1,15 @@
-"""The runner of a remote site: one DEALER socket; whoever asks sends himself, and reads if he is alone.
+"""The runner of a remote site: it sends tasks to one server, and matches the answers by id.
 
-Answers are matched by id; whatever arrives late is dropped. What a message looks like is `wire.messages`.
+What a message looks like is `wire.messages`; which thread reads the socket is `shared_reader`; whether the
+server can be used is `connection`.
 """
 
-import contextlib
 import logging
-import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import Future
-from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any
-
-import zmq
-import zmq.utils.monitor
 
 from offboard.common import VERSION as SOFTWARE
 from offboard.common.errors import (
@@ -25,68 +18,38 @@ from offboard.common.errors import (
     CloudBusy,
     CloudError,
     CloudTimeout,
-    ConfigError,
     OffloadError,
     Overtaken,
     ProtocolError,
-    TaskFailed,
 )
-from offboard.common.security.guard import on_loopback
 from offboard.common.security.keys import RobotKeys
 from offboard.common.tasks import Kind, Task, kinds
 from offboard.common.wire import messages as wire
-from offboard.common.wire.channel import Channel, readable
-from offboard.robot_client.sites.heartbeat import ALONG_S, Heartbeat, Told
+from offboard.robot_client.sites.blob_uploads import BlobUploads
+from offboard.robot_client.sites.cloud_socket import MESSAGE_BYTES_MAX, CloudSocket, SocketEvent
+from offboard.robot_client.sites.connection import Action, Connection, HandshakeFailure
+from offboard.robot_client.sites.heartbeat import EARLY_S, Heartbeat, ServerReport
 from offboard.robot_client.sites.own_cpu import OWN_CPU
+from offboard.robot_client.sites.pending_request import PendingRequest
 from offboard.robot_client.sites.runner import CLOUD, Condition, Execution, check_endpoint
-from offboard.robot_client.sites.turns import Answer, Turns
-from offboard.robot_client.sites.uploads import Uploads
+from offboard.robot_client.sites.shared_reader import Answer, SharedReader
 
 PENDING_MAX = 1024
 ATTEMPTS_MAX = 4  # sends of one request: the first, and one after each `need_blob`
-MESSAGE_BYTES_MAX = 256 * 1024 * 1024
-SEND_QUEUE_MAX = 1000  # messages, per socket
-HELLO_EVERY_S = 1.0  # until it is answered; a server that refused the handshake is asked as often
-RECONNECT_MS, RECONNECT_MAX_MS = 100, 1000
-# TCP alone may take a quarter of an hour to notice a peer that vanished without a word. ZMQ's own
-# heartbeats would wait behind a large argument and break a slow link that works.
-UNACKNOWLEDGED_MS = 15_000
-KEEPALIVE_IDLE_S, KEEPALIVE_EVERY_S, KEEPALIVE_PROBES = 10, 5, 2
 CLOSE_WAIT_S = 2.0
-REFUSED = "it does not know this robot's key"
-UNFIT = "the handshake failed: the connection broke, or keys do not fit the server's"
-HANDSHAKE_FAILURES: dict[int, tuple[str, bool]] = {  # and whether libzmq tries no more
-    zmq.EVENT_HANDSHAKE_FAILED_AUTH: (REFUSED, True),
-    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: (UNFIT, True),
-    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: (UNFIT, False),
-}
 IDLE_WAIT_S = 1.0
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(eq=False)
-class _Pending:
-    """A request in flight."""
-
-    task: Task
-    body: wire.Body
-    published: float
-    deadline: float
-    future: "Future[Execution]"
-    along: bool  # whether large arguments are in the body
-    attempt: int = 1
-    bytes_out: int = 0
-    sent_as: int = 0  # number of the last message it was sent in
-    asks: bool = False  # whether the server has a blob of it is not known
 
 
 class CloudRunner:
     """Runs tasks on the server at `endpoint` (tcp://HOST:PORT).
 
     The site is available for a kind once the server has answered `hello` on the present connection with
-    the same protocol version and the same source for that kind. `heartbeat_s`: seconds between heartbeats;
-    0: none, and nothing is measured but tasks. `keys`: encrypted, and with the server of this key alone.
+    the same protocol version and the same source for that kind.
+
+    heartbeat_s: seconds between heartbeats; 0: none are sent, and only tasks are measured.
+    keys: encrypt the connection, and connect only to the server of this key.
     """
 
     def __init__(
@@ -100,60 +63,49 @@ class CloudRunner:
     ) -> None:
         check_endpoint(site, endpoint)
         self.site = site
+        self._connection = Connection(site, endpoint)
         self._heartbeat = Heartbeat(heartbeat_s, seed, OWN_CPU)
-        self._endpoint = endpoint
-        self._absent: str | None = f"no answer from {endpoint} yet"
-        self._remote: dict[str, str] = {}
-        self._message_bytes_max = MESSAGE_BYTES_MAX  # what the server takes, once it said so
-        self._told: set[str] = set()
-        self._pending: dict[int, _Pending] = {}
-        self._unwanted: deque[int] = deque()
-        self._asked = False  # to find out whether the server is there
-        self._turns = Turns(
+        self._heartbeat_wanted = False  # by `hurry`
+        self._remote: dict[str, str] = {}  # source hashes at the server, by kind
+        self._message_bytes_max = MESSAGE_BYTES_MAX  # what the server takes, once it has said so
+        self._warned: set[str] = set()  # kinds
+        self._pending: dict[int, PendingRequest] = {}
+        self._cancelled: deque[int] = deque()
+        self._reader = SharedReader(
             self._tend,
             self._receive,
-            asked=self._pending.__len__,
-            expected=self._expected,
+            unanswered=self._pending.__len__,
+            expects_message=self._expects_message,
             wake=self._wake,
         )
-        self._looks_s = -math.inf  # when whoever waits for messages looks again, whatever happens
-        self._handshake_failure = ""  # the last one's, until one succeeds
-        self._given_up = False  # by libzmq, after such a failure
-        self._hello_due = math.inf
+        self._reader_wakes_s: float | None = None  # when a waiting reader wakes by itself; None: none waits
         self._messages = 0
-        self._uploads = Uploads()
-        self._context = zmq.Context()
-        try:
-            self._socket, self._monitor = _connect(self._context, endpoint, keys)
-        except zmq.ZMQError as error:
-            self._context.destroy(linger=0)
-            raise ConfigError(f"{site}: endpoint {endpoint!r}: {error}") from error
-        self._channel = Channel(self._socket, self._monitor.FD)
-        if keys is None:
-            _warn_of_plain_text(site, endpoint)
+        self._uploads = BlobUploads()
+        self._socket = CloudSocket(site, endpoint, keys)
         self._thread = threading.Thread(target=self._run, name=f"site-{site}", daemon=True)
         self._thread.start()
 
     def unavailable(self, kind: Kind) -> str | None:
-        if self._absent is not None:
-            return self._absent
+        absent = self._connection.why_absent
+        if absent is not None:
+            return absent
         if self._remote.get(kind.name) == kind.source_hash != "":
             return None
         why = (
-            f"task {kind.name} is not the same there"
+            f"the source of task {kind.name} differs on the server"
             if kind.name in self._remote
-            else f"no task {kind.name} there"
+            else f"the server has no task {kind.name}"
         )
-        if kind.name not in self._told:
-            self._told.add(kind.name)
-            log.warning("%s: %s: it stays onboard", self.site, why)
+        if kind.name not in self._warned:
+            self._warned.add(kind.name)
+            log.warning("%s: %s: this task stays onboard", self.site, why)
         return why
 
     def submit(self, task: Task, budget_s: float) -> "Future[Execution]":
-        published = time.perf_counter()
+        published_s = time.perf_counter()
         try:
-            along = self._uploads.along(task.kind.name, self._message_bytes_max)
-            body = wire.encode(list(task.args), task.kind.types, blobs=True, along=along)
+            inline = self._uploads.inline_rule(task.kind.name, self._message_bytes_max)
+            body = wire.encode(list(task.args), task.kind.types, blobs=True, along=inline)
         except BadValue as error:
             return self._refused(BadValue(f"task {task.kind.name}: {error}"))
         largest = max([wire.byte_count(body.frames), *(raw.nbytes for raw in body.blobs.values())])
@@ -162,31 +114,39 @@ class CloudRunner:
             return self._refused(CloudBroken(failure))
         if len(self._pending) >= PENDING_MAX:
             return self._refused(CloudBusy(f"{PENDING_MAX} tasks are in flight"))
-        pending = _Pending(task, body, published, published + budget_s, Answer(self._turns), along.used)
-        with self._channel.lock:
-            if self._turns.closed:
+        pending = PendingRequest(
+            self.site,
+            task,
+            body,
+            published_s,
+            deadline_s=published_s + budget_s,
+            future=Answer(self._reader),
+            inline=inline.used,
+        )
+        with self._socket.lock:
+            if self._reader.closed:
                 pending.future.cancel()
                 return pending.future
             self._pending[task.id] = pending
-            self._beat(early_s=ALONG_S)
+            self._beat(early_s=EARLY_S)
             self._send_first(pending)
-            if pending.deadline < self._looks_s:
-                self._channel.wake()
+            if self._reader_wakes_s is not None and pending.deadline_s < self._reader_wakes_s:
+                self._socket.wake()
         return pending.future
 
     def cancel(self, task: Task) -> None:
-        self._unwanted.append(task.id)
-        self._turns.call()
+        self._cancelled.append(task.id)
+        self._reader.interrupt()
 
     def hurry(self) -> None:
-        self._asked = True
-        self._turns.call()
+        self._heartbeat_wanted = True
+        self._reader.interrupt()
 
     def condition(self) -> Condition:
         return self._heartbeat.condition(time.perf_counter())
 
     def close(self) -> None:
-        self._turns.close()
+        self._reader.close()
         self._thread.join(CLOSE_WAIT_S)
 
     def _refused(self, failure: OffloadError) -> "Future[Execution]":
@@ -194,283 +154,182 @@ class CloudRunner:
         future.set_result(Execution(self.site, 0.0, failure=failure, started=False))
         return future
 
-    def _expected(self) -> bool:
+    def _expects_message(self) -> bool:
         return bool(self._pending or self._heartbeat.unanswered)
 
     def _wake(self) -> None:
-        self._channel.wake()
+        self._socket.wake()
 
     def _run(self) -> None:
         try:
-            self._turns.run(IDLE_WAIT_S)
+            self._reader.run(IDLE_WAIT_S)
         finally:
             self._shut_down()
 
-    # What follows runs in the thread whose turn it is, but for sending a request.
+    # The thread that has the turn calls what follows. Only `submit` sends from another thread.
 
     def _tend(self) -> None:
-        """What is due."""
-        with self._channel.lock:
-            self._watch_connection()
-            while self._unwanted:
-                self._give_up(self._unwanted.popleft())
+        """Do what is due."""
+        with self._socket.lock:
+            self._follow_connection()
+            while self._cancelled:
+                self._cancel(self._cancelled.popleft())
             self._expire()
             self._beat()
 
     def _receive(self, wait_s: float) -> None:
-        with self._channel.lock:
+        with self._socket.lock:
             now_s = time.perf_counter()
-            due = [pending.deadline for pending in self._pending.values()]
-            self._looks_s = min([now_s + wait_s, self._hello_due, self._heartbeat.due_s, *due])
-        self._channel.wait(self._looks_s - now_s)
-        with self._channel.lock:
-            self._looks_s = -math.inf
-            while frames := self._channel.receive():
-                self._read(frames, time.perf_counter())
+            deadlines = [pending.deadline_s for pending in self._pending.values()]
+            wakes_s = min([now_s + wait_s, self._connection.due_s, self._heartbeat.due_s, *deadlines])
+            self._reader_wakes_s = wakes_s
+        self._socket.wait(wakes_s - now_s)
+        with self._socket.lock:
+            self._reader_wakes_s = None
+            while frames := self._socket.receive():
+                self._read([frame.buffer for frame in frames], time.perf_counter())
 
-    def _watch_connection(self) -> None:
-        while readable(self._monitor):
-            event = zmq.utils.monitor.recv_monitor_message(self._monitor)["event"]
-            if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
-                self._handshake_failure, self._given_up = "", False
-                self._say_hello()
-            elif event in HANDSHAKE_FAILURES:
-                failure, self._given_up = HANDSHAKE_FAILURES[event]
-                if failure == REFUSED != self._handshake_failure:
-                    log.warning("%s: %s: %s; asking again", self.site, self._endpoint, failure)
-                self._handshake_failure = failure
-            elif event == zmq.EVENT_DISCONNECTED:
-                self._hello_due = math.inf
-                self._heartbeat.stop()
-                if self._absent is None:
-                    log.warning("%s: connection to %s lost", self.site, self._endpoint)
-                self._absent = f"not connected to {self._endpoint}"
-                if self._handshake_failure:
-                    self._absent += f": {self._handshake_failure}"
-                if self._given_up:
-                    self._hello_due = time.perf_counter() + HELLO_EVERY_S
-                self._uploads.forget()
-                for request_id in list(self._pending):
-                    self._finish(request_id, CloudBroken("the connection was lost"))
+    def _follow_connection(self) -> None:
+        for event in self._socket.events():
+            now_s = time.perf_counter()
+            match event:
+                case SocketEvent.HANDSHAKE_SUCCEEDED:
+                    self._connection.handshake_succeeded(now_s)
+                case HandshakeFailure():
+                    self._connection.handshake_failed(event, now_s)
+                case SocketEvent.DISCONNECTED:
+                    self._connection.disconnected(now_s)
+                    self._heartbeat.stop()
+                    self._uploads.forget()
+                    for request_id in list(self._pending):
+                        self._give_up(request_id, CloudBroken("the connection was lost"))
+        match self._connection.take_due(time.perf_counter()):
+            case Action.SAY_HELLO:
+                known = {kind.name: kind.source_hash for kind in kinds()}
+                self._send(wire.Hello(known, SOFTWARE, MESSAGE_BYTES_MAX))
+            case Action.CONNECT_AGAIN:
+                self._socket.connect_again()
 
-    def _say_hello(self) -> None:
-        self._hello_due = time.perf_counter() + HELLO_EVERY_S
-        if self._given_up:
-            self._connect_again()
-            return
-        known = {kind.name: kind.source_hash for kind in kinds()}
-        self._send(wire.Hello(known, SOFTWARE, MESSAGE_BYTES_MAX))
+    def _cancel(self, request_id: int) -> None:
+        if request_id in self._pending:
+            self._send(wire.Cancel(request_id))
+            self._give_up(request_id, Overtaken("another site answered first"), censored=True)
+            self._heartbeat.hurry(time.perf_counter())
 
-    def _connect_again(self) -> None:
-        self._hello_due, self._given_up = math.inf, False
-        with contextlib.suppress(zmq.ZMQError):  # there is no connection to end
-            self._socket.disconnect(self._endpoint)
-        self._socket.connect(self._endpoint)
+    def _expire(self) -> None:
+        """Give up the requests whose budget is over."""
+        now_s = time.perf_counter()
+        for request_id in [id for id, pending in self._pending.items() if pending.deadline_s <= now_s]:
+            self._send(wire.Cancel(request_id))
+            self._give_up(request_id, CloudTimeout("no answer within the budget"), censored=True)
+            self._heartbeat.hurry(now_s)
 
     def _beat(self, early_s: float = 0.0) -> None:
         now_s = time.perf_counter()
-        if self._asked:
-            self._asked = False
+        if self._heartbeat_wanted:
+            self._heartbeat_wanted = False
             self._heartbeat.hurry(now_s)
         if self._heartbeat.due_s <= now_s + early_s:
             self._send(wire.Ping(self._heartbeat.beat(now_s)))
 
-    def _give_up(self, request_id: int) -> None:
-        """Nobody waits for the answer any more."""
-        if request_id in self._pending:
-            self._send(wire.Cancel(request_id))
-            self._finish(request_id, Overtaken("another site answered first"), censored=True)
-            self._heartbeat.hurry(time.perf_counter())
+    def _send_first(self, pending: PendingRequest) -> None:
+        """Send a request for the first time.
 
-    def _send_first(self, pending: _Pending) -> None:
-        """Blobs that the server may have are only named, unless those of this kind are always new."""
+        Blobs of a kind whose arguments are always new are uploaded first; others are only named.
+        """
         body, kind = pending.body, pending.task.kind.name
         unknown = self._uploads.unknown(body)
         if unknown and self._uploads.often_new(kind):
             self._upload(pending, unknown)
         elif unknown:
-            pending.asks = True
-        elif body.blobs and not pending.along:
+            pending.doubtful = True
+        elif body.blobs and not pending.inline:
             self._uploads.found(kind, new=False)
         self._send_request(pending)
 
-    def _send_request(self, pending: _Pending) -> None:
-        left_s = pending.deadline - time.perf_counter()
-        if left_s > 0:
-            task, body = pending.task, pending.body
-            request = wire.Request(
-                task.id, task.kind.name, left_s, pending.attempt, tuple(body.blobs), body.frames
-            )
-            sent = self._send(request)
+    def _send_request(self, pending: PendingRequest) -> None:
+        now_s = time.perf_counter()
+        if pending.deadline_s > now_s:
+            sent = self._send(pending.message(now_s))
             pending.bytes_out += sent
-            pending.sent_as = self._messages
+            pending.last_message = self._messages
             if not sent:
-                self._finish(pending.task.id, CloudBroken("nothing can be sent"), started=False)
+                self._give_up(pending.task.id, CloudBroken("nothing can be sent"), started=False)
 
     def _send(self, message: wire.Message) -> int:
-        """Bytes handed over; 0 where there is no connection or its queue is full."""
+        """Send a message; return its bytes, 0 if it cannot be sent now."""
         frames = wire.pack(message)
-        try:
-            self._channel.send(frames)
-        except zmq.Again:
+        if not self._socket.try_send(frames):
             return 0
         self._messages += 1
         return wire.byte_count(frames)
 
-    def _read(self, frames: Iterable[zmq.Frame], received: float) -> None:
-        buffers = [frame.buffer for frame in frames]
+    def _read(self, frames: list[wire.Buffer], received_s: float) -> None:
         try:
-            self._take(wire.unpack(buffers), received, wire.byte_count(buffers))
+            self._take(wire.unpack(frames), received_s, wire.byte_count(frames))
         except wire.VersionMismatch as error:
-            self._absent, self._hello_due = str(error), math.inf
-            log.warning("%s: %s: tasks stay onboard", self.site, error)
+            self._connection.other_version(str(error))
         except ProtocolError as error:
             log.warning("%s: message dropped: %s", self.site, error)
 
-    def _take(self, message: wire.Message, received: float, bytes_in: int) -> None:
+    def _take(self, message: wire.Message, received_s: float, bytes_in: int) -> None:
         if isinstance(message, wire.Hello):
-            self._hello_due = math.inf
             self._remote, self._message_bytes_max = message.tasks, message.message_bytes_max
-            if self._absent is not None:
-                log.info("%s: %s is up", self.site, self._endpoint)
-                self._heartbeat.start(received)
-            self._absent = None
+            if self._connection.hello_answered():
+                self._heartbeat.start(received_s)
             return
         if not isinstance(message, wire.Pong | wire.Reply):
             return
-        told = Told(message.queue_depth, message.load, message.capacity)
+        report = ServerReport(message.queue_depth, message.load, message.capacity)
         if isinstance(message, wire.Pong):
-            self._heartbeat.answer(message.id, received, told)
+            self._heartbeat.answer(message.id, received_s, report)
             return
-        self._heartbeat.hear(received, told)
-        if message.id in self._pending:
-            if message.status == "need_blob":
-                self._send_blobs(self._pending[message.id], message.missing)
-            else:
-                self._finish_reply(self._pending[message.id], message, received, bytes_in)
+        self._heartbeat.hear(received_s, report)
+        pending = self._pending.get(message.id)
+        if pending is None:
+            return  # the request was given up
+        if message.status == "need_blob":
+            self._send_blobs(pending, message.missing)
+        else:
+            if pending.doubtful and message.status in ("ok", "failed"):
+                self._uploads.found(pending.task.kind.name, new=False)
+            execution = pending.answered(message, received_s, bytes_in)
+            del self._pending[message.id]
+            pending.future.set_result(execution)
 
-    def _send_blobs(self, pending: _Pending, missing: Iterable[bytes]) -> None:
+    def _send_blobs(self, pending: PendingRequest, missing: Iterable[bytes]) -> None:
+        """Upload the blobs that the server lacks, and send the request again."""
         pending.attempt += 1
         if pending.attempt > ATTEMPTS_MAX or not pending.body.blobs.keys() >= set(missing):
-            self._finish(pending.task.id, CloudBroken("the server keeps losing the blobs"), started=False)
+            failure = CloudBroken("the server keeps losing the blobs")
+            self._give_up(pending.task.id, failure, started=False)
             return
-        if pending.asks:
+        if pending.doubtful:
             self._uploads.found(pending.task.kind.name, new=True)
-            pending.asks = False
-        # Another task may have brought one since this one was sent; messages keep their order.
-        sent_as = pending.sent_as
-        self._upload(pending, [one for one in missing if not self._uploads.carried_after(one, sent_as)])
+            pending.doubtful = False
+        # Messages keep their order: a blob that another task sent after this request is there by now.
+        sent_before = pending.last_message
+        lost = [digest for digest in missing if not self._uploads.carried_after(digest, sent_before)]
+        self._upload(pending, lost)
         self._send_request(pending)
 
-    def _upload(self, pending: _Pending, digests: Iterable[bytes]) -> None:
+    def _upload(self, pending: PendingRequest, digests: Iterable[bytes]) -> None:
         for digest in digests:
             pending.bytes_out += self._send(wire.Blob(pending.body.blobs[digest]))
             self._uploads.sent(digest, self._messages)
 
-    def _finish_reply(self, pending: _Pending, reply: wire.Reply, received: float, bytes_in: int) -> None:
-        value, failure = None, _failure(reply)
-        if pending.asks and reply.status in ("ok", "failed"):
-            self._uploads.found(pending.task.kind.name, new=False)
-        if failure is None:
-            try:
-                value = wire.decode(reply.body, pending.task.kind.types, {})
-            except ProtocolError as error:
-                failure = CloudBroken(f"answer cannot be read: {error}")
-        seconds = received - pending.published
-        network_s = max(0.0, seconds - reply.queue_s - reply.run_s)
-        execution = Execution(
-            self.site,
-            seconds,
-            value,
-            failure,
-            queue_s=reply.queue_s,
-            run_s=reply.run_s,
-            network_s=network_s,
-            cpu_s=reply.cpu_s,
-            bytes_out=pending.bytes_out,
-            bytes_in=bytes_in,
-            started=reply.status in ("ok", "failed"),
-        )
-        del self._pending[pending.task.id]
-        pending.future.set_result(execution)
-
-    def _expire(self) -> None:
-        """Give up what is overdue; say hello again where it was not answered."""
-        now = time.perf_counter()
-        if self._hello_due <= now:
-            self._say_hello()
-        for request_id in [id for id, pending in self._pending.items() if pending.deadline <= now]:
-            self._send(wire.Cancel(request_id))
-            self._finish(request_id, CloudTimeout("no answer within the budget"), censored=True)
-            self._heartbeat.hurry(now)
-
-    def _finish(
+    def _give_up(
         self, request_id: int, failure: CloudError, *, censored: bool = False, started: bool = True
     ) -> None:
-        """Give a request up."""
         pending = self._pending.pop(request_id)
         pending.future.set_result(
-            Execution(
-                self.site,
-                time.perf_counter() - pending.published,
-                failure=failure,
-                censored=censored,
-                bytes_out=pending.bytes_out,
-                started=started,
-            )
+            pending.given_up(failure, time.perf_counter(), censored=censored, started=started)
         )
 
     def _shut_down(self) -> None:
-        self._absent = "closed"
-        self._turns.close()
-        with self._turns.taken, self._channel.lock:
+        self._connection.close()
+        self._reader.close()
+        with self._reader.turn, self._socket.lock:
             for request_id in list(self._pending):
-                self._finish(request_id, CloudBroken("closed while the task was in flight"))
-            self._socket.disable_monitor()
-            self._context.destroy(linger=0)
-            self._channel.close()
-
-
-_FAILURES: dict[str, Callable[[str], OffloadError]] = {
-    "failed": TaskFailed,
-    "busy": CloudBusy,
-    "expired": CloudBusy,
-    "unknown_task": CloudBroken,
-}
-
-
-def _failure(reply: wire.Reply) -> OffloadError | None:
-    if reply.status == "ok":
-        return None
-    failure = CloudBroken if reply.server_fault else _FAILURES[reply.status]
-    return failure(reply.error or reply.status)
-
-
-def _connect(
-    context: "zmq.Context[Any]", endpoint: str, keys: RobotKeys | None
-) -> tuple["zmq.Socket[bytes]", "zmq.Socket[bytes]"]:
-    dealer = context.socket(zmq.DEALER)
-    dealer.linger = 0
-    dealer.ipv6 = "[" in endpoint
-    dealer.immediate = True  # a request never waits for a connection: it would arrive with its budget gone
-    dealer.sndhwm = dealer.rcvhwm = SEND_QUEUE_MAX
-    dealer.reconnect_ivl, dealer.reconnect_ivl_max = RECONNECT_MS, RECONNECT_MAX_MS
-    dealer.setsockopt(zmq.TCP_MAXRT, UNACKNOWLEDGED_MS)
-    dealer.setsockopt(zmq.TCP_KEEPALIVE, 1)
-    dealer.setsockopt(zmq.TCP_KEEPALIVE_IDLE, KEEPALIVE_IDLE_S)
-    dealer.setsockopt(zmq.TCP_KEEPALIVE_INTVL, KEEPALIVE_EVERY_S)
-    dealer.setsockopt(zmq.TCP_KEEPALIVE_CNT, KEEPALIVE_PROBES)
-    dealer.maxmsgsize = MESSAGE_BYTES_MAX
-    if keys is not None:
-        dealer.curve_publickey, dealer.curve_secretkey = keys.own.public, keys.own.secret
-        dealer.curve_serverkey = keys.server
-    events = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED
-    monitor = dealer.get_monitor_socket(sum(HANDSHAKE_FAILURES, events))
-    dealer.connect(endpoint)
-    return dealer, monitor
-
-
-@lru_cache(maxsize=256)  # once for each server, however many offloaders are made
-def _warn_of_plain_text(site: str, endpoint: str) -> None:
-    if not on_loopback(endpoint.removeprefix("tcp://").rpartition(":")[0].strip("[]")):
-        log.warning("%s: %s without keys: whoever is on the way can read and change it", site, endpoint)
+                self._give_up(request_id, CloudBroken("closed while the task was in flight"))
+            self._socket.close()

@@ -1,4 +1,4 @@
-"""The runner of the robot's own computer."""
+"""The runner of the robot's own computer: it runs tasks in threads of this process."""
 
 import contextlib
 import os
@@ -18,38 +18,42 @@ from offboard.common.wanted import call_while
 from offboard.robot_client.sites.own_cpu import OWN_CPU
 from offboard.robot_client.sites.runner import ONBOARD, Condition, Execution
 
-ASIDE_MAX = 4  # runs that nobody waits for any more and that still go on
-ASIDE_NICE = 10  # theirs: beside a task of nice 0 a tenth of its CPU time (sched(7))
-CLOSE_WAIT_S = 1.0  # for what runs at the end
+ABANDONED_MAX = 4  # cancelled runs that go on at the same time
+ABANDONED_NICE = 10  # their niceness: a tenth of the CPU time of a task with niceness 0 (sched(7))
+CLOSE_WAIT_S = 1.0  # for the runs that go on when the runner is closed
 
 
 @dataclass(eq=False, slots=True)
 class _Run:
-    """A task in line, or running in the thread of this native id; `aside`: nobody waits for it any more."""
+    """One run of a task.
+
+    thread: native id of the thread that runs it; None while it waits in the queue.
+    abandoned: it was cancelled while it ran, and goes on.
+    """
 
     task: Task
-    published: float
+    published_s: float
     future: "Future[Execution]" = field(default_factory=Future)
     thread: int | None = None
-    aside: bool = False
+    abandoned: bool = False
 
 
 class OnboardRunner:
-    """Runs tasks in this process, `workers` at a time; a waiting task's seconds include its wait.
+    """Runs at most `workers` tasks at a time. The seconds of a task include its wait in the queue.
 
-    A thread cannot be stopped: another one takes the place of a run that is cancelled, which goes on aside,
-    at a low priority, until it ends or looks whether it is wanted.
+    Python cannot stop a thread. So a run that is cancelled is abandoned: it goes on at a low priority until
+    it ends or calls `check_wanted`, and a new thread takes its place.
     """
 
     site = ONBOARD
 
     def __init__(self, workers: int = 1) -> None:
         self._workers = workers
-        self._line: SimpleQueue[_Run | None] = SimpleQueue()
-        self._runs: dict[int, _Run] = {}  # that have not ended
-        self._threads = 0  # without those aside
-        self._started: list[threading.Thread] = []  # all of them, but for some that have ended
-        self._aside = 0
+        self._queue: SimpleQueue[_Run | None] = SimpleQueue()
+        self._runs: dict[int, _Run] = {}  # those that have not ended, by task id
+        self._threads = 0  # without those of abandoned runs
+        self._started: list[threading.Thread] = []  # all that have not ended, and a few that have
+        self._abandoned = 0
         self._closed = False
         self._lock = threading.Lock()
         self._load = LoadWatch(Load(SELF), pause_s=OWN_CPU.pause_s)
@@ -64,23 +68,23 @@ class OnboardRunner:
             if self._closed:
                 raise OffloadError("the onboard runner is closed")
             self._runs[task.id] = run
-            if self._threads < min(self._workers, len(self._runs) - self._aside):
+            if self._threads < min(self._workers, len(self._runs) - self._abandoned):
                 self._start_thread()
-            self._line.put(run)
+            self._queue.put(run)
         return run.future
 
     def cancel(self, task: Task) -> None:
-        """One that waits is not begun; one that runs goes on aside, ASIDE_MAX of them at most."""
+        """Remove the task from the queue, or abandon its run; past ABANDONED_MAX a run is left alone."""
         with self._lock:
             run = self._runs.get(task.id)
-            if run is None or run.aside or (run.thread is not None and self._aside == ASIDE_MAX):
+            if run is None or run.abandoned or (run.thread is not None and self._abandoned == ABANDONED_MAX):
                 return
             if run.thread is None:
                 del self._runs[task.id]
             else:
-                self._put_aside(run, run.thread)
+                self._abandon(run, run.thread)
         failure = Overtaken("another site answered first")
-        seconds, started = time.perf_counter() - run.published, run.thread is not None
+        seconds, started = time.perf_counter() - run.published_s, run.thread is not None
         run.future.set_result(Execution(ONBOARD, seconds, failure=failure, censored=True, started=started))
 
     def hurry(self) -> None:
@@ -94,18 +98,18 @@ class OnboardRunner:
         return found
 
     def close(self) -> None:
-        """What runs is waited for, for CLOSE_WAIT_S at most."""
+        """Cancel the tasks in the queue, and wait for those that run, for at most CLOSE_WAIT_S."""
         with self._lock:
             if self._closed:
                 return
             self._closed = True
             self._load.close()
-            OWN_CPU.loaded = False  # nobody reads it any more
+            OWN_CPU.loaded = False  # no later reading would reset it
             waiting = [run for run in self._runs.values() if run.thread is None]
             for run in waiting:
                 del self._runs[run.task.id]
             for _ in range(self._threads):
-                self._line.put(None)
+                self._queue.put(None)
         for run in waiting:
             run.future.cancel()
         join_all(self._started, CLOSE_WAIT_S)
@@ -114,19 +118,19 @@ class OnboardRunner:
         self._threads += 1
         thread = threading.Thread(target=self._work, name=ONBOARD, daemon=True)
         thread.start()
-        self._started = [*(one for one in self._started if one.is_alive()), thread]
+        self._started = [*(other for other in self._started if other.is_alive()), thread]
 
-    def _put_aside(self, run: _Run, thread: int) -> None:
-        run.aside = True
-        self._aside += 1
-        with contextlib.suppress(OSError, AttributeError):  # where threads have no priority of their own
-            os.setpriority(os.PRIO_PROCESS, thread, ASIDE_NICE)
+    def _abandon(self, run: _Run, thread: int) -> None:
+        run.abandoned = True
+        self._abandoned += 1
+        with contextlib.suppress(OSError, AttributeError):  # on systems without priorities for threads
+            os.setpriority(os.PRIO_PROCESS, thread, ABANDONED_NICE)
         self._threads -= 1
         self._start_thread()
 
     def _work(self) -> None:
-        """What a thread does until it is put aside or the runner is closed."""
-        while (run := self._line.get()) is not None:
+        """Run tasks until a run is abandoned or the runner is closed. Each thread does this."""
+        while (run := self._queue.get()) is not None:
             with self._lock:
                 if self._runs.get(run.task.id) is not run:  # cancelled, or closed
                     continue
@@ -134,33 +138,33 @@ class OnboardRunner:
             execution = _run(run)
             with self._lock:
                 del self._runs[run.task.id]
-                if run.aside:
-                    self._aside -= 1
+                if run.abandoned:
+                    self._abandoned -= 1
                     return
             run.future.set_result(execution)
 
 
 def _run(run: _Run) -> Execution:
-    cpu_before_s, started = cpu.used_s(), time.perf_counter()
+    cpu_before_s, started_s = cpu.used_s(), time.perf_counter()
     value, failure = None, None
     OWN_CPU.begin()
     try:
-        value = call_while(lambda: not run.aside, run.task.kind.function, run.task.args)
-    except BaseException as error:  # noqa: BLE001 - whatever a user's function raises is the task's failure
+        value = call_while(lambda: not run.abandoned, run.task.kind.function, run.task.args)
+    except BaseException as error:  # noqa: BLE001 - anything that the function raises is the task's failure
         failure = TaskFailed(describe(error))
         failure.__cause__ = error
     cpu_s = cpu.used_s() - cpu_before_s
-    # Asked for its CPU time the kernel charges this thread, and under a quota stops it until what it overdrew
-    # is paid: the caller waits for that too.
-    now = time.perf_counter()
-    OWN_CPU.end(now)
+    # Reading the CPU time makes the kernel charge this thread. A thread that has used more than its quota is
+    # then stopped for a while, and the caller waits for that too.
+    ended_s = time.perf_counter()
+    OWN_CPU.end(ended_s)
     return Execution(
         ONBOARD,
-        now - run.published,
+        ended_s - run.published_s,
         value,
         failure,
-        queue_s=started - run.published,
-        run_s=now - started,
+        queue_s=started_s - run.published_s,
+        run_s=ended_s - started_s,
         network_s=0.0,
         cpu_s=cpu_s,
     )

@@ -1,24 +1,24 @@
-"""What takes the CPU of this process: it is slow to hear of other sites meanwhile.
+"""What takes the CPU of this process, which then hears late from other sites.
 
-All of its threads share the interpreter's lock and, under a quota, its CPU time. What it measures of a server
-then is too long, by 10 to 50 ms on a tenth of a CPU.
+All threads of the process share the interpreter's lock and, under a quota, its CPU time. While a task runs
+onboard, the times that the robot measures of a server are too long, by 10 to 50 ms on a tenth of a CPU.
 """
 
 import threading
 
-LOADED_SLOWER = 3  # times as rarely is done what a loaded robot does beside its tasks
-LATE_MAX = 2.0  # times as long as expected: what takes longer still is late for another reason
+LOADED_SLOWER = 3  # on a loaded robot, pauses in background work are this many times as long
+LATE_MAX = 2.0  # times the expected time: a run onboard does not explain a longer delay
 
 
 def may_be_late(seconds: float, expected_s: float | None) -> bool:
-    """Whether own runs may be why it took longer than expected, or it took no longer."""
+    """Whether it took no longer than a run onboard at the same time may explain."""
     return expected_s is not None and seconds <= LATE_MAX * expected_s
 
 
 class OwnCpu:
-    """Whether any run was under way since some time, on the clock of `time.perf_counter`.
+    """Knows whether a task ran onboard since a given time, on the clock of `time.perf_counter`.
 
-    `loaded`: others take so much of the CPU that what is measured tells of them.
+    loaded: other programs take so much of the CPU that measured times show it.
     """
 
     def __init__(self) -> None:
@@ -28,7 +28,7 @@ class OwnCpu:
         self._lock = threading.Lock()
 
     def pause_s(self, usual_s: float) -> float:
-        """Until what is done again and again beside the tasks, whose CPU it takes, is done again."""
+        """The pause between two steps of background work, which takes CPU from the tasks."""
         return LOADED_SLOWER * usual_s if self.loaded else usual_s
 
     def begin(self) -> None:
@@ -41,7 +41,7 @@ class OwnCpu:
             self._ended_s = now_s
 
     def since(self, at_s: float) -> bool:
-        """Whether there was one from then on, if only for its last moment."""
+        """Whether a task ran onboard at this time or later."""
         return self._running > 0 or self._ended_s >= at_s
 
 

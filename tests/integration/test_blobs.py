@@ -13,9 +13,9 @@ from offboard.cloud_server.executors import Threads
 from offboard.cloud_server.metrics import Metrics
 from offboard.cloud_server.server import Server
 from offboard.common.tasks import Task, kind_of, task
+from offboard.robot_client.sites.blob_uploads import INLINE_BYTES_MAX, INLINE_SHARE, NEW_AFTER
 from offboard.robot_client.sites.cloud import CloudRunner
 from offboard.robot_client.sites.runner import Execution
-from offboard.robot_client.sites.uploads import ALONG_BYTES_MAX, ALONG_SHARE, NEW_AFTER
 
 pytestmark = pytest.mark.integration
 
@@ -97,8 +97,8 @@ def test_what_went_along_is_kept_once_it_comes_again(served: Served) -> None:
 
 def test_no_more_goes_along_than_fits(served: Served) -> None:
     """Of one task; the rest are blobs, in messages of their own."""
-    most = int(ALONG_SHARE * MESSAGE_BYTES_MAX)
-    assert most <= ALONG_BYTES_MAX
+    most = int(INLINE_SHARE * MESSAGE_BYTES_MAX)
+    assert most <= INLINE_BYTES_MAX
     with joined(served) as runner:
         for n in range(NEW_AFTER):
             run(runner, new(n))

@@ -1,7 +1,8 @@
-"""When a client sends its heartbeats, seen from the server's end of the socket."""
+"""When a robot sends its heartbeats, as the server sees it."""
 
+import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 
 import pytest
 import zmq
@@ -11,7 +12,7 @@ from offboard.common.wire import messages as wire
 from offboard.common.wire.messages import Hello, Message, Ping, Pong, Reply, Request
 from offboard.robot_client.sites import cloud
 from offboard.robot_client.sites.cloud import CloudRunner
-from offboard.robot_client.sites.turns import LINGER_S
+from offboard.robot_client.sites.shared_reader import LINGER_S
 
 pytestmark = pytest.mark.integration
 
@@ -25,7 +26,7 @@ def nothing() -> None:
 
 
 class Peer:
-    """The far end; it says what it is told to."""
+    """The server's end of the connection, played by the test."""
 
     def __init__(self, socket: "zmq.Socket[bytes]") -> None:
         self.endpoint = f"tcp://127.0.0.1:{socket.bind_to_random_port('tcp://127.0.0.1')}"
@@ -44,7 +45,7 @@ class Peer:
 
 @contextmanager
 def met(heartbeat_s: float) -> Iterator[tuple[CloudRunner, Peer]]:
-    """A client whose first heartbeat was answered."""
+    """A robot whose first heartbeat was answered."""
     with zmq.Context() as context, context.socket(zmq.ROUTER) as socket:
         socket.linger = 0
         peer = Peer(socket)
@@ -57,22 +58,26 @@ def met(heartbeat_s: float) -> Iterator[tuple[CloudRunner, Peer]]:
             yield runner, peer
 
 
-def test_one_that_is_due_soon_goes_ahead_of_a_task(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its answer is heard while the task's is waited for."""
-    monkeypatch.setattr(cloud, "ALONG_S", 2 * HARDLY_EVER_S)
+def test_a_heartbeat_that_is_due_soon_is_sent_before_a_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its answer is read while the caller waits for the answer of the task."""
+    monkeypatch.setattr(cloud, "EARLY_S", 2 * HARDLY_EVER_S)
     with met(HARDLY_EVER_S) as (runner, peer):
         answer = runner.submit(Task(kind_of(nothing), (), 0.0), WAIT_S)
         ping, request = peer.hear(), peer.hear()
         assert isinstance(ping, Ping)
         assert isinstance(request, Request)
-        peer.say(Pong(ping.id))
+        peer.say(Pong(ping.id, queue_depth=7))
+        until_s = time.monotonic() + WAIT_S
+        while runner.condition().queue != 7:
+            assert time.monotonic() < until_s, "the answer to the heartbeat was not read"
+            with suppress(TimeoutError):
+                answer.result(0.01)
         peer.say(Reply(request.id, "ok", body=wire.encode(None, (), blobs=False).frames))
         assert answer.result(WAIT_S).ok
-        assert runner._heartbeat.unanswered == 0
 
 
-def test_one_that_is_not_due_waits() -> None:
-    """A task alone brings none forward."""
+def test_a_heartbeat_that_is_not_due_is_not_sent() -> None:
+    """A task does not bring the next heartbeat forward."""
     with met(HARDLY_EVER_S) as (runner, peer):
         runner.submit(Task(kind_of(nothing), (), 0.0), WAIT_S)
         assert isinstance(peer.hear(), Request)

@@ -183,7 +183,7 @@ FILES = {
         ),
         (
             ["robot_client", "--map", "open.map", "--trace", "words.txt"],
-            "words.txt: the file is there and is no",
+            "words.txt: the file exists and is no",
         ),
         (["robot_client", "--map", "m.yaml", "--window", "0"], "--window: 0 is below 2"),
         (["robot_client", "--map", "m.yaml", "--policy", "x"], "'x' is not one of paper, onboard, cloud"),

@@ -67,7 +67,7 @@ OWNERS = {
     "zmq": {
         "common/wire/channel.py",
         "common/security/keys.py",
-        "robot_client/sites/cloud.py",
+        "robot_client/sites/cloud_socket.py",
         "cloud_server/reply_queue.py",
         "cloud_server/authorisation.py",
         "cloud_server/server.py",

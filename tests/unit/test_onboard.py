@@ -1,4 +1,4 @@
-"""The runner of the robot's own computer: threads of this process."""
+"""The onboard runner: queue, cancelled runs, closing, and the load of the robot."""
 
 import os
 import threading
@@ -7,17 +7,18 @@ from collections.abc import Iterator
 import pytest
 
 from offboard.common.errors import OffloadError, Overtaken, Unwanted
+from offboard.common.host.load import LoadWatch
 from offboard.common.tasks import Task, kind_of, task
 from offboard.common.wanted import check_wanted
 from offboard.robot_client.sites import onboard
-from offboard.robot_client.sites.onboard import ASIDE_MAX, ASIDE_NICE, OnboardRunner
+from offboard.robot_client.sites.onboard import ABANDONED_MAX, ABANDONED_NICE, OnboardRunner
 from offboard.robot_client.sites.own_cpu import LOADED_SLOWER, OWN_CPU
 
 WAIT_S = 5.0
 
 
 class Gate:
-    """Holds `held_back` until it is opened."""
+    """Holds the tasks of these tests until a test opens it, and knows which have begun."""
 
     def __init__(self) -> None:
         self.open, self.stopped = threading.Event(), threading.Event()
@@ -71,11 +72,11 @@ def until_begun(count: int) -> None:
         if len(gate.begun) == count:
             return
         threading.Event().wait(0.01)
-    raise AssertionError(f"{gate.begun} has begun")
+    raise AssertionError(f"{count} tasks should have begun, not {gate.begun}")
 
 
-def test_a_run_that_is_cancelled_makes_room_at_once(runner: OnboardRunner) -> None:
-    """Its future ends as overtaken, it goes on at a low priority, and the next task does not wait for it."""
+def test_a_cancelled_run_makes_room_at_once(runner: OnboardRunner) -> None:
+    """Its future ends as overtaken, the run goes on at a low priority, and the next task starts at once."""
     first = call(1)
     future = runner.submit(first, 1.0)
     until_begun(1)
@@ -86,11 +87,11 @@ def test_a_run_that_is_cancelled_makes_room_at_once(runner: OnboardRunner) -> No
     assert given_up.started
     assert runner.submit(call(2, at_once), 1.0).result(WAIT_S).value == 2
     own = os.getpriority(os.PRIO_PROCESS, 0)
-    assert os.getpriority(os.PRIO_PROCESS, gate.threads[0]) == max(ASIDE_NICE, own)
+    assert os.getpriority(os.PRIO_PROCESS, gate.threads[0]) == max(ABANDONED_NICE, own)
 
 
-def test_a_run_that_looks_whether_it_is_wanted_stops(runner: OnboardRunner) -> None:
-    """And one that comes after it is wanted."""
+def test_a_cancelled_run_stops_if_it_checks_for_that(runner: OnboardRunner) -> None:
+    """`check_wanted` ends the cancelled run, and does not end the next one."""
     first = call(1, looking)
     future = runner.submit(first, 1.0)
     until_begun(1)
@@ -101,27 +102,27 @@ def test_a_run_that_looks_whether_it_is_wanted_stops(runner: OnboardRunner) -> N
     assert runner.submit(call(2, looking), 1.0).result(WAIT_S).value == 2
 
 
-def test_so_many_go_on_aside_and_no_more(runner: OnboardRunner) -> None:
-    """One more than ASIDE_MAX cannot be cancelled: it keeps its place until it ends."""
-    for number in range(ASIDE_MAX):
+def test_the_number_of_abandoned_runs_is_bounded(runner: OnboardRunner) -> None:
+    """Past ABANDONED_MAX abandoned runs, a run cannot be cancelled: it keeps its place until it ends."""
+    for number in range(ABANDONED_MAX):
         one = call(number)
         future = runner.submit(one, 1.0)
         until_begun(number + 1)
         runner.cancel(one)
         assert future.done()
-    last = call(ASIDE_MAX)
+    last = call(ABANDONED_MAX)
     future = runner.submit(last, 1.0)
-    until_begun(ASIDE_MAX + 1)
+    until_begun(ABANDONED_MAX + 1)
     runner.cancel(last)
     behind = runner.submit(call(9, at_once), 1.0)
     assert not future.done()
     assert not behind.done()
     gate.open.set()
-    assert (future.result(WAIT_S).value, behind.result(WAIT_S).value) == (ASIDE_MAX, 9)
+    assert (future.result(WAIT_S).value, behind.result(WAIT_S).value) == (ABANDONED_MAX, 9)
 
 
-def test_a_task_that_waits_is_not_begun_once_it_is_cancelled(runner: OnboardRunner) -> None:
-    """It ends as never started; those behind it take its place."""
+def test_a_cancelled_task_in_the_queue_never_runs(runner: OnboardRunner) -> None:
+    """It ends as never started, and the next task in the queue takes its place."""
     runner.submit(call(1), 1.0)
     until_begun(1)
     second, third = call(2), call(3)
@@ -133,15 +134,16 @@ def test_a_task_that_waits_is_not_begun_once_it_is_cancelled(runner: OnboardRunn
     assert gate.begun == [1, 3]
 
 
-def test_what_is_unknown_or_over_can_be_cancelled(runner: OnboardRunner) -> None:
+def test_cancelling_an_unknown_or_finished_task_does_nothing(runner: OnboardRunner) -> None:
+    """Neither raises."""
     one = call(1, at_once)
     assert runner.submit(one, 1.0).result(WAIT_S).value == 1
     runner.cancel(one)
     runner.cancel(call(2))
 
 
-def test_closing_ends_what_waits(runner: OnboardRunner) -> None:
-    """What runs comes to its end, what waits is cancelled, and nothing more is taken."""
+def test_closing_cancels_the_queue(runner: OnboardRunner) -> None:
+    """The task that runs ends, those in the queue are cancelled, and new tasks are refused."""
     runs, waits = runner.submit(call(1), 1.0), runner.submit(call(2), 1.0)
     until_begun(1)
     runner.close()
@@ -154,23 +156,23 @@ def test_closing_ends_what_waits(runner: OnboardRunner) -> None:
 
 
 @pytest.mark.usefixtures("runner")
-def test_closing_leaves_no_thread_that_can_end() -> None:
-    """One that ended with the process took it down, now and then (SIGABRT); those set aside count too."""
+def test_after_closing_no_thread_is_left_that_could_end() -> None:
+    """A thread that ends together with the process may abort it (SIGABRT); abandoned runs count too."""
     for _ in range(20):
         gate.__init__()  # type: ignore[misc]
         one, before = OnboardRunner(2), set(threading.enumerate())
-        aside, plain = call(1), [one.submit(call(number, at_once), 1.0) for number in range(4)]
-        one.submit(aside, 1.0)
+        abandoned, plain = call(1), [one.submit(call(number, at_once), 1.0) for number in range(4)]
+        one.submit(abandoned, 1.0)
         until_begun(1)
-        one.cancel(aside)
+        one.cancel(abandoned)
         assert [future.result(WAIT_S).ok for future in plain] == [True] * 4
         gate.open.set()
         one.close()
         assert {thread.name for thread in set(threading.enumerate()) - before} <= {"load"}
 
 
-def test_closing_does_not_wait_for_ever(runner: OnboardRunner, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A task that does not end is left behind."""
+def test_closing_has_a_limit(runner: OnboardRunner, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A task that does not end within CLOSE_WAIT_S is left running."""
     monkeypatch.setattr(onboard, "CLOSE_WAIT_S", 0.05)
     runs = runner.submit(call(1), 1.0)
     until_begun(1)
@@ -179,8 +181,8 @@ def test_closing_does_not_wait_for_ever(runner: OnboardRunner, monkeypatch: pyte
 
 
 @pytest.mark.usefixtures("runner")
-def test_so_many_workers_run_at_a_time() -> None:
-    """And each task once."""
+def test_as_many_tasks_run_at_a_time_as_there_are_workers() -> None:
+    """Three workers run three tasks at a time, and each task once."""
     many = OnboardRunner(3)
     futures = [many.submit(call(number), 1.0) for number in range(6)]
     until_begun(3)
@@ -190,20 +192,22 @@ def test_so_many_workers_run_at_a_time() -> None:
     many.close()
 
 
-def test_a_load_is_forgotten_with_the_runner_that_read_it(
+def test_closing_a_runner_ends_the_longer_pauses(
     runner: OnboardRunner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """While it lasts pauses are longer, in the whole process; the next runner begins without."""
-    monkeypatch.setattr(runner._load, "latest", lambda: (0.9, 1.0))
+    """Under load, pauses in the whole process are longer, until the runner that read the load is closed."""
+    monkeypatch.setattr(LoadWatch, "latest", lambda _: (0.9, 1.0))
     runner.condition()
     assert OWN_CPU.pause_s(1.0) == LOADED_SLOWER
     runner.close()
     assert OWN_CPU.pause_s(1.0) == 1.0
 
 
-def test_a_load_is_over_when_none_is_read(runner: OnboardRunner, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever read it: a look that finds what it found before tells too."""
-    monkeypatch.setattr(runner._load, "latest", lambda: (0.0, 1.0))
+def test_a_reading_without_load_ends_the_longer_pauses(
+    runner: OnboardRunner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """This holds even if the reading equals the one before, because another runner may have set them."""
+    monkeypatch.setattr(LoadWatch, "latest", lambda _: (0.0, 1.0))
     monkeypatch.setattr(OWN_CPU, "loaded", True)
     runner.condition()
     assert OWN_CPU.pause_s(1.0) == 1.0

@@ -16,7 +16,7 @@ from offboard.loadgen.simulation.model.simulated_tasks import Tasks, find_tasks
 from offboard.loadgen.simulation.run import simulate
 from offboard.loadgen.simulation.world import check_simulated
 from offboard.loadgen.testbed.testbed import ROBOT
-from offboard.robot_client.sites.cloud import RECONNECT_MAX_MS
+from offboard.robot_client.sites.cloud_socket import RECONNECT_MAX_MS
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.mazes import warm
 

@@ -24,7 +24,7 @@ from offboard.robot_client import predictors
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Decision, Forecast
 from offboard.robot_client.records.trace import Record
-from offboard.robot_client.sites.heartbeat import Told
+from offboard.robot_client.sites.heartbeat import ServerReport
 
 SMALL = """name = "small"
 [workload]
@@ -109,13 +109,13 @@ def test_a_server_knows_what_hogs_take_of_its_cpu() -> None:
     clock = VirtualClock()
     server = Server(clock, CloudPart(cpus=1.0))
     clock.pass_by(1.0)
-    assert server.told == Told(0, 0.0, 1.0)
+    assert server.told == ServerReport(0, 0.0, 1.0)
     server.processor.change(hogs=3, cpus=0.5)
     clock.pass_by(2 * SERVER_EVERY_S)
-    assert server.told == Told(0, 1.0, 0.5)
+    assert server.told == ServerReport(0, 1.0, 0.5)
     server.processor.change(hogs=0, cpus=2.0)
     clock.pass_by(2 * SERVER_EVERY_S)
-    assert server.told == Told(0, 0.0, 1.0)
+    assert server.told == ServerReport(0, 0.0, 1.0)
 
 
 def test_workers_share_it_among_them_too() -> None:

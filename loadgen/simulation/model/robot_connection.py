@@ -8,7 +8,7 @@ from offboard.loadgen.simulation.model.clock import VirtualClock
 from offboard.loadgen.simulation.model.costs import HELLO_BYTES
 from offboard.loadgen.simulation.model.one_way import Way
 from offboard.loadgen.simulation.model.server import Server
-from offboard.robot_client.sites.cloud import RECONNECT_MAX_MS, RECONNECT_MS
+from offboard.robot_client.sites.cloud_socket import RECONNECT_MAX_MS, RECONNECT_MS
 
 HANDSHAKE_TRIPS = 2  # round trips of ZMTP (greeting, ready) before hello
 

@@ -11,7 +11,7 @@ from offboard.loadgen.simulation.model.clock import VirtualClock
 from offboard.loadgen.simulation.model.costs import START_S
 from offboard.loadgen.simulation.model.measured_load import SimulatedLoad
 from offboard.loadgen.simulation.model.processor import Processor, Run
-from offboard.robot_client.sites.heartbeat import Told
+from offboard.robot_client.sites.heartbeat import ServerReport
 
 QUEUE_MAX = 64  # requests in line, as `cloud-server` has it; beyond it the answer is busy
 UNREAD_MAX = 100_000  # messages that a paused server has not read
@@ -25,7 +25,7 @@ class Reply:
     """What the server says to a request, and of itself when it does."""
 
     status: str
-    told: Told
+    told: ServerReport
     queue_s: float = 0.0
     run_s: float = 0.0
     cpu_s: float = 0.0
@@ -52,9 +52,9 @@ class Server:
         return self.processor.waiting
 
     @property
-    def told(self) -> Told:
+    def told(self) -> ServerReport:
         """What it says of itself."""
-        return Told(self.queue, self._load.latest, self._load.capacity)
+        return ServerReport(self.queue, self._load.latest, self._load.capacity)
 
     def _look(self) -> None:
         self._load.share(SERVER_EVERY_S)

@@ -1,4 +1,4 @@
-"""Who reads: a caller who waits alone for his answer, else the thread; nobody waits in vain."""
+"""Who reads the socket: a caller that waits alone, otherwise the thread; no answer is left unread."""
 
 import threading
 from collections import deque
@@ -7,56 +7,56 @@ from concurrent.futures import CancelledError
 
 import pytest
 
-from offboard.robot_client.sites import turns
+from offboard.robot_client.sites import shared_reader
 from offboard.robot_client.sites.clock import SystemClock
-from offboard.robot_client.sites.turns import Answer, Turns
+from offboard.robot_client.sites.shared_reader import Answer, SharedReader
 
-LONG_S = 30.0  # what is lost is waited for as long
+LONG_S = 30.0  # a test that loses an answer fails after this time
 
 
 class Line:
-    """Messages that arrive, each for one answer, and who read them."""
+    """Messages that arrive, each the answer to one question, and who reads them."""
 
     def __init__(self) -> None:
         self.waiting: dict[int, Answer[int]] = {}
-        self.unasked = 0  # messages that are expected, and that nobody waits for
-        self.turns = Turns(
+        self.unasked = 0  # messages that are expected although no caller waits for them
+        self.reader = SharedReader(
             self.tend,
             self.read,
-            asked=self.waiting.__len__,
-            expected=lambda: bool(self.waiting or self.unasked),
+            unanswered=self.waiting.__len__,
+            expects_message=lambda: bool(self.waiting or self.unasked),
             wake=self.wake,
         )
         self.read_by: list[str] = []
         self.tended = 0
         self._arrived: deque[int] = deque()
-        self._some = threading.Condition()
+        self._changed = threading.Condition()
         self._woken = False
-        self.thread = threading.Thread(target=self.turns.run, args=(LONG_S,), name="thread", daemon=True)
+        self.thread = threading.Thread(target=self.reader.run, args=(LONG_S,), name="thread", daemon=True)
 
     def ask(self, n: int) -> Answer[int]:
-        answer = self.waiting[n] = Answer(self.turns)
+        answer = self.waiting[n] = Answer(self.reader)
         return answer
 
     def arrive(self, n: int) -> None:
-        with self._some:
+        with self._changed:
             self._arrived.append(n)
-            self._some.notify_all()
+            self._changed.notify_all()
 
     def arrive_later(self, n: int) -> None:
         threading.Timer(0.02, self.arrive, (n,)).start()
 
     def wake(self) -> None:
-        with self._some:
+        with self._changed:
             self._woken = True
-            self._some.notify_all()
+            self._changed.notify_all()
 
     def tend(self) -> None:
         self.tended += 1
 
     def read(self, wait_s: float) -> None:
-        with self._some:
-            self._some.wait_for(lambda: self._woken or self._arrived, min(wait_s, LONG_S))
+        with self._changed:
+            self._changed.wait_for(lambda: self._woken or self._arrived, min(wait_s, LONG_S))
             self._woken = False
             while self._arrived:
                 n = self._arrived.popleft()
@@ -64,7 +64,7 @@ class Line:
                 self.waiting.pop(n).set_result(n)
 
     def answered(self, n: int) -> int:
-        """Ask, and wait alone."""
+        """Ask one question, and wait for its answer alone."""
         answer = self.ask(n)
         self.arrive_later(n)
         return answer.result(LONG_S)
@@ -72,27 +72,27 @@ class Line:
 
 @pytest.fixture
 def line(monkeypatch: pytest.MonkeyPatch) -> Iterator[Line]:
-    """The thread never comes back by itself, unless a test says so."""
-    monkeypatch.setattr(turns, "LINGER_S", LONG_S)
+    """A line whose thread stays away once callers read, unless a test calls it back."""
+    monkeypatch.setattr(shared_reader, "LINGER_S", LONG_S)
     line = Line()
     line.thread.start()
     yield line
-    line.turns.close()
+    line.reader.close()
     line.thread.join(LONG_S)
     assert not line.thread.is_alive()
 
 
-ME = threading.current_thread().name
+CALLER = threading.current_thread().name
 
 
-def test_who_waits_alone_reads_himself(line: Line) -> None:
-    """The thread has the first turn and makes way for the next ones."""
+def test_a_caller_that_waits_alone_reads(line: Line) -> None:
+    """The thread has the first turn and leaves the next ones to the caller."""
     assert [line.answered(n) for n in range(5)] == list(range(5))
-    assert line.read_by == ["thread"] + 4 * [ME]
+    assert line.read_by == ["thread"] + 4 * [CALLER]
 
 
-def test_the_thread_reads_for_several(line: Line) -> None:
-    """Who waits for one of two answers leaves the reading to it, and is not late."""
+def test_the_thread_reads_if_two_answers_are_due(line: Line) -> None:
+    """A caller that waits for one of two answers leaves the reading to the thread, and gets both."""
     line.answered(0), line.answered(1)
     first, second = line.ask(2), line.ask(3)
     line.arrive_later(3)
@@ -102,13 +102,13 @@ def test_the_thread_reads_for_several(line: Line) -> None:
     assert line.read_by[2:] == ["thread", "thread"]
 
 
-def test_who_waits_alone_reads_what_nobody_waits_for_too(line: Line) -> None:
-    """As the answer to a heartbeat; where that comes later than his own the thread reads it."""
+def test_a_caller_reads_other_messages_too(line: Line) -> None:
+    """The caller also reads the answer to a heartbeat; if that comes after its own, the thread reads it."""
     line.answered(0), line.answered(1)
     line.unasked = 1
     assert line.answered(2) == 2
-    assert line.read_by[2:] == [ME]
-    line.waiting[3] = unasked = Answer[int](line.turns)
+    assert line.read_by[2:] == [CALLER]
+    line.waiting[3] = unasked = Answer[int](line.reader)
     heard = threading.Event()
     unasked.add_done_callback(lambda _: heard.set())
     line.arrive(3)
@@ -116,18 +116,18 @@ def test_who_waits_alone_reads_what_nobody_waits_for_too(line: Line) -> None:
     assert line.read_by[3:] == ["thread"]
 
 
-def test_the_thread_reads_for_who_waits_for_anything_else_too(line: Line) -> None:
-    """As for a race of two sites."""
+def test_the_thread_reads_if_the_caller_waits_for_two_sites(line: Line) -> None:
+    """The caller of a race waits for several futures, so it cannot read one socket."""
     line.answered(0), line.answered(1)
-    answer, other = line.ask(2), Answer[int](line.turns)
+    answer, other = line.ask(2), Answer[int](line.reader)
     line.arrive_later(2)
     SystemClock().wait([answer, other], LONG_S)
     assert answer.done()
     assert line.read_by[2:] == ["thread"]
 
 
-def test_the_thread_takes_over_what_a_caller_leaves(line: Line) -> None:
-    """Whoever gave up waiting, or whose answer came before another one's, leaves nothing unread."""
+def test_the_thread_reads_what_a_caller_no_longer_waits_for(line: Line) -> None:
+    """An answer that comes after its caller gave up is read."""
     line.answered(0), line.answered(1)
     late = line.ask(2)
     with pytest.raises(TimeoutError):
@@ -139,35 +139,35 @@ def test_the_thread_takes_over_what_a_caller_leaves(line: Line) -> None:
     assert line.read_by[2:] == ["thread"]
 
 
-def test_what_is_to_be_done_at_once_is_done_while_a_caller_reads(line: Line) -> None:
-    """He is woken, and tends to it before he reads on."""
+def test_an_interrupt_reaches_a_caller_that_reads(line: Line) -> None:
+    """The caller wakes up, does what is due, and reads on."""
     line.answered(0), line.answered(1)
     answer, before = line.ask(2), line.tended
-    threading.Timer(0.02, line.turns.call).start()
+    threading.Timer(0.02, line.reader.interrupt).start()
     threading.Timer(0.1, line.arrive, (2,)).start()
     assert answer.result(LONG_S) == 2
     assert line.tended >= before + 2
 
 
 def test_the_thread_comes_back_when_no_caller_reads(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What nobody asked for, as that the connection is gone, is read after LINGER_S."""
+    """After LINGER_S the thread reads what no caller asked for, for example that the connection is lost."""
     line.answered(0), line.answered(1)
-    monkeypatch.setattr(turns, "LINGER_S", 0.01)
-    line.turns.call()
-    line.waiting[2] = unasked = Answer[int](line.turns)
+    monkeypatch.setattr(shared_reader, "LINGER_S", 0.01)
+    line.reader.interrupt()
+    line.waiting[2] = unasked = Answer[int](line.reader)
     line.arrive(2)
-    SystemClock().wait([unasked, Answer[int](line.turns)], LONG_S)
+    SystemClock().wait([unasked, Answer[int](line.reader)], LONG_S)
     assert line.read_by[2:] == ["thread"]
 
 
-def test_a_caller_who_reads_is_let_go_at_the_end(line: Line) -> None:
-    """Close ends his turn; who still waits is told by whoever closed."""
+def test_closing_ends_the_turn_of_a_caller(line: Line) -> None:
+    """After `close` the caller stops reading, and the owner of the reader can cancel its answer."""
     line.answered(0), line.answered(1)
     answer = line.ask(2)
 
     def close() -> None:
-        line.turns.close()
-        with line.turns.taken:
+        line.reader.close()
+        with line.reader.turn:
             answer.cancel()
 
     threading.Timer(0.02, close).start()

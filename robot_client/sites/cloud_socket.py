@@ -1,0 +1,120 @@
+"""The ZMQ socket of a remote site: its options, its encryption, and the events of its connection.
+
+What is sent on it, and when, is decided in `cloud`.
+"""
+
+import contextlib
+import logging
+from collections.abc import Iterator, Sequence
+from enum import Enum, auto
+from functools import lru_cache
+from typing import Any
+
+import zmq
+import zmq.utils.monitor
+
+from offboard.common.errors import ConfigError
+from offboard.common.security.guard import on_loopback
+from offboard.common.security.keys import RobotKeys
+from offboard.common.wire.channel import Channel, readable
+from offboard.robot_client.sites.connection import NO_HANDSHAKE, UNKNOWN_ROBOT, HandshakeFailure
+
+MESSAGE_BYTES_MAX = 256 * 1024 * 1024
+SEND_QUEUE_MAX = 1000  # messages
+RECONNECT_MS, RECONNECT_MAX_MS = 100, 1000
+# TCP alone may take a quarter of an hour to notice that the server vanished without a word. The heartbeats
+# of ZMQ would wait behind a large argument, and break a slow link that works.
+UNACKNOWLEDGED_MS = 15_000
+KEEPALIVE_IDLE_S, KEEPALIVE_EVERY_S, KEEPALIVE_PROBES = 10, 5, 2
+
+log = logging.getLogger(__name__)
+
+
+class CloudSocket(Channel):
+    """A DEALER that connects to `endpoint` by itself. With `keys`, only to the server of that key.
+
+    ConfigError if libzmq does not take the endpoint.
+    """
+
+    def __init__(self, site: str, endpoint: str, keys: RobotKeys | None) -> None:
+        self._endpoint = endpoint
+        self._context = zmq.Context()
+        try:
+            self._dealer = _dealer(self._context, endpoint, keys)
+            self._monitor = self._dealer.get_monitor_socket(sum(_EVENTS))
+            self._dealer.connect(endpoint)
+        except zmq.ZMQError as error:
+            self._context.destroy(linger=0)
+            raise ConfigError(f"{site}: endpoint {endpoint!r}: {error}") from error
+        super().__init__(self._dealer, self._monitor.FD)
+        if keys is None:
+            _warn_of_plain_text(site, endpoint)
+
+    def events(self) -> "Iterator[SocketEvent | HandshakeFailure]":
+        """What happened to the connection since the last call."""
+        while readable(self._monitor):
+            event = _EVENTS.get(zmq.utils.monitor.recv_monitor_message(self._monitor)["event"])
+            if event is not None:
+                yield event
+
+    def connect_again(self) -> None:
+        with contextlib.suppress(zmq.ZMQError):  # there may be no connection to end
+            self._dealer.disconnect(self._endpoint)
+        self._dealer.connect(self._endpoint)
+
+    def try_send(self, frames: Sequence[Any]) -> bool:
+        """Send without waiting. False if there is no connection, or the queue of the socket is full."""
+        try:
+            self.send(frames)
+        except zmq.Again:
+            return False
+        return True
+
+    def close(self) -> None:
+        self._dealer.disable_monitor()
+        self._context.destroy(linger=0)
+        super().close()
+
+
+class SocketEvent(Enum):
+    HANDSHAKE_SUCCEEDED = auto()
+    DISCONNECTED = auto()
+
+
+_EVENTS: dict[int, SocketEvent | HandshakeFailure] = {
+    zmq.EVENT_HANDSHAKE_SUCCEEDED: SocketEvent.HANDSHAKE_SUCCEEDED,
+    zmq.EVENT_DISCONNECTED: SocketEvent.DISCONNECTED,
+    zmq.EVENT_HANDSHAKE_FAILED_AUTH: HandshakeFailure(UNKNOWN_ROBOT, final=True),
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: HandshakeFailure(NO_HANDSHAKE, final=True),
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: HandshakeFailure(NO_HANDSHAKE, final=False),
+}
+
+
+def _dealer(context: "zmq.Context[Any]", endpoint: str, keys: RobotKeys | None) -> "zmq.Socket[bytes]":
+    dealer: zmq.Socket[bytes] = context.socket(zmq.DEALER)
+    dealer.linger = 0
+    dealer.ipv6 = "[" in endpoint
+    dealer.immediate = True  # a request never waits for a connection: it would arrive with its budget gone
+    dealer.sndhwm = dealer.rcvhwm = SEND_QUEUE_MAX
+    dealer.reconnect_ivl, dealer.reconnect_ivl_max = RECONNECT_MS, RECONNECT_MAX_MS
+    dealer.setsockopt(zmq.TCP_MAXRT, UNACKNOWLEDGED_MS)
+    dealer.setsockopt(zmq.TCP_KEEPALIVE, 1)
+    dealer.setsockopt(zmq.TCP_KEEPALIVE_IDLE, KEEPALIVE_IDLE_S)
+    dealer.setsockopt(zmq.TCP_KEEPALIVE_INTVL, KEEPALIVE_EVERY_S)
+    dealer.setsockopt(zmq.TCP_KEEPALIVE_CNT, KEEPALIVE_PROBES)
+    dealer.maxmsgsize = MESSAGE_BYTES_MAX
+    if keys is not None:
+        dealer.curve_publickey, dealer.curve_secretkey = keys.own.public, keys.own.secret
+        dealer.curve_serverkey = keys.server
+    return dealer
+
+
+@lru_cache(maxsize=256)  # once for each server, even if many offloaders connect to it
+def _warn_of_plain_text(site: str, endpoint: str) -> None:
+    """Log a warning unless the server is on this computer."""
+    if not on_loopback(endpoint.removeprefix("tcp://").rpartition(":")[0].strip("[]")):
+        log.warning(
+            "%s: %s without keys: anybody on the network path can read and change what is sent",
+            site,
+            endpoint,
+        )

@@ -1,0 +1,102 @@
+"""A request in flight, and the execution that it becomes.
+
+Sending it, and deciding when to give it up, is left to `cloud`.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+
+from offboard.common.errors import (
+    CloudBroken,
+    CloudBusy,
+    CloudError,
+    OffloadError,
+    ProtocolError,
+    TaskFailed,
+)
+from offboard.common.tasks import Task
+from offboard.common.wire import messages as wire
+from offboard.robot_client.sites.runner import Execution
+
+
+@dataclass(eq=False)
+class PendingRequest:
+    """One request to the server of `site`. Times are readings of `time.perf_counter`.
+
+    inline: whether large arguments are inside the body.
+    attempt: how often it was sent, counted from 1.
+    last_message: the number of the message that carried it last.
+    doubtful: whether its large arguments were only named, and the server may lack one of them.
+    """
+
+    site: str
+    task: Task
+    body: wire.Body
+    published_s: float
+    deadline_s: float
+    future: "Future[Execution]"
+    inline: bool
+    attempt: int = 1
+    bytes_out: int = 0
+    last_message: int = 0
+    doubtful: bool = False
+
+    def message(self, now_s: float) -> wire.Request:
+        return wire.Request(
+            self.task.id,
+            self.task.kind.name,
+            self.deadline_s - now_s,
+            self.attempt,
+            tuple(self.body.blobs),
+            self.body.frames,
+        )
+
+    def answered(self, reply: wire.Reply, received_s: float, bytes_in: int) -> Execution:
+        value, failure = None, _failure(reply)
+        if failure is None:
+            try:
+                value = wire.decode(reply.body, self.task.kind.types, {})
+            except ProtocolError as error:
+                failure = CloudBroken(f"the answer cannot be read: {error}")
+        seconds = received_s - self.published_s
+        return Execution(
+            self.site,
+            seconds,
+            value,
+            failure,
+            queue_s=reply.queue_s,
+            run_s=reply.run_s,
+            network_s=max(0.0, seconds - reply.queue_s - reply.run_s),
+            cpu_s=reply.cpu_s,
+            bytes_out=self.bytes_out,
+            bytes_in=bytes_in,
+            started=reply.status in ("ok", "failed"),
+        )
+
+    def given_up(
+        self, failure: CloudError, now_s: float, *, censored: bool = False, started: bool = True
+    ) -> Execution:
+        return Execution(
+            self.site,
+            now_s - self.published_s,
+            failure=failure,
+            censored=censored,
+            bytes_out=self.bytes_out,
+            started=started,
+        )
+
+
+_FAILURES: dict[str, Callable[[str], OffloadError]] = {
+    "failed": TaskFailed,
+    "busy": CloudBusy,
+    "expired": CloudBusy,
+    "unknown_task": CloudBroken,
+}
+
+
+def _failure(reply: wire.Reply) -> OffloadError | None:
+    if reply.status == "ok":
+        return None
+    failure = CloudBroken if reply.server_fault else _FAILURES[reply.status]
+    return failure(reply.error or reply.status)
