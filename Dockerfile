@@ -1,7 +1,7 @@
-# Targets: robot (planning), cloud (planning, server), bench (relay, tables). One base, no compiler in any of them.
+# Targets: robot (planning), cloud (planning, server), bench (relay, tables). They share one base; none contains a compiler.
 FROM python:3.13-slim AS base
 ENV PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 PATH=/opt/offboard/bin:$PATH
-# The planner is compiled for the CPU it runs on, at first start; the cache is worth a volume.
+# The planner is compiled at the first start, for the CPU that it runs on. Keep the cache in a volume.
 ENV NUMBA_CACHE_DIR=/var/cache/offboard
 RUN python3 -m venv /opt/offboard \
  && groupadd --gid 10001 offboard \
@@ -18,7 +18,7 @@ COPY robot_client robot_client
 COPY cloud_server cloud_server
 COPY loadgen loadgen
 RUN pip wheel --quiet --no-deps --wheel-dir /wheels .
-# One time stamp in all images: the cache of the compiled planner is shared by containers and goes by it.
+# All images get the same file times: containers share the cache of the compiled planner, and numba compares file times.
 RUN printf '%s\n' '#!/bin/sh' 'set -e' 'pip install --quiet --no-cache-dir --no-deps /wheels/*.whl' \
       'find /opt/offboard/lib -path "*/common/*.py" -exec touch -r /wheels/install {} +' \
       'find /opt/offboard/lib -path "*/robot_client/*.py" -exec touch -r /wheels/install {} +' > /wheels/install \
@@ -54,7 +54,7 @@ HEALTHCHECK --interval=2s --timeout=2s --start-period=20s --retries=3 \
   CMD ["python3", "-c", "import urllib.request as u; u.urlopen('http://127.0.0.1:8001/health', timeout=1)"]
 ENTRYPOINT ["loadgen"]
 
-# The unit tests on the image's Python.
+# Runs the unit tests with the Python of the image.
 FROM bench AS test
 USER root
 COPY requirements/dev.txt /tmp/requirements.txt
@@ -64,6 +64,6 @@ COPY . .
 RUN chown -R offboard /src
 USER offboard
 ENTRYPOINT ["python3", "-m", "pytest", "-p", "no:cacheprovider"]
-# The learned predictors, the tables of docs/, A* and jump points, reports and simulations take minutes, and are tested outside.
+# These tests take minutes and run outside: learned predictors, tables of docs/, A* and jump points, reports, simulations.
 CMD ["--numprocesses=2", "tests/unit", "--ignore=tests/unit/test_learned.py", "--ignore=tests/unit/test_datasets.py", \
   "--ignore=tests/unit/test_accelerations.py", "--ignore=tests/unit/test_report.py", "--ignore-glob=*test_simulation*"]

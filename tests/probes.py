@@ -1,4 +1,4 @@
-"""Small tasks for tests of the way a task takes; loaded on both sides as `tests.probes`."""
+"""Small tasks for tests. Robot and server load them as `tests.probes`."""
 
 import os
 import time
@@ -23,7 +23,7 @@ def nap(seconds: float) -> float:
 
 @task("burn", size=lambda seconds: seconds)
 def burn(seconds: float) -> list[float]:
-    """Computes until its thread has used so many CPU seconds; those used, and those it waited for a CPU."""
+    """Compute until the thread has used this CPU time; return the seconds used, and those without a CPU."""
     start_s, waited_s = time.thread_time(), _waited_s()
     while (used_s := time.thread_time() - start_s) < seconds:
         pass
@@ -31,7 +31,7 @@ def burn(seconds: float) -> list[float]:
 
 
 def _waited_s() -> float:
-    """How long this thread could have run and did not, by the kernel's count."""
+    """How long this thread was ready to run and had no CPU, as the kernel counts it."""
     return int(Path("/proc/thread-self/schedstat").read_text().split()[1]) / 1e9
 
 
@@ -52,7 +52,7 @@ def process_id() -> int:
 
 @task("mark_once", size=lambda path: 0.0, duplicate=False)  # noqa: ARG005 - no size
 def mark_once(path: str) -> int:
-    """Appends the process id to a file, so that a second run shows."""
+    """Append the process id to a file, which shows how often the task ran."""
     with open(path, "a") as file:  # noqa: PTH123 - a path from the wire is text
         file.write(f"{os.getpid()}\n")
     return os.getpid()

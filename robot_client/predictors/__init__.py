@@ -1,4 +1,7 @@
-"""Predictors by name; one family a file, loaded when it is asked for."""
+"""The registry of predictors: their names, and what each name stands for.
+
+A family of predictors has a file of its own, which is loaded when one of its names is asked for.
+"""
 
 import importlib
 from dataclasses import dataclass
@@ -6,21 +9,28 @@ from dataclasses import dataclass
 from offboard.common.errors import ConfigError
 from offboard.robot_client.predictors.base import Prediction, Predictor
 
-__all__ = ["LEAST_SQUARES", "Prediction", "Predictor", "check_name", "make", "names", "slow"]
+__all__ = ["LEAST_SQUARES", "Prediction", "Predictor", "check_name", "conditional", "make", "names", "slow"]
 
 LEAST_SQUARES = "least-squares"
 AVERAGE = "average"
-FEATURES = "features:"  # before a name: with the measured features taken out
-RIVER = "river:"
-WORK = "work:"  # before a name: times per work, where a kind tells its work
+WORK = "work:"  # before any name: times are learnt per work if the kind says how much work a task was
+_NAME, _CLASS = "NAME", "MODULE.CLASS"
 
 
 @dataclass(frozen=True, slots=True)
 class _Entry:
-    """Where a predictor is; `slow`: fitting takes so long that `loadgen table` does so once unless told."""
+    """What one name stands for.
+
+    module, factory: where the predictor is made.
+    follows: what stands after the name and a colon, if anything: another predictor, or a class of river.
+    conditional: it is asked and taught with the measured condition of a site.
+    slow: one fit takes tenths of a second or more.
+    """
 
     module: str
-    name: str
+    factory: str
+    follows: str = ""
+    conditional: bool = False
     slow: bool = False
 
 
@@ -30,56 +40,70 @@ _ENTRIES: dict[str, _Entry] = {
     "clipped-least-squares": _Entry("adaptive", "ClippedLeastSquares"),
     "bayesian-least-squares": _Entry("adaptive", "BayesianLeastSquares"),
     "kalman": _Entry("adaptive", "Kalman"),
-    "blind-average": _Entry("average", "blind_average"),
-    AVERAGE: _Entry("average", "Average"),
+    "blind-average": _Entry("average", "blind_average", conditional=True),
+    AVERAGE: _Entry("average", "Average", conditional=True),
     "theil-sen": _Entry("robust", "TheilSen"),
     "huber": _Entry("robust", "Huber"),
     "random-forest": _Entry("random_forest", "RandomForest", slow=True),
     "arima": _Entry("arima", "Arima", slow=True),
     "sarima": _Entry("arima", "Sarima", slow=True),
     "lstm": _Entry("lstm", "Lstm", slow=True),
+    "river": _Entry("river_model", "River", follows=_CLASS),
+    "features": _Entry("features", "Measured", follows=_NAME, conditional=True),
 }
-HELP = f"{', '.join(_ENTRIES)}, or {RIVER}MODULE.CLASS; {FEATURES}NAME: on measured features"  # for --help
+
+
+def names() -> tuple[str, ...]:
+    """All names that stand for a predictor by themselves."""
+    return tuple(name for name, entry in _ENTRIES.items() if not entry.follows)
+
+
+HELP = f"{', '.join(names())}, or river:{_CLASS}; features:{_NAME} also uses what is measured of a site"
 
 
 def make(name: str, window: int, seed: int = 0) -> Predictor:
-    """A fresh predictor that remembers the last `window` executions; the same seed gives the same answers.
+    """A new predictor that remembers the last `window` executions. The same seed gives the same answers.
 
-    MissingExtra where its library is not installed.
+    MissingExtra if its library is not installed.
     """
     check_name(name)
-    name = name.removeprefix(WORK)
-    if name.startswith(FEATURES):
-        from offboard.robot_client.predictors.features import Measured
-
-        return Measured(make(name.removeprefix(FEATURES), window, seed))
-    if name.startswith(RIVER):
-        from offboard.robot_client.predictors.river_model import River
-
-        return River(name.removeprefix(RIVER), window, seed)
-    entry = _ENTRIES[name]
+    entry, rest = _find(name)
     module = importlib.import_module(f"offboard.robot_client.predictors.{entry.module}")
-    made: Predictor = getattr(module, entry.name)(window, seed=seed)
+    factory = getattr(module, entry.factory)
+    made: Predictor
+    if entry.follows == _NAME:
+        made = factory(make(rest, window, seed))
+    elif entry.follows == _CLASS:
+        made = factory(rest, window, seed)
+    else:
+        made = factory(window, seed=seed)
     return made
 
 
 def conditional(name: str) -> bool:
-    """Whether it asks for what is measured of a site."""
-    return name.startswith(FEATURES) or name in (AVERAGE, "blind-average")
-
-
-def names() -> tuple[str, ...]:
-    """All but those of river, which has its own."""
-    return tuple(_ENTRIES)
+    """Whether this predictor uses the measured condition of a site."""
+    return _find(name)[0].conditional
 
 
 def slow(name: str) -> bool:
-    """Whether one fit takes tenths of a second or more."""
-    return name in _ENTRIES and _ENTRIES[name].slow
+    """Whether one fit of this predictor takes tenths of a second or more."""
+    return _find(name)[0].slow
 
 
 def check_name(name: str, where: str = "predictor") -> None:
-    """ConfigError, naming `where` it stood, unless `make` knows it; nothing is loaded."""
-    plain = name.removeprefix(WORK).removeprefix(FEATURES)
-    if plain not in _ENTRIES and not plain.startswith(RIVER):
-        raise ConfigError(f"{where}: {name!r} is not one of {HELP}")
+    """Raise ConfigError unless `make` knows the name; `where` names its flag or field. Loads nothing."""
+    try:
+        _find(name)
+    except KeyError:
+        raise ConfigError(f"{where}: {name!r} is not one of {HELP}") from None
+
+
+def _find(name: str) -> tuple[_Entry, str]:
+    """The entry of a name, and what follows its colon; KeyError if there is no such predictor."""
+    head, colon, rest = name.removeprefix(WORK).partition(":")
+    entry = _ENTRIES[head]
+    if bool(colon) != bool(entry.follows):
+        raise KeyError(name)
+    if entry.follows == _NAME and (rest.startswith(WORK) or _find(rest)[0].follows == _NAME):
+        raise KeyError(name)
+    return entry, rest

@@ -1,6 +1,6 @@
-"""Lines that follow a site that changes, and do not jump at a single outlier.
+"""Predictors that follow a site as it changes, and do not jump at a single outlier.
 
-All limits are in units of the site's own running error, so that tasks of 5 ms and of 50 s are alike to them.
+All limits are relative to the running error of the site, so that they fit tasks of 5 ms and of 50 s.
 """
 
 import math
@@ -9,24 +9,25 @@ from offboard.robot_client.predictors.base import SIZE_MIN, Prediction, check_ob
 from offboard.robot_client.predictors.least_squares import ROUNDING, RecursiveLeastSquares, checked_forgetting
 from offboard.robot_client.predictors.window import WINDOW_MAX, checked_length
 
-CLIP = 3.0  # standard deviations of the running error that one observation may pull by
-CLIP_FROM = 8  # observations: before them nothing is known to be an outlier
-SCALE_RATE = 0.05  # of the running error, once so many observations made it
-PACE_RATE = 0.3  # of a time's ratio to what was expected that the pace takes over
-PACE_MAX = 2.0  # times what was expected: a longer one counts as this long
-PACE_FAR = 100.0  # times as slow as the line, or as quick, at most
-PACE_WINDOWS = 4  # windows are the memory of the line
-NORMAL = math.sqrt(math.pi / 2)  # standard deviation over mean absolute error, of normal errors
-GROWTH = 2.0  # times what is usual, or was seen before: a larger error counts as this large
+CLIP = 3.0  # an error counts as at most this many standard deviations of the running error
+CLIP_FROM = 8  # observations before any is taken for an outlier
+SCALE_RATE = 0.05  # weight of a new error in the running error, after the first 20 errors
+PACE_RATE = 0.3  # how far the pace follows the ratio of measured to expected time
+PACE_MAX = 2.0  # a larger ratio counts as this one
+PACE_FAR = 100.0  # the largest pace; the smallest is its inverse
+PACE_WINDOWS = 4  # memory of the line, in windows
+NORMAL = math.sqrt(math.pi / 2)  # standard deviation divided by mean absolute error, for normal errors
+GROWTH = 2.0  # an error counts as at most this many times the clip, or the error before
 
 
 class Scale:
-    """Running standard deviation of errors, as that of normal ones with their mean absolute value.
+    """Running standard deviation of errors, computed from their mean absolute value as for normal errors.
 
-    An error is taken as at most GROWTH clips, so that one outlier does not make the next one look usual,
-    while a lasting change doubles the scale within a few tasks; squares would let one outlier in 30 tasks
-    grow it for ever. `clip` is the largest error that is believed: infinite while too few are known, or all
-    were 0.
+    An error counts as at most GROWTH times `clip`. One outlier then does not make the next one look normal,
+    while a lasting change doubles the scale within a few tasks. With squared errors, one outlier in 30 tasks
+    would make the scale grow without end.
+
+    clip: the largest error that counts in full; infinite while few errors are known, or all were 0.
     """
 
     __slots__ = ("_mean", "clip", "count", "deviation")
@@ -50,11 +51,12 @@ class Scale:
 
 
 class ClippedLeastSquares:
-    """Least squares with weights that fade, where no observation pulls by more than CLIP running errors.
+    """Least squares with decaying weights, where no error counts as more than CLIP running errors.
 
-    What lies further out is learnt as if it lay there (Huber's psi as a one-step weight).
-    The spread is the running error of predictions made before the observation was known.
-    forgetting: of the weight of an execution with each further one; None: 1 - 1 / window.
+    An observation further away is learnt as if it lay at that limit (Huber's psi as a one-step weight).
+    The spread is the running error of predictions for observations that were not known yet.
+
+    forgetting: the factor by which a weight decays with each execution; None is 1 - 1 / window.
     """
 
     def __init__(self, window: int, seed: int = 0, forgetting: float | None = None) -> None:  # noqa: ARG002
@@ -72,7 +74,7 @@ class ClippedLeastSquares:
         return self._count
 
     def expect(self, size: float) -> float:
-        """The expected seconds alone."""
+        """The expected seconds, without a spread."""
         return self._seconds + self._slope * (size - self._size)
 
     def predict(self, size: float, ahead: int = 1) -> Prediction | None:  # noqa: ARG002
@@ -109,10 +111,10 @@ class ClippedLeastSquares:
 
 
 class Paced:
-    """A line times a pace: what a site takes for all sizes alike changes far sooner than its line does.
+    """A line times a pace: the speed of a site changes far sooner than how its times depend on size.
 
-    The pace follows the last times by a share of PACE_RATE of their ratio to what was expected, at most
-    PACE_MAX either way, on the logarithm; the line is learnt from times at a pace of 1.
+    On a logarithmic scale, the pace moves by PACE_RATE towards the ratio of measured to expected time, which
+    counts as at most PACE_MAX. The line is learnt from times divided by the pace.
     """
 
     def __init__(self, window: int, seed: int = 0) -> None:
@@ -120,7 +122,7 @@ class Paced:
         self._pace = 1.0
 
     def expect(self, size: float) -> float:
-        """The expected seconds alone."""
+        """The expected seconds, without a spread."""
         return self._pace * self._line.expect(size)
 
     def learn(self, size: float, seconds: float) -> None:
@@ -131,11 +133,11 @@ class Paced:
 
 
 class BayesianLeastSquares(RecursiveLeastSquares):
-    """Bayesian linear regression with unknown noise; nothing is forgotten unless told.
+    """Bayesian linear regression with unknown noise. By default it forgets nothing.
 
-    The slope's prior is normal around 0 and weighs PRIOR observations; level and noise have none (Gelman
-    et al., Bayesian Data Analysis, chapter 14). `error_s` is the posterior's standard deviation of the
-    mean time at this size: what bandits explore by.
+    The prior of the slope is normal around 0 and weighs PRIOR observations; level and noise have no prior
+    (Gelman et al., Bayesian Data Analysis, chapter 14). `error_s` is the posterior standard deviation of the
+    mean time at this size, which bandit policies use to explore.
     """
 
     PRIOR = 1.0
@@ -146,7 +148,7 @@ class BayesianLeastSquares(RecursiveLeastSquares):
     def predict(self, size: float, ahead: int = 1) -> Prediction | None:  # noqa: ARG002
         if not self._count:
             return None
-        ridge = self.PRIOR * self._sdd / self._weight  # in the units of the sizes seen
+        ridge = self.PRIOR * self._sdd / self._weight  # in the units of the sizes
         least = max(SIZE_MIN, ROUNDING * self._size.value)
         known = self._sdd > self._weight * least * least
         slope = self._sdt / (self._sdd + ridge) if known else 0.0
@@ -162,25 +164,25 @@ class BayesianLeastSquares(RecursiveLeastSquares):
 
 
 class Kalman:
-    """A dynamic linear model: level and slope are random walks, what is observed has noise.
+    """A dynamic linear model: level and slope are random walks, and observations have noise.
 
-    West and Harrison, Bayesian Forecasting and Dynamic Models; noise of the walks as shares of the
-    measured one, so that no unit matters. Innovations are clipped at CLIP running errors. After RUN
-    innovations of one sign beyond SIGNAL running errors the last of them is not clipped, and the level as
-    uncertain as it is large: what has changed for good is believed at once. It counts as at most GROWTH times
-    the one before: an outlier behind a small one is no change. Alone it can lock on to what it last saw of a
-    site that is no longer tried: it needs probes.
+    West and Harrison, Bayesian Forecasting and Dynamic Models. The noise of the walks is a share of the
+    measured noise, so that units do not matter. Innovations are clipped at CLIP running errors. After RUN
+    innovations of the same sign beyond SIGNAL running errors, the last one is not clipped and the level
+    becomes as uncertain as that innovation is large, so that a lasting change is learnt at once. It counts as
+    at most GROWTH times the innovation before, because a large outlier after a small one is no change.
+    The filter learns nothing about a site that is no longer used, so it needs probes.
     """
 
-    LEVEL_NOISE = 0.1  # variance a task over that of the measurement
-    SLOPE_NOISE = 0.01  # the same for the slope times the typical distance of a size from the first
-    NOISE_RATE = 0.04  # of the measurement's variance
+    LEVEL_NOISE = 0.1  # variance of a step of the level, as a share of the variance of the measurement
+    SLOPE_NOISE = 0.01  # the same for the slope times the typical distance of a size from the first size
+    NOISE_RATE = 0.04  # weight of a new task in the variance of the measurement
     SIGNAL, RUN = 2.0, 2
 
     def __init__(self, window: int, seed: int = 0) -> None:  # noqa: ARG002 - nothing is random
         self.window = checked_length(window)
         self._count = 0
-        self._origin = 0.0  # the first size: the level is that there
+        self._origin = 0.0  # the first size; the level is the time there
         self._level = self._slope = 0.0
         self._p00 = self._p01 = self._p11 = 0.0  # covariance of level and slope
         self._noise = 0.0
@@ -224,7 +226,7 @@ class Kalman:
         self._step(x, error)
 
     def expect(self, size: float) -> float:
-        """The expected seconds alone."""
+        """The expected seconds, without a spread."""
         return self._level + self._slope * (size - self._origin)
 
     def predict(self, size: float, ahead: int = 1) -> Prediction | None:  # noqa: ARG002
@@ -233,7 +235,7 @@ class Kalman:
         return Prediction(self.expect(size), self._scale.deviation if self._scale.count > 1 else None)
 
     def _see(self, x: float) -> None:
-        """The slope is as unknown as the first size that differs tells; its walk is in units of the sizes."""
+        """Follow the typical distance of sizes, and set the uncertainty of the slope at the first one."""
         rate = max(1 / self._count, 1 / self.window)
         first = self._reach == 0
         self._reach += rate * (x * x - self._reach)
@@ -241,7 +243,7 @@ class Kalman:
             self._p11 = self._noise / self._reach
 
     def _watch(self, error: float, deviation: float) -> bool:
-        """Whether innovations were beyond SIGNAL on one side again and again: a change."""
+        """Whether RUN innovations in a row were beyond SIGNAL on the same side, which is a change."""
         if self._scale.count <= CLIP_FROM or abs(error) <= self.SIGNAL * deviation:
             self._run = 0
             return False
@@ -264,6 +266,6 @@ class Kalman:
             self._p00 = max(0.0, self._p00 - k0 * c0)
             self._p01 -= k0 * c1
             self._p11 = max(0.0, self._p11 - k1 * c1)
-        # What the model does not explain itself is noise of the measurement.
+        # The part that the model does not explain is noise of the measurement.
         unexplained = max(error * error - variance, 0.0)
         self._noise += max(1 / self._count, self.NOISE_RATE) * (unexplained - self._noise)

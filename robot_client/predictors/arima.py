@@ -1,4 +1,4 @@
-"""A line on the size, and what its residuals say of the next one: ARIMA and SARIMA."""
+"""A line on the size, and a time series of its residuals: ARIMA and SARIMA."""
 
 import math
 import threading
@@ -19,27 +19,27 @@ try:
 except ImportError as error:
     raise MissingExtra("predictor arima or sarima", "learned") from error
 
-REFIT_SHARE = 4  # fitted anew after a quarter as many observations
-AHEAD_MAX = 200  # steps that a forecast goes ahead; later tasks get that of the last step
-LIKELIHOODS_MAX = 300  # that a fit may try; 50 to 200 are usual
-PARAMETER_MAX = 0.999  # below it in size, each of them, the series is stationary and invertible
-FLAT = 1e-9  # residuals below this share of the times are rounding, not a series
-FITTING = threading.Lock()  # threads and warnings are set, and set back, for the whole process
-# On its threads the 12 x 12 matrices of a season took 7 times as long as on one, and more on a busy machine.
+REFIT_SHARE = 4  # the next fit comes after a quarter as many observations as the last one had
+AHEAD_MAX = 200  # steps of a forecast; later tasks get the forecast of the last step
+LIKELIHOODS_MAX = 300  # evaluations in one fit; 50 to 200 are usual
+PARAMETER_MAX = 0.999  # if all parameters are smaller, the series is stationary and invertible
+FLAT = 1e-9  # residuals below this share of the times are rounding errors, not a series
+FITTING = threading.Lock()  # a fit changes threads and warnings of the whole process, and restores them
+# With several threads the 12 x 12 matrices of a season took 7 times as long, and longer on a busy machine.
 BLAS = ThreadpoolController()
 
 
 class Arima(Refitted):
     """Least squares of seconds on size, plus ARIMA(1,0,1) on its residuals in the order of observation.
 
-    A stream of tasks is no even time series and its times depend mostly on size, so the line comes first;
-    its residuals have mean 0, so the series has no constant.
-    Both are fitted anew once a quarter as many observations have come as the last fit was made on; between
-    fits each observation moves the state of the series.
-    The prediction is the line plus the forecast of the residual `ahead` steps on, which fades to 0. It is
-    the line alone below `observations_min`, and where the estimate fails or is at the edge of what is
-    stationary and invertible.
-    The spread is the standard deviation over the window of what one step ahead leaves unexplained.
+    The times of tasks depend mostly on their size, so the line comes first. Its residuals have mean 0, so the
+    series has no constant.
+    Both are fitted again after a quarter as many observations as the last fit had. Between fits, each
+    observation updates the state of the series.
+    The prediction is the line plus the forecast of the residual `ahead` steps later, which fades to 0. It is
+    the line alone with fewer than `observations_min` observations, if the estimate fails, and if it is barely
+    stationary or invertible.
+    The spread is the standard deviation of the forecast errors one step ahead, over the window.
     """
 
     season = 0
@@ -67,7 +67,7 @@ class Arima(Refitted):
 class Sarima(Arima):
     """The same with SARIMA(1,0,1)x(1,0,1) of ten tasks a season.
 
-    Tasks have no season of their own: ten stands in for whatever repeats, a robot's rounds for one.
+    Tasks have no natural season. Ten stands for anything that repeats, such as the rounds of a robot.
     """
 
     season = 10
@@ -86,16 +86,16 @@ class Line(NamedTuple):
 
 
 class Series:
-    """Forecasts of a multiplicative ARMA(1,1)x(1,1), which keep step with what is observed.
+    """Forecasts of a multiplicative ARMA(1,1)x(1,1) that follow each observation.
 
-    phi(B) PHI(B^season) r = theta(B) THETA(B^season) e with e the errors one step ahead; season 0: none.
-    The polynomials multiplied out reach `season` + 1 back, and so does what is kept of r and e.
+    phi(B) PHI(B^season) r = theta(B) THETA(B^season) e, where e are the errors one step ahead. Season 0 means
+    no season. The multiplied polynomials reach back `season` + 1 steps, so that many r and e are kept.
     """
 
     def __init__(
         self, parameters: list[float], season: int, values: list[float], errors: list[float]
     ) -> None:
-        """parameters: phi, theta and with a season PHI, THETA; values and errors: r and e so far."""
+        """`parameters`: phi, theta, and with a season PHI, THETA; `values` and `errors`: r and e so far."""
         phi, theta, *seasonal = parameters
         self._weights = [(1, phi, theta)]  # lag, weight of r, weight of e
         if season:
@@ -111,7 +111,7 @@ class Series:
         self._errors.append(error)
 
     def forecast(self, ahead: int) -> float:
-        """The expected r so many steps after the last one taken in."""
+        """The expected r, `ahead` steps after the last observation."""
         values, errors = self._values.copy(), self._errors.copy()
         for _ in range(min(ahead, AHEAD_MAX)):
             values.append(self._next(values, errors))
@@ -123,7 +123,7 @@ class Series:
 
 
 def fit_line(sizes: Column, seconds: Column) -> tuple[Line, Column]:
-    """Least squares and its residuals; slope 0 where all sizes are equal."""
+    """The line of least squares and its residuals. The slope is 0 if all sizes are equal."""
     low, width = float(sizes.min()), float(np.ptp(sizes))
     x = (sizes - low) / width if width > SIZE_MIN else np.zeros(len(sizes))
     mean_x, mean_y = float(x.mean()), float((seconds - seconds[0]).mean())
@@ -134,11 +134,11 @@ def fit_line(sizes: Column, seconds: Column) -> tuple[Line, Column]:
 
 
 def fit_series(residuals: Column, season: int) -> tuple[Series | None, Column]:
-    """The series by maximum likelihood, and its errors one step ahead; None where there is none."""
+    """The series by maximum likelihood and its errors one step ahead; None if it cannot be used."""
     scale = float(residuals.std())
     seasonal = (1, 0, 1, season) if season else (0, 0, 0, 0)
     with FITTING, warnings.catch_warnings(), BLAS.limit(limits=1, user_api="blas"):
-        # Of poor starting values, the limit, 0/0 on the way: a poor estimate is told by its parameters.
+        # They warn of starting values, the limit, and 0/0. The check of the parameters below is enough.
         warnings.simplefilter("ignore", UserWarning)
         warnings.simplefilter("ignore", RuntimeWarning)
         try:
@@ -150,7 +150,7 @@ def fit_series(residuals: Column, season: int) -> tuple[Series | None, Column]:
             return None, residuals
     parameters = found.params.tolist()
     errors = scale * np.asarray(found.resid, dtype=np.float64)
-    # Not `any(.. > ..)`: parameters that are not a number shall fail too.
+    # Written as `not all(.. < ..)`, so that NaN fails too.
     if not all(abs(parameter) < PARAMETER_MAX for parameter in parameters) or not np.isfinite(errors).all():
         return None, residuals
     return Series(parameters, season, residuals.tolist(), errors.tolist()), errors

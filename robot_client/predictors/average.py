@@ -1,4 +1,4 @@
-"""Dynamic model averaging: three predictors of one site, each believed as far as it was right of late."""
+"""Dynamic model averaging: three predictors of one site, weighted by how right each was recently."""
 
 import math
 from collections.abc import Sequence
@@ -10,30 +10,32 @@ from offboard.robot_client.predictors.robust import TheilSen
 from offboard.robot_client.sites.runner import UNMEASURED, Condition
 
 SHARPNESS = 4.0  # weight of a model: exp(-SHARPNESS x its mean error in units of the average's own)
-MEMORY = 0.9  # of the mean error: so much of it is left after one more task
-ERROR_MAX = 4.0  # one task's error counts as at most so many of the average's own
-START = 10  # observations, of which none may lie further than CLIP deviations from a line that bears outliers
-START_CLIP_FROM = 5  # fewer have no outliers
+MEMORY = 0.9  # share of the mean error that is left after one more task
+ERROR_MAX = 4.0  # the error of one task counts as at most this many errors of the average
+START = 10  # first observations; their outliers are clipped at CLIP deviations from a robust line
+START_CLIP_FROM = 5  # with fewer observations none counts as an outlier
 EXCESS_RATE = 0.05  # of the mean of what was clipped
-EXCESS_MAX = 8.0  # clips that count of it, at most: hedges bound what is waited for
-FEARED = 20  # tasks without news that it outlasts: so often a site is tried that is not slow
-FADING = 0.97  # with each one more
+EXCESS_MAX = 8.0  # clips that count of it at most, because hedges bound the wait
+FEARED = 20  # tasks without news after which it starts to fade: a site that is not slow is tried that often
+FADING = 0.97  # factor with each further task
 
 Three = tuple[float, float, float]  # a value of each model
 
 
 class Average(Conditional):
-    """Least squares on what is seen; a Kalman filter and a line at a pace on what is left without features.
+    """The weighted mean of three models.
 
-    The features are those that were measured. The mean of the models' predictions is weighted by how small
-    their errors were of late: Raftery, Karny and Ettler, Online Prediction Under Model Uncertainty Via
-    Dynamic Model Averaging (2010), with clipped absolute errors in place of densities: an outlier is no
-    model's fault. The spread is the running error of the average itself. `blind`: the features are not
-    looked at.
+    Least squares learns the measured times. A Kalman filter and a line with a pace learn what is left without
+    the measured features. The weights depend on the recent errors of the models: Raftery, Karny and Ettler,
+    Online Prediction Under Model Uncertainty Via Dynamic Model Averaging (2010), with clipped absolute errors
+    in place of densities, because no model can predict an outlier. The spread is the running error of the
+    mean itself.
 
-    The first START observations are held to a line that bears outliers; what was clipped off any counts in
-    the mean, as times do that nobody can foretell. Where no news come that fades: bad luck at the start would
-    else keep a site from ever being chosen again.
+    Outliers among the first START observations are clipped at a robust line. The mean of what was clipped is
+    added to every prediction, because such times will come again. It fades while the site is not used:
+    otherwise bad luck at the start could exclude a site for ever.
+
+    blind: ignore the measured features.
     """
 
     def __init__(self, window: int, seed: int = 0, *, blind: bool = False) -> None:
@@ -42,7 +44,7 @@ class Average(Conditional):
         self._forget()
 
     def _forget(self) -> None:
-        """Begin anew, with what `_first` holds not yet learnt."""
+        """Start from nothing; the caller teaches what `_first` holds."""
         self._seen = ClippedLeastSquares(self._window, self._seed)
         self._left = Kalman(self._window, self._seed)
         self._paced = Paced(self._window, self._seed)
@@ -110,12 +112,12 @@ class Average(Conditional):
         )
 
     def _mean(self, each: Three) -> float:
-        """By their shares; to the bit what they say where all say the same."""
+        """The mean by shares; exact if all three agree."""
         (_, left_share, paced_share), (seen, left, paced) = self._shares, each
         return seen + left_share * (left - seen) + paced_share * (paced - seen)
 
     def _judge(self, each: Three, seconds: float) -> None:
-        """How far each was off; the weights that follow."""
+        """Learn how far each model was off, and set the weights."""
         scale = self._scale
         unit, clip = scale.deviation, scale.clip
         error = seconds - self._mean(each)
@@ -136,23 +138,23 @@ class Average(Conditional):
         self._shares = x / (x + y + z), y / (x + y + z), z / (x + y + z)
 
     def _exceed(self, beyond_s: float, clip: float) -> None:
-        """What was clipped at `clip` was so much more."""
+        """An observation was clipped at `clip`, and was `beyond_s` larger."""
         excess = min(beyond_s, EXCESS_MAX * clip) if beyond_s > 0 else 0.0
         self._excess += EXCESS_RATE * (excess - self._excess)
 
     def _feared(self, ahead: int) -> float:
-        """What counts of what was clipped, `ahead` tasks after the last one learnt."""
+        """The mean of what was clipped, faded for `ahead` tasks without news."""
         return self._excess if ahead <= FEARED else self._excess * FADING ** (ahead - FEARED)
 
     def _learn_gains(self, size: float, rest: float, condition: Condition) -> None:
-        """From the error of the model that uses them."""
+        """Learn the gains from the error of the Kalman filter, which uses them."""
         expected = self._left.expect(size) * self._gains.crowding(condition)
         if expected > 0:
             self._gains.learn(rest / expected, condition)
 
 
 def _reach(first: Sequence[tuple[float, float, Condition]]) -> list[tuple[float, float]]:
-    """Between what seconds each is no outlier; from START_CLIP_FROM observations on there may be some."""
+    """The lowest and highest seconds of each observation that is no outlier."""
     line = TheilSen(START)
     for size, seconds, _ in first:
         line.learn(size, seconds)
@@ -168,5 +170,5 @@ def _reach(first: Sequence[tuple[float, float, Condition]]) -> list[tuple[float,
 
 
 def blind_average(window: int, seed: int = 0) -> Average:
-    """Least squares and Kalman filter on the size alone."""
+    """The average that ignores the measured features."""
     return Average(window, seed, blind=True)

@@ -1,15 +1,19 @@
-"""The contract of every predictor: learn what happened on one site, say what will."""
+"""The contract of every predictor: it learns what happened on one site, and predicts what will.
+
+Where a task runs is decided in `policies`.
+"""
 
 import math
 from typing import NamedTuple, Protocol
 
-SIZE_MIN = 1e-100  # sizes that differ by less are equal: a steeper line would leave the range of a float
+SIZE_MIN = 1e-100  # smaller differences of sizes are 0: a steeper line would leave the range of a float
 
 
 class Prediction(NamedTuple):
-    """Expected `seconds` of a task, and the standard deviation of what was seen around it (None: unknown).
+    """What a task is expected to take.
 
-    `error_s` is the standard error of the expectation itself, where the predictor knows it.
+    spread_s: standard deviation of the observed times around the prediction; None if unknown.
+    error_s: standard error of `seconds` itself; None if unknown.
     """
 
     seconds: float
@@ -18,31 +22,30 @@ class Prediction(NamedTuple):
 
 
 class Predictor(Protocol):
-    """Learns the time of one kind of task on one site. Called from one thread at a time.
+    """Learns the times of one kind of task on one site. Only one thread at a time calls it.
 
-    `copy.deepcopy` and pickle carry all that it has learnt; memory is bounded by its window, however much
-    it is taught.
+    `copy.deepcopy` and pickle keep everything that it has learnt. Its window bounds its memory.
     """
 
     @property
     def full(self) -> bool:
-        """Whether warm-up is over for this site."""
+        """Whether the warm-up of this site is over."""
 
     def __len__(self) -> int:
-        """Observations it rests on, at most the window."""
+        """The number of observations that predictions use, at most the window."""
 
     def learn(self, size: float, seconds: float) -> None:
-        """Take one finished execution; ValueError unless both are finite and not negative."""
+        """Learn one finished execution. ValueError unless both values are finite and not negative."""
 
     def predict(self, size: float, ahead: int = 1) -> Prediction | None:
-        """For a task of this size; None until it has learnt anything.
+        """The prediction for a task of this size; None before the first observation.
 
-        `ahead` counts tasks since the last one learnt: 1 is the next one, more where this site has not run
-        the tasks between. Only predictors of a sequence look at it.
+        `ahead` counts tasks since the last one learnt. It is 1 for the next task, and more if this site did
+        not run the tasks in between. Only predictors of a time series use it.
         """
 
 
 def check_observation(size: float, seconds: float) -> None:
-    """The check every `learn` starts with."""
+    """The check that every `learn` starts with."""
     if not (0 <= size < math.inf and 0 <= seconds < math.inf):
         raise ValueError(f"observation ({size}, {seconds}): size and seconds must be finite and not negative")

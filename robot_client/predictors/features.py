@@ -1,4 +1,7 @@
-"""Predictors that know what was measured of the site beside its times (`runner.Condition`)."""
+"""Predictors that also use what is measured of a site (`runner.Condition`).
+
+Measuring is left to `sites`.
+"""
 
 from abc import ABC, abstractmethod
 
@@ -7,12 +10,12 @@ from offboard.robot_client.sites.runner import UNMEASURED, Condition
 
 GAIN_RATE = 0.05
 GAIN_MAX = 3.0
-GAIN_FROM = 0.3  # below this a feature says too little to learn what it does
+GAIN_FROM = 0.3  # a smaller feature says too little to learn its effect
 STEP_MAX = 1.0  # of the relative error that one observation may move a gain by
 
 
 class Conditional(ABC):
-    """A predictor whose observations, and whose questions, come with what was measured beforehand."""
+    """A predictor that is taught and asked with the condition that was measured before the task."""
 
     @property
     @abstractmethod
@@ -23,7 +26,7 @@ class Conditional(ABC):
 
     @abstractmethod
     def learn(self, size: float, seconds: float, condition: Condition = UNMEASURED, ahead: int = 1) -> None:
-        """`ahead`, as for `predict`: so many tasks after the one learnt before."""
+        """`ahead`: tasks since the one learnt before, as for `predict`."""
 
     @abstractmethod
     def predict(
@@ -32,11 +35,11 @@ class Conditional(ABC):
 
 
 class Gains:
-    """Seconds = round trip + (1 + k_q queue + k_l load) x what is left when these are taken out.
+    """Seconds = round trip + (1 + k_q queue + k_l load) x base time.
 
-    What is left is learnt by whoever asks, and needs not to be forgotten when link or load change. The gains
-    k are learnt by clipped steps along the relative error, each only where its feature is large enough to
-    tell; they start at 1: a waiting task takes as long as ours, and another busy program doubles the time.
+    The caller learns the base time, which stays valid when link or load change. The gains k are learnt in
+    clipped steps along the relative error, each only while its feature is large enough. They start at 1: a
+    waiting task takes as long as ours, and another busy program doubles the time.
     """
 
     __slots__ = ("load", "queue")
@@ -48,7 +51,7 @@ class Gains:
         return 1.0 + self.queue * condition.queue + self.load * condition.load
 
     def learn(self, ratio: float, condition: Condition) -> None:
-        """`ratio`: what was left over what was expected to be."""
+        """`ratio`: measured over expected time, both without the round trip."""
         step = GAIN_RATE * max(-STEP_MAX, min(STEP_MAX, ratio - 1))
         if condition.queue > GAIN_FROM:
             self.queue = min(GAIN_MAX, max(0.0, self.queue + step))
@@ -57,7 +60,7 @@ class Gains:
 
 
 class Measured(Conditional):
-    """Any predictor, asked and taught what is left when the measured features are taken out."""
+    """Any predictor, which learns and predicts the base time without the measured features."""
 
     def __init__(self, base: Predictor) -> None:
         self._base = base

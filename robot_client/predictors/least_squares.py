@@ -1,4 +1,7 @@
-"""Least squares: on the window, as psi^l and psi^c of the paper, and with weights that fade instead."""
+"""Least squares: over the window, as psi^l and psi^c of the paper, and with weights that decay.
+
+Predictors that also resist outliers are in `adaptive` and `robust`.
+"""
 
 import math
 
@@ -6,14 +9,14 @@ from offboard.common.errors import ConfigError
 from offboard.robot_client.predictors.base import SIZE_MIN, Prediction, check_observation
 from offboard.robot_client.predictors.window import Window, checked_length
 
-ROUNDING = 2.0**-50  # 4 units in the last place: sizes that differ by less than this share are equal
+ROUNDING = 2.0**-50  # 4 units in the last place: smaller relative differences of sizes are 0
 
 
 class LeastSquares:
     """Ordinary least squares of seconds on size over the last `window` executions.
 
     m = sum((d - mean d)(t - mean t)) / sum((d - mean d)^2); c = mean t - m mean d; p = m d + c.
-    Where all sizes are equal the slope is 0 and p = mean t.
+    If all sizes are equal, the slope is 0 and p = mean t.
     """
 
     def __init__(self, window: int, seed: int = 0) -> None:  # noqa: ARG002 - nothing is random
@@ -40,13 +43,14 @@ class LeastSquares:
 
 
 class RecursiveLeastSquares:
-    """Least squares of seconds on size where each execution weighs `forgetting` times as much as the next.
+    """Least squares of seconds on size, where each execution weighs `forgetting` times as much as the next.
 
-    No prior and no window: means and centred sums move with each execution, in constant time and memory.
-    forgetting: from 0.5 to 1; None: 1 - 1 / window, so that all weights together come to the window.
-    At 1 nothing fades, and the line is that of least squares on all executions.
-    Where the sizes that still weigh are equal up to rounding the slope is 0 and p = the weighted mean of
-    seconds. Times that never changed are predicted to the bit.
+    There is neither a prior nor a window: each execution updates means and centred sums, in constant time
+    and memory. If the sizes that still have weight are equal up to rounding, the slope is 0 and p is the
+    weighted mean of seconds. Times that never change are predicted exactly.
+
+    forgetting: from 0.5 to 1. None is 1 - 1 / window, so that the sum of all weights approaches the window.
+        With 1 the line is that of ordinary least squares over all executions.
     """
 
     def __init__(self, window: int, seed: int = 0, forgetting: float | None = None) -> None:  # noqa: ARG002
@@ -65,7 +69,7 @@ class RecursiveLeastSquares:
         return self._count
 
     def learn(self, size: float, seconds: float) -> None:
-        """West (1979): with d and t the distances from the old means, each sum grows by d t W_old / W_new."""
+        """West (1979): each sum grows by d t W_old / W_new; d and t are distances from the old means."""
         check_observation(size, seconds)
         fade = self.forgetting
         faded = fade * self._weight
@@ -74,7 +78,9 @@ class RecursiveLeastSquares:
         d, t = self._size.offset(size), self._seconds.offset(seconds)
         self._size.move(d / self._weight)
         self._seconds.move(t / self._weight)
-        if abs(d) <= ROUNDING * size:  # else a run of one size would fade all sums but that of its rounding
+        if (
+            abs(d) <= ROUNDING * size
+        ):  # otherwise, after many equal sizes, only rounding errors would be left in the sums
             d = 0.0
         share = faded / self._weight
         self._sdd = fade * self._sdd + share * d * d
@@ -94,7 +100,7 @@ class RecursiveLeastSquares:
         return self._sdt / self._sdd if self._sdd > self._weight * least * least else 0.0
 
     def _spread(self, slope: float) -> float | None:
-        """Root of the weighted residual sum of squares over W - 2 sum(w^2) / W; N - 2 where nothing fades."""
+        """Root of the weighted residual sum of squares over W - 2 sum(w^2) / W; N - 2 without decay."""
         if self._count < 3:
             return None
         freedom = self._weight - 2 * self._squares / self._weight
@@ -102,7 +108,7 @@ class RecursiveLeastSquares:
 
 
 def checked_forgetting(window: int, forgetting: float | None) -> float:
-    """What is left of a weight after one more execution; ConfigError where that is too little or too much."""
+    """The factor by which a weight decays with each execution; ConfigError if it is out of range."""
     share = 1 - 1 / window if forgetting is None else forgetting
     if not 0.5 <= share <= 1:
         raise ConfigError(f"forgetting {forgetting}: must be from 0.5 to 1")
@@ -110,7 +116,7 @@ def checked_forgetting(window: int, forgetting: float | None) -> float:
 
 
 class _Mean:
-    """A mean as the sum of two floats: moves far below its last digit are kept."""
+    """A mean as the sum of two floats, so that it keeps changes far below its last digit."""
 
     __slots__ = ("_rest", "value")
 
@@ -124,5 +130,5 @@ class _Mean:
     def move(self, by: float) -> None:
         rest = self._rest + by
         moved = self.value + rest
-        self._rest = rest - (moved - self.value)  # what rounding took from `moved` (Dekker's fast two-sum)
+        self._rest = rest - (moved - self.value)  # the rounding error of `moved` (Dekker's fast two-sum)
         self.value = moved

@@ -1,4 +1,4 @@
-"""The neural network that the paper compares itself with."""
+"""LSTM: the neural network that the paper compares its method with."""
 
 import math
 import threading
@@ -18,35 +18,35 @@ try:
 except ImportError as error:
     raise MissingExtra("predictor lstm", "lstm") from error
 
-# The paper gives these two, and that it was trained on the first 80 % of 1,000 rows.
+# The paper gives these two values. It trained on the first 80 % of 1,000 rows.
 LAYERS = 4
 BATCH = 50
-# The rest was chosen on lines, bends and steps with and without noise, for 5 to 800 observations.
+# The other values were chosen on lines, curves and steps with and without noise, for 5 to 800 observations.
 WIDTH = 32
 RATE = 0.01  # of Adam
-UPDATES_MAX = 800  # of the weights in one fit: 53 epochs of 800 observations
+UPDATES_MAX = 800  # updates of the weights in one fit: 53 epochs of 800 observations
 CHECK_EVERY = 5  # updates
-PATIENCE = 150  # updates without a better check that end the fit
-BETTER = 0.999  # times the best loss so far
+PATIENCE = 150  # the fit ends after this many updates without a better check
+BETTER = 0.999  # a check is better if its loss is below this share of the best one
 HELD_OUT_SHARE = 10  # the newest tenth decides when to stop ...
-HELD_OUT_MIN = 2  # ... unless that is fewer than this: then all are trained on, and decide
-REFIT_SHARE = 2  # trained on after half as many observations
-FLAT = 1e-9  # times that differ by less than this share of themselves are equal
-SCORE_MAX = 1e30  # more would be infinite in 32 bits; every cell has long been saturated
-COMPUTING = threading.Lock()  # the count of threads is set, and set back, for the whole process
+HELD_OUT_MIN = 2  # ... unless that is fewer than this; then all observations train and decide
+REFIT_SHARE = 2  # training continues after half as many observations as the last fit had
+FLAT = 1e-9  # times that differ by less than this share are equal
+SCORE_MAX = 1e30  # larger scores would overflow 32 bits; all cells are saturated long before
+COMPUTING = threading.Lock()  # the number of threads of torch is changed for the whole process, and restored
 
 
 class Lstm(Refitted):
-    """Four stacked LSTM layers and a linear one, trained on the window by mean square error.
+    """Four stacked LSTM layers and a linear one, trained on the window with mean square error.
 
-    The input is the size of the task alone, a sequence of length 1: a robot never learns what the site it
-    did not choose would have taken, so it has no even sequence to show. Each cell starts from zero; its
-    recurrent weights and its forget gate have nothing to act on.
-    Size and seconds are standardised. Beyond the sizes seen the cells saturate, and the prediction bends
-    towards a constant: it does not go on as a line does.
-    Trained further, from the weights that it has, once half as many observations have come as the last fit
-    was made on. A fit takes about a second: this one is for tables rather than for a robot at work.
-    The spread is the standard deviation of the residuals over the window, most of which were trained on.
+    The input is the size of the task, as a sequence of length 1. A robot never learns what the other site
+    would have taken, so there is no complete sequence. Each cell starts from zero, so its recurrent weights
+    and its forget gate have no effect.
+    Size and seconds are standardised. Beyond the observed sizes the cells saturate, so the prediction
+    approaches a constant instead of following a line.
+    After half as many observations as the last fit had, training continues from the present weights. A fit
+    takes about a second, so this predictor is meant for tables rather than for a working robot.
+    The spread is the standard deviation of the residuals over the window, which are mostly training errors.
     """
 
     def __init__(self, window: int, seed: int = 0) -> None:
@@ -69,7 +69,7 @@ class Lstm(Refitted):
             left = self._network.train(x, y, self._random)
         self._spread = self._seconds_scale * left
 
-    def _estimate(self, size: float, ahead: int) -> Prediction:  # noqa: ARG002 - the next task is as any other
+    def _estimate(self, size: float, ahead: int) -> Prediction:  # noqa: ARG002 - not a time series
         if self._flat:
             return Prediction(self._seconds, self._spread)
         score = (size - self._size) / self._size_scale
@@ -79,14 +79,14 @@ class Lstm(Refitted):
 
 
 class _Network:
-    """The weights, started from `random`; input and output are of shape (1, observations, 1)."""
+    """The network. `random` draws its first weights; input and output have the shape (1, observations, 1)."""
 
     def __init__(self, random: torch.Generator) -> None:
         with torch.inference_mode(False), torch.no_grad():
-            # Without values at first: torch would draw them from the generator that is the user's.
+            # Created without values, because torch would draw them from its global generator.
             self._cells = nn.LSTM(1, WIDTH, LAYERS, device="meta", dtype=torch.float32).to_empty(device="cpu")
             self._out = nn.Linear(WIDTH, 1, device="meta", dtype=torch.float32).to_empty(device="cpu")
-            bound = 1 / math.sqrt(WIDTH)  # as torch does it
+            bound = 1 / math.sqrt(WIDTH)  # as in torch
             for weights in self._weights():
                 weights.uniform_(-bound, bound, generator=random)
 
@@ -94,7 +94,7 @@ class _Network:
         return self._out(self._cells(x)[0])
 
     def train(self, x: torch.Tensor, y: torch.Tensor, random: torch.Generator) -> float:
-        """Go on from the weights that are there; the root mean square error on all of x."""
+        """Continue training; return the root mean square error on all of x."""
         held_out = x.shape[1] // HELD_OUT_SHARE
         trained = x.shape[1] - held_out if held_out >= HELD_OUT_MIN else x.shape[1]
         checked = slice(trained % x.shape[1], None)
@@ -130,9 +130,10 @@ class _Network:
 
 @contextmanager
 def _alone() -> Iterator[None]:
-    """torch on one thread, and free of an inference mode that the caller may be in.
+    """Run torch on one thread, outside of the inference mode that the caller may be in.
 
-    The work is too small to share: on a busy machine threads waited for each other for most of a minute.
+    The work is too small for several threads: on a busy machine they waited for each other for most of a
+    minute.
     """
     with COMPUTING:
         threads = torch.get_num_threads()
@@ -145,7 +146,7 @@ def _alone() -> Iterator[None]:
 
 
 def _batches(count: int, random: torch.Generator) -> Iterator[torch.Tensor]:
-    """Indices below `count` for ever, BATCH at a time; each once before any comes again."""
+    """Endless batches of BATCH indices below `count`; each index comes once before any comes again."""
     while True:
         yield from torch.randperm(count, generator=random, device="cpu").split(BATCH)
 

@@ -1,4 +1,7 @@
-"""The base of the predictors that fit a model to the whole window."""
+"""The base of the predictors that fit a model to the whole window.
+
+The models are left to its subclasses.
+"""
 
 from collections import deque
 
@@ -12,11 +15,12 @@ Column = npt.NDArray[np.float64]
 
 
 class Refitted:
-    """Learns a window and fits it when asked.
+    """Keeps a window of observations, and fits the model when a prediction is asked for.
 
-    A prediction fits anew where observations came since the last fit; with `refit_share` k, where at least
-    1/k as many came as that one was made on. A leaf has `_fit` and `_estimate`; `_follow` is for those that
-    keep step with each observation between two fits.
+    A subclass defines `_fit` and `_estimate`, and `_follow` if the model changes between two fits.
+
+    refit_share: with k, the model is fitted again after 1/k as many observations as the last fit had; with
+        None, after each observation.
     """
 
     def __init__(self, window: int, refit_share: int | None = None) -> None:
@@ -24,7 +28,7 @@ class Refitted:
         self.refit_share = refit_share
         self._observations: deque[tuple[float, float]] = deque(maxlen=window)
         self._unfitted = 0  # observations since the last fit
-        self._refit_at = 0  # so many of them; 0: never fitted
+        self._refit_at = 0  # that many of them start a fit; 0 before the first fit
 
     @property
     def full(self) -> bool:
@@ -51,12 +55,12 @@ class Refitted:
         return self._estimate(size, ahead)
 
     def _fit(self, sizes: Column, seconds: Column) -> None:
-        """Fit to the window, oldest first; it holds at least one observation."""
+        """Fit the model to the window, oldest first; there is at least one observation."""
         raise NotImplementedError
 
     def _follow(self, size: float, seconds: float) -> None:
-        """Take in one observation without fitting."""
+        """Take in one observation between two fits."""
 
     def _estimate(self, size: float, ahead: int) -> Prediction:
-        """The prediction of the model as fitted."""
+        """The prediction of the fitted model."""
         raise NotImplementedError

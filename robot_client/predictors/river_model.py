@@ -1,4 +1,4 @@
-"""Any regressor of river, which learns one observation at a time and decides itself what it forgets."""
+"""Any regressor of the library river. It learns one observation at a time, and decides what it forgets."""
 
 import difflib
 import importlib
@@ -16,21 +16,21 @@ try:
 except ImportError as error:
     raise MissingExtra("predictor river", "river") from error
 
-# What a model is tried with: standard scores of size and seconds.
+# A model must be able to learn these standard scores of size and seconds.
 TRIAL = ((-1.0, -1.0), (0.0, 0.5), (1.0, 1.0))
 
 
 class River:
-    """The regressor at `path` below river, such as `tree.HoeffdingTreeRegressor`, on the size alone.
+    """The regressor at `path` in river, such as `tree.HoeffdingTreeRegressor`, on the size.
 
-    The window is the count after which it is full, and the memory of the spread; what the model forgets,
-    and how much memory it takes, is its own affair.
-    It learns standard scores: sizes and seconds less their means, over their standard deviations, of all
-    seen so far. So a task of 5 ms and one of 50 s are alike to it, gradients do not explode, and a model
-    without an intercept has its line through both means.
-    Where it has no answer yet, or none that is a number, the prediction is the mean of seconds.
-    The spread is the root of the mean square of its errors when each observation was still unseen, with
-    the weight of an old one fading over the window.
+    The window says when warm-up is over, and how long the spread remembers. The model itself decides what it
+    forgets and how much memory it uses.
+    The model learns standard scores of all sizes and seconds so far. Tasks of 5 ms and of 50 s are then the
+    same to it, gradients do not explode, and the line of a model without an intercept passes through both
+    means.
+    The prediction is the mean of seconds while the model has no answer, or none that is a finite number.
+    The spread is the root mean square of the errors on observations that were still unknown. Old errors lose
+    weight over the window.
     """
 
     def __init__(self, path: str, window: int, seed: int = 0) -> None:
@@ -58,7 +58,7 @@ class River:
         self._seconds.add(seconds)
         self._model.learn_one({"size": self._size.score(size)}, self._seconds.score(seconds))
 
-    def predict(self, size: float, ahead: int = 1) -> Prediction | None:  # noqa: ARG002 - sees no sequence
+    def predict(self, size: float, ahead: int = 1) -> Prediction | None:  # noqa: ARG002 - not a time series
         if not self._seen:
             return None
         spread = None if self._square_error is None else math.sqrt(self._square_error)
@@ -103,7 +103,7 @@ class _Scale:
 
 
 def load(path: str, seed: int) -> Regressor:
-    """A fresh model; ConfigError unless `path` is PACKAGE.CLASS of a regressor that can do with sizes."""
+    """A new model; ConfigError unless `path` is PACKAGE.CLASS of a regressor that can learn from sizes."""
     package, _, name = path.partition(".")
     found = _regressors(package).get(name)
     if found is None:
@@ -118,7 +118,7 @@ def load(path: str, seed: int) -> Regressor:
 
 
 def known() -> list[str]:
-    """The paths of all that `load` takes; looking for them loads the whole of river."""
+    """All paths that `load` accepts. This imports all of river."""
     return [
         f"{package}.{name}"
         for package in _packages()
@@ -132,7 +132,7 @@ def _packages() -> list[str]:
 
 
 def _regressors(package: str) -> dict[str, type[Regressor]]:
-    """The public ones of a package of river by name; nothing is imported but what river has."""
+    """The public regressors of a package of river, by name. Imports nothing outside of river."""
     if package not in _packages():
         return {}
     public = vars(importlib.import_module(f"river.{package}"))
@@ -144,7 +144,7 @@ def _regressors(package: str) -> dict[str, type[Regressor]]:
 
 
 def _fault(found: type[Regressor]) -> str | None:
-    """Why a regressor cannot be used here, in words that follow its name."""
+    """Why a regressor cannot be used here, as a phrase after its name; None if it can."""
     needed = [
         parameter.name
         for parameter in inspect.signature(found).parameters.values()
@@ -158,7 +158,7 @@ def _fault(found: type[Regressor]) -> str | None:
         for size, seconds in TRIAL:
             model.learn_one({"size": size}, seconds)
         float(model.predict_one({"size": 0.5}) or 0.0)
-    except Exception as error:  # noqa: BLE001 - whatever a model for other data raises
+    except Exception as error:  # noqa: BLE001 - a model for other data may raise anything
         return f"does not learn one number from another ({describe(error)})"
     return None
 

@@ -1,4 +1,4 @@
-"""Lines that outliers do not bend."""
+"""Lines that outliers do not bend: Theil-Sen and Huber."""
 
 import math
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from offboard.common.errors import ConfigError
 from offboard.robot_client.predictors.base import SIZE_MIN, Prediction
 from offboard.robot_client.predictors.refitted import Column, Refitted
 
-SAMPLE = 1_000  # values that tell where the middle of many more lies
+SAMPLE = 1_000  # values that show roughly where the median of many more lies
 
 
 class _Line(NamedTuple):
@@ -26,7 +26,7 @@ class _Straight(Refitted):
 
     _line: _Line
 
-    def _estimate(self, size: float, ahead: int) -> Prediction:  # noqa: ARG002 - the next task is as any other
+    def _estimate(self, size: float, ahead: int) -> Prediction:  # noqa: ARG002 - not a time series
         line = self._line
         return Prediction(line.seconds + line.slope * (size - line.size), line.spread_s)
 
@@ -34,13 +34,13 @@ class _Straight(Refitted):
 class TheilSen(_Straight):
     """The median of the slopes between all pairs of different sizes, through the medians of size and seconds.
 
-    Bears up to 29 % outliers. A fit looks at N (N - 1) / 2 pairs, so the window is at most WINDOW_MAX.
-    The spread is 1.4826 times the median absolute deviation of the residuals: the standard deviation where
-    they are normal.
+    It tolerates up to 29 % outliers. A fit compares N (N - 1) / 2 pairs, so the window is at most WINDOW_MAX.
+    The spread is 1.4826 times the median absolute deviation of the residuals, which is the standard deviation
+    of normal residuals.
     """
 
     WINDOW_MAX = 2_000
-    PAIR_ROWS = 64  # of the table of pairs, taken at a time: as much as stays in the cache
+    PAIR_ROWS = 64  # rows of the table of pairs that are computed at a time, to stay in the cache
     MAD_TO_DEVIATION = 1.4826
 
     def __init__(self, window: int, seed: int = 0) -> None:  # noqa: ARG002 - nothing is random
@@ -65,7 +65,7 @@ class TheilSen(_Straight):
         for start in range(0, len(d), self.PAIR_ROWS):
             rows = slice(start, start + self.PAIR_ROWS)
             run, rise = d[start:] - d[rows, np.newaxis], t[start:] - t[rows, np.newaxis]
-            with np.errstate(all="ignore"):  # of pairs that are not apart
+            with np.errstate(all="ignore"):  # pairs of equal sizes divide by 0
                 found.append((rise / run)[run > SIZE_MIN])
         return np.concatenate(found)
 
@@ -73,9 +73,9 @@ class TheilSen(_Straight):
 class Huber(_Straight):
     """Huber's loss with line and scale estimated together: Owen (2007), "A robust hybrid of lasso and ridge".
 
-    Minimises sum(sigma + H(r / sigma) sigma) over line and sigma, where H(z) = z^2 up to EPSILON and goes
-    on as a straight line: the estimate of scikit-learn's HuberRegressor without its penalty.
-    The spread is sigma times what makes it the standard deviation where residuals are normal.
+    It minimises sum(sigma + H(r / sigma) sigma) over line and sigma. H(z) is z^2 up to EPSILON and a straight
+    line beyond. This is the estimate of scikit-learn's HuberRegressor without its penalty.
+    The spread is sigma, scaled to the standard deviation of normal residuals.
     """
 
     # The a with E min((a z)^2, EPSILON^2) = 1 for a standard normal z, from the condition on sigma.
@@ -94,14 +94,14 @@ class Huber(_Straight):
         self._line = _Line(low_d, low_t + height * intercept, height * slope / (width or 1.0), spread)
 
 
-EPSILON = 1.35  # residuals beyond so many sigma count as outliers
+EPSILON = 1.35  # residuals beyond this many sigma are outliers
 STEPS_MAX = 50  # 3 to 8 are usual
 HALVINGS_MAX = 30
-TOLERANCE = 1e-10  # in sigmas: a step that moves nothing by more is the last
-SHRINK_MAX = 0.1  # of sigma in one step, lest it jumps to 0 on the few points that are in reach at first
-SINGULAR = 1e-8  # inliers whose sizes vary by less than this share of all variance leave the slope open ...
-DAMPING = 1e-5  # ... which then moves as if they varied by this share
-EXACT = 2.0**-48  # residuals below this share of the values are rounding
+TOLERANCE = 1e-10  # the last step moves no parameter by more sigmas than this
+SHRINK_MAX = 0.1  # one step leaves at least this share of sigma: the first inliers may lie on a line
+SINGULAR = 1e-8  # inliers with less than this share of the variance of all sizes do not fix the slope ...
+DAMPING = 1e-5  # ... which then moves as if they had this share
+EXACT = 2.0**-48  # residuals below this share of the values are rounding errors
 
 
 class _Fit(NamedTuple):
@@ -111,10 +111,11 @@ class _Fit(NamedTuple):
 
 
 def huber_line(x: Column, y: Column) -> tuple[float, float, float]:
-    """Intercept, slope and sigma of the joint estimate; x and y within 0..1, sigma 0 for an exact fit.
+    """Intercept, slope and sigma of the joint estimate, for x and y within 0..1. An exact fit has sigma 0.
 
-    Newton's method on the pieces of the objective, which is convex: which residuals are outliers, and on
-    which side, names the piece; its minimum has a closed form; a step towards it that does not pay is halved.
+    The objective is convex and made of pieces. A piece is given by which residuals are outliers, and on which
+    side of the line. Its minimum has a closed form. Newton's method steps towards that minimum, and halves a
+    step that does not lower the objective.
     """
     fit = _step(x, y, _Fit(0.0, 0.0, 0.0), np.zeros(len(x)), 0.0)
     last = None
@@ -135,10 +136,10 @@ def huber_line(x: Column, y: Column) -> tuple[float, float, float]:
 
 
 def _step(x: Column, y: Column, fit: _Fit, sides: Column, sigma_min: float) -> _Fit:
-    """The minimum of one piece: inliers by squares, outliers on `sides` (-1, 1; 0 for inliers) by their pull.
+    """The minimum of one piece: inliers count by squares, outliers by a constant pull.
 
-    For a given sigma the line is that of least squares on the inliers plus sigma times a tilt by the pull,
-    which leaves `room` sigma + rss / sigma to minimise.
+    `sides` is -1 or 1 for outliers and 0 for inliers. For a given sigma, the line is that of least squares on
+    the inliers plus sigma times a tilt from the pull. That leaves `room` sigma + rss / sigma to minimise.
     """
     inliers = (sides == 0).astype(np.float64)
     count = float(inliers.sum())
@@ -158,7 +159,7 @@ def _step(x: Column, y: Column, fit: _Fit, sides: Column, sigma_min: float) -> _
     rss = float(residuals @ residuals) + damping * (slope - fit.slope) ** 2
     room = len(x) - (len(x) - count) * EPSILON**2 - EPSILON * (pull * lift + torque * tilt)
     if room <= 0:
-        sigma = 2 * fit.sigma  # the piece falls for ever: outwards, to the next one
+        sigma = 2 * fit.sigma  # the piece has no minimum: move on to the next one
     elif rss <= EXACT**2 * float(inliers @ (y * y)):
         sigma = 0.0
     else:
@@ -169,7 +170,7 @@ def _step(x: Column, y: Column, fit: _Fit, sides: Column, sigma_min: float) -> _
 
 
 def _shorten(x: Column, y: Column, fit: _Fit, aim: _Fit) -> _Fit:
-    """The first of `aim`, half the way there, a quarter .. that costs no more than `fit`; else `fit`."""
+    """The first of `aim`, half the step, a quarter .. that costs no more than `fit`; else `fit`."""
     most = _cost(x, y, fit) * (1 + EXACT)
     for _ in range(HALVINGS_MAX):
         if _cost(x, y, aim) <= most:
@@ -179,7 +180,7 @@ def _shorten(x: Column, y: Column, fit: _Fit, aim: _Fit) -> _Fit:
 
 
 def _cost(x: Column, y: Column, fit: _Fit) -> float:
-    """The objective; at sigma = 0 its limit, the sum of absolute residuals."""
+    """The objective. At sigma = 0 it is the limit, the sum of absolute residuals."""
     far = np.abs(y - fit.intercept - fit.slope * x)
     if fit.sigma == 0:
         return 2 * EPSILON * float(far.sum())
@@ -188,14 +189,14 @@ def _cost(x: Column, y: Column, fit: _Fit) -> float:
 
 
 def median(values: Column) -> float:
-    """Exact; of many values only those near the middle of a sample are looked at closely."""
+    """The exact median. Among many values, only those near the middle of a sample are sorted."""
     half, even = len(values) // 2, len(values) % 2 == 0
     if len(values) > 5 * SAMPLE:
         sample = np.sort(values[:: len(values) // SAMPLE])
         low, high = sample[len(sample) * 44 // 100], sample[len(sample) * 56 // 100]
         below = int(np.count_nonzero(values < low))
         between = values[(values >= low) & (values <= high)]
-        if below < half < below + len(between):  # else the sample was far off
+        if below < half < below + len(between):  # otherwise the sample misled
             values, half = between, half - below
     parted = np.partition(values, half)
     upper = float(parted[half])

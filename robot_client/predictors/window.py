@@ -1,6 +1,6 @@
-"""The FIFO window of one site: its last N executions, and the centred sums that a line needs.
+"""The FIFO window of one site: its last N executions, and the centred sums that a fitted line needs.
 
-Fitting and predicting are in `predictors`.
+Fitting and predicting are left to the predictors.
 """
 
 from collections import deque
@@ -9,16 +9,18 @@ from dataclasses import dataclass
 
 from offboard.common.errors import ConfigError
 
-WINDOW = 50  # N, unless told
+WINDOW = 50  # the default of N
 WINDOW_MAX = 1_000_000
-CANCELLATION_MAX = 1e-3  # sums are made anew when less than this share of their largest value is left
+CANCELLATION_MAX = 1e-3  # sums are recomputed if less than this share of their largest value is left
 
 
 @dataclass(slots=True)
 class Moments:
-    """Means and centred sums over a window: sdd = sum((d - mean d)^2), sdt, stt alike.
+    """Means and centred sums over a window, for size d and seconds t.
 
-    The mean size is `origin + mean_offset`; adding the two would lose the digits that tell near sizes apart.
+    sdd = sum((d - mean d)^2), sdt = sum((d - mean d)(t - mean t)), stt = sum((t - mean t)^2).
+    The mean size is `origin + mean_offset`. The two stay apart, as their sum would round away small
+    differences between sizes.
     """
 
     count: int
@@ -35,11 +37,11 @@ class Moments:
 
 
 class Window:
-    """The last `length` observations (size, seconds), oldest first; queue B of Algorithm 1.
+    """The last `length` observations (size, seconds), oldest first: queue B of Algorithm 1.
 
-    Appending and reading the moments take constant time on average: sums slide along, held around a
-    reference point near the mean, and are made anew from the window every `length` appends and whenever
-    subtraction has eaten too many of their digits.
+    Appending, and reading the moments, takes constant time on average. The sums are updated with each
+    observation, relative to a point near the mean. They are recomputed from the window after every `length`
+    appends, and whenever cancellation has cost too many of their digits.
     """
 
     def __init__(self, length: int) -> None:
@@ -61,7 +63,7 @@ class Window:
         return len(self._observations) == self.length
 
     def append(self, size: float, seconds: float) -> None:
-        """Add the newest observation; a full window drops its oldest."""
+        """Add the newest observation. A full window drops the oldest one."""
         x, y = size - self._origin_d, seconds - self._origin_t
         sx, sy = self._sx + x, self._sy + y
         sxx, sxy, syy = self._sxx + x * x, self._sxy + x * y, self._syy + y * y
@@ -78,7 +80,7 @@ class Window:
             self._recentre()
 
     def moments(self) -> Moments:
-        """Of a window that holds at least one observation."""
+        """The moments; the window must hold at least one observation."""
         found = self._sums_to_moments()
         if found.sdd < CANCELLATION_MAX * self._peak_xx or found.stt < CANCELLATION_MAX * self._peak_yy:
             self._recentre()
@@ -99,7 +101,7 @@ class Window:
         )
 
     def _recentre(self) -> None:
-        """Sum the window anew, around its mean; exactly zero where all values are equal."""
+        """Recompute the sums around the mean. They are exactly zero if all values are equal."""
         self._origin_d = _centre([size for size, _ in self._observations])
         self._origin_t = _centre([seconds for _, seconds in self._observations])
         xs = [size - self._origin_d for size, _ in self._observations]
@@ -113,14 +115,14 @@ class Window:
 
 
 def checked_length(length: int) -> int:
-    """The length of a window; ConfigError where there is none of it."""
+    """The length itself; ConfigError if no window may have it."""
     if not 2 <= length <= WINDOW_MAX:
         raise ConfigError(f"window {length}: must be from 2 to {WINDOW_MAX}")
     return length
 
 
 def _centre(values: list[float]) -> float:
-    """The mean; the value itself where all are equal, which a rounded mean may miss."""
+    """The mean. If all values are equal it is that value, which a rounded mean may miss."""
     if not values or min(values) == max(values):
         return values[0] if values else 0.0
     return sum(values) / len(values)

@@ -1,1 +1,1 @@
-"""What is written about each task: trace and metrics."""
+"""What is recorded about each task: the trace and the metrics."""

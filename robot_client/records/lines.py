@@ -1,4 +1,7 @@
-"""JSON Lines files that a run appends to and that survive its crash; what a line holds is its owner's."""
+"""JSON Lines files that a run appends to, and that survive its crash.
+
+The fields of a line are left to its owner, such as `trace`.
+"""
 
 import contextlib
 import errno
@@ -21,9 +24,11 @@ log = logging.getLogger(__name__)
 
 
 class Lines:
-    """Appends lines to a file, unbuffered and from any thread; `what` is the file's name in messages.
+    """Appends lines to a file without a buffer, from any thread.
 
-    A line that cannot be written is logged and counted in `lost`, and tasks go on.
+    A line that cannot be written is logged and counted in `lost`; tasks go on.
+
+    what: the kind of file, for messages.
     """
 
     def __init__(self, what: str, path: Path) -> None:
@@ -40,7 +45,7 @@ class Lines:
             raise ConfigError(f"{what} {path}: {error.strerror}") from error
 
     def append(self, number: int, fields: Mapping[str, Any]) -> None:
-        """Append the line of task `number`; its first field is `v`. Once closed the file takes no more."""
+        """Append the line of task `number`, whose first field is `v`. After `close` nothing is written."""
         line = _ENCODE(fields).encode() + b"\n"
         with self._lock:
             if self._file.closed:
@@ -48,7 +53,7 @@ class Lines:
                 return
             end = os.fstat(self._file.fileno()).st_size
             try:
-                if self._file.write(line) < len(line):  # a disk that fills up takes the part that fits
+                if self._file.write(line) < len(line):  # a full disk may take a part of the line
                     raise OSError(errno.ENOSPC, "no space left for the whole line")
             except OSError as error:
                 self.lost += 1
@@ -62,11 +67,11 @@ class Lines:
             self._file.close()
 
     def _cut_torn_line(self) -> None:
-        """A crash may have left half a line, which would spoil the next one. No other file is touched."""
+        """Remove half a line that a crash has left. A file of another kind is never changed."""
         with self.path.open("rb") as file:
             start = file.read(len(LINE_START))
         if not LINE_START.startswith(start):
-            raise ConfigError(f"{self._what} {self.path}: the file is there and is no {self._what}")
+            raise ConfigError(f"{self._what} {self.path}: the file exists and is no {self._what}")
         kept = _end_of_last_line(self.path)
         if kept < self.path.stat().st_size:
             log.warning("%s %s: cut off a torn last line", self._what, self.path)
@@ -74,9 +79,9 @@ class Lines:
 
 
 def read(path: Path, names: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Each line's fields, `names` among them.
+    """The fields of each line, which must include `names`.
 
-    A torn last line is skipped with a warning; any other bad line is a DataError.
+    A torn last line is skipped with a warning. Any other bad line raises DataError.
     """
     try:
         file = path.open("rb")
@@ -106,7 +111,7 @@ def _parse(where: str, line: bytes, names: Sequence[str]) -> dict[str, Any]:
 
 
 def _end_of_last_line(path: Path) -> int:
-    """Bytes up to and including the last newline; looks at the tail only."""
+    """The number of bytes up to the last newline, including it. Reads only the end of the file."""
     with path.open("rb") as file:
         end = file.seek(0, os.SEEK_END)
         while end > 0:

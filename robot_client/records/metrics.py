@@ -1,4 +1,7 @@
-"""Prometheus metrics of the robot, fed by the record of every task."""
+"""The Prometheus metrics of the robot, updated with the record of every task.
+
+The records are made in `offloader`.
+"""
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, start_http_server
 
@@ -8,19 +11,19 @@ from offboard.robot_client.sites.runner import Execution
 SECONDS_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
 
 REGRET = {
-    "": "Mean time a task that the better site would have saved",
+    "": "Mean seconds per task that the better site would have saved",
     "_low": "Lower end of the 95 % interval of robot_regret_seconds",
     "_high": "Upper end of the 95 % interval of robot_regret_seconds",
 }
 
 
 class Metrics:
-    """An observer for the offloader; counts into `registry`."""
+    """An observer of the offloader that counts into `registry`."""
 
     def __init__(self, registry: CollectorRegistry) -> None:
         self._registry = registry
         self._tasks = Counter(
-            "robot_tasks", "Tasks answered, by the site used", ["kind", "site"], registry=registry
+            "robot_tasks", "Tasks, by the site whose answer was used", ["kind", "site"], registry=registry
         )
         self._executions = Counter(
             "robot_executions",
@@ -30,23 +33,23 @@ class Metrics:
         )
         self._waited = Histogram(
             "robot_waited_seconds",
-            "What the caller waited",
+            "Seconds that the caller waited",
             ["kind"],
             buckets=SECONDS_BUCKETS,
             registry=registry,
         )
         self._predicted = Gauge(
-            "robot_predicted_seconds", "Last prediction", ["kind", "site"], registry=registry
+            "robot_predicted_seconds", "Last prediction, in seconds", ["kind", "site"], registry=registry
         )
         self._interval = Counter(
             "robot_interval",
-            "Answers by whether their time was inside the 90 % interval of the prediction",
+            "Answers, by whether their time was inside the 90 % interval of the prediction",
             ["kind", "site", "inside"],
             registry=registry,
         )
         self._decisions = Counter(
             "robot_decisions",
-            "Tasks by the site that was decided for",
+            "Tasks, by the site that was chosen",
             ["kind", "site", "policy"],
             registry=registry,
         )
@@ -80,7 +83,7 @@ class Metrics:
                 self._regret[name].set(value)
 
     def _judge(self, record: Record, execution: Execution) -> None:
-        """Whether the interval held what it said; a run without an answer has no time to tell by."""
+        """Count whether the time was inside its interval. A run without an answer has no time to compare."""
         outlook = record.sites.get(execution.site)
         if not execution.ok or outlook is None or outlook.low_s is None or outlook.high_s is None:
             return
@@ -88,5 +91,5 @@ class Metrics:
         self._interval.labels(record.kind, execution.site, inside).inc()
 
     def serve(self, host: str, port: int) -> None:
-        """Answer GET /metrics from a thread of its own."""
+        """Answer GET /metrics in a background thread."""
         start_http_server(port, host, registry=self._registry)

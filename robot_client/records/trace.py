@@ -1,4 +1,7 @@
-"""The trace: one JSON line a task, what was predicted, decided and seen."""
+"""The record of a task, and the trace: one JSON line per task with what was predicted, decided and measured.
+
+Writing lines so that they survive a crash is left to `lines`.
+"""
 
 import atexit
 import threading
@@ -17,7 +20,7 @@ from offboard.robot_client.sites.own_cpu import OWN_CPU
 from offboard.robot_client.sites.runner import UNMEASURED, Condition, Execution
 
 WRITE_EVERY_S = 0.2
-WAITING_MAX = 1000  # records not yet written; whoever brings one more writes them
+WAITING_MAX = 1000  # records in memory; the thread that adds one more writes them all
 
 _FIELDS = (
     "v",
@@ -51,7 +54,7 @@ _EXECUTION_FIELDS = (
 
 @dataclass(frozen=True, slots=True)
 class Late:
-    """An execution that ended after another site had answered its task; `id` is that of the task's record."""
+    """An execution that ended after another site had answered; `id` is that of the record of its task."""
 
     id: str
     site: str
@@ -62,10 +65,12 @@ class Late:
 
 @dataclass(slots=True)
 class Record:
-    """Everything about one task, written once it is answered; `used` is the site whose answer was used.
+    """Everything about one task, made when it is answered.
 
-    `amount`: what the sites' predictors were asked with, the work that the size was expected to be, or the
-    size; `late`: what has ended since the last record of tasks answered before; `regret`: as estimated now.
+    used: the site whose answer was used; None if no site answered.
+    amount: what the predictors of the sites were asked with: the size, or the work that was expected for it.
+    late: executions of earlier tasks that have ended since the record before.
+    regret: the present estimate, if there is one.
     """
 
     i: int
@@ -90,11 +95,10 @@ _DECISION_FIELDS, _LATE_FIELDS, _REGRET_FIELDS = (
 
 
 class Trace(Lines):
-    """Appends records to a file, in order; a line that cannot be written is logged and tasks go on.
+    """Appends records to a file, in order. A line that cannot be written is logged; tasks go on.
 
-    A thread makes the lines, some at a time, every WRITE_EVERY_S, more seldom on a loaded robot: where a
-    robot has a tenth of a CPU, a line between two tasks takes the time that the next one needs. A crash
-    loses what was not written yet.
+    A thread writes the waiting records every WRITE_EVERY_S, and less often on a loaded robot. With a tenth of
+    a CPU, writing between two tasks would delay the next one. A crash loses the waiting records.
     """
 
     def __init__(self, path: Path) -> None:
@@ -104,16 +108,16 @@ class Trace(Lines):
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="trace", daemon=True)
         self._thread.start()
-        atexit.register(self.close)  # whoever does not close it loses nothing by that
+        atexit.register(self.close)  # a program that does not close the trace loses no record
 
     def write(self, record: Record) -> None:
-        """Any thread."""
+        """Add a record. Any thread may call this."""
         self._waiting.append(record)
         if len(self._waiting) >= WAITING_MAX or self._closing.is_set():
             self.flush()
 
     def close(self) -> None:
-        """Everything is written. Safe to call twice."""
+        """Write all waiting records, and close the file. Safe to call twice."""
         atexit.unregister(self.close)
         self._closing.set()
         self._thread.join()
@@ -121,7 +125,7 @@ class Trace(Lines):
         super().close()
 
     def flush(self) -> None:
-        """Write what was given so far; any thread."""
+        """Write all waiting records. Any thread may call this."""
         with self._writing:
             while self._waiting:
                 record = self._waiting.popleft()
@@ -133,17 +137,17 @@ class Trace(Lines):
 
 
 def alone_path(path: Path) -> Path:
-    """The trace of the plans that `robot-client --alone` measures, beside the trace of the run."""
+    """The trace of the plans that `robot-client --alone` measures, next to the trace of the run."""
     return path.with_name(f"{path.stem}.alone.jsonl")
 
 
 def reference_path(path: Path) -> Path:
-    """The lines of `robot-client --reference`, beside the trace of the run."""
+    """The lines of `robot-client --reference`, next to the trace of the run."""
     return path.with_name(f"{path.stem}.reference.jsonl")
 
 
 def as_dict(record: Record) -> dict[str, Any]:
-    """The record as its JSON line holds it (DESIGN, Trace)."""
+    """The fields of the JSON line (docs/formats.md)."""
     return {
         "v": VERSION,
         "i": record.i,
@@ -163,7 +167,7 @@ def as_dict(record: Record) -> dict[str, Any]:
 
 
 def features(record: Record) -> dict[str, float]:
-    """What was measured, by name: that of a site as SITE.NAME."""
+    """What was measured, by name; a value of a site is named SITE.NAME."""
     found: dict[str, float] = {}
     if record.amount is not None and record.amount != record.size:
         found["work"] = record.amount
@@ -176,7 +180,7 @@ def features(record: Record) -> dict[str, float]:
 
 
 def read(path: Path) -> Iterator[dict[str, Any]]:
-    """Each line's fields. A torn last line is skipped with a warning; any other bad line is a DataError."""
+    """The fields of each line. A torn last line is skipped with a warning; any other raises DataError."""
     return lines.read(path, _FIELDS)
 
 

@@ -97,7 +97,10 @@ class Connection:
             self._move(State.LOST)
 
     def hello_answered(self) -> bool:
-        """Whether this brought the site up; an answer that an earlier connection left behind does not."""
+        """The server has answered `hello`. Returns whether that brought the site up.
+
+        An answer that an earlier connection left behind does not.
+        """
         if self.state not in (State.GREETING, State.INCOMPATIBLE):
             return False
         log.info("%s: %s is up", self._site, self._endpoint)

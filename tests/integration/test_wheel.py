@@ -2,8 +2,10 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +19,7 @@ ROOT = Path(__file__).parents[2]
 TASKS = '''
 """A user's own tasks."""
 import os
-from offboard.common.tasks import task
+from offboard import task
 
 @task("count_primes", size=lambda limit: limit)
 def count_primes(limit: int) -> int:
@@ -59,11 +61,15 @@ def run(*command: str | Path, cwd: Path, **env: str) -> str:
     return done.stdout + done.stderr
 
 
+def build(kind: str, source: Path, out: Path) -> Path:
+    """The one file that a build of this kind (`wheel` or `sdist`) puts into `out`."""
+    run(sys.executable, "-m", "build", f"--{kind}", "--no-isolation", "--outdir", out, source, cwd=out)
+    return next(out.iterdir())
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("dist")
-    run(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", out, ROOT, cwd=out)
-    return next(out.glob("*.whl"))
+    return build("wheel", ROOT, tmp_path_factory.mktemp("dist"))
 
 
 @pytest.fixture(scope="module")
@@ -96,16 +102,29 @@ def server(installed: Path, tmp_path: Path) -> Iterator[str]:
     process.stderr.close()
 
 
-def test_the_wheel_holds_the_four_packages_and_no_maps(wheel: Path) -> None:
-    """Code, types and scenarios; neither maps nor tests."""
+def test_offboard_is_the_only_top_level_package(wheel: Path) -> None:
+    """The wheel holds `offboard/` alone: code, types and scenarios, neither maps nor tests."""
     names = zipfile.ZipFile(wheel).namelist()
-    tops = {name.partition("/")[0] for name in names if ".dist-info" not in name}
-    assert tops == {"common", "robot_client", "cloud_server", "loadgen"}
+    assert {name.partition("/")[0] for name in names if ".dist-info" not in name} == {"offboard"}
     assert not [name for name in names if name.endswith((".pgm", ".map", ".png"))]
-    assert all(f"{top}/py.typed" in names for top in tops)
+    packages = ("common", "robot_client", "cloud_server", "loadgen")
+    assert all(f"offboard/{package}/__init__.py" in names for package in packages)
+    assert "offboard/py.typed" in names
+    assert "offboard/loadgen/scenarios/outage.toml" in names
 
 
-@pytest.mark.parametrize("command", ["robot-client", "cloud-server", "loadgen"])
+def test_a_wheel_from_the_sdist_is_identical(wheel: Path, tmp_path: Path) -> None:
+    """Who builds from the source distribution gets the same files, byte by byte."""
+    folders = {name: tmp_path / name for name in ("sdist", "source", "wheel")}
+    for folder in folders.values():
+        folder.mkdir()
+    with tarfile.open(build("sdist", ROOT, folders["sdist"])) as archive:
+        archive.extractall(folders["source"], filter="data")
+    rebuilt = build("wheel", next(folders["source"].iterdir()), folders["wheel"])
+    assert rebuilt.read_bytes() == wheel.read_bytes()
+
+
+@pytest.mark.parametrize("command", ["offboard", "robot-client", "cloud-server", "loadgen"])
 def test_the_console_scripts_start(installed: Path, tmp_path: Path, command: str) -> None:
     """--help of every console script answers outside the repository."""
     assert "usage:" in run(installed / command, "--help", cwd=tmp_path)
@@ -119,6 +138,21 @@ def test_a_ten_line_program_offloads_its_own_task(installed: Path, server: str, 
     assert re.search(r" ms .*against .* ms", first)
     assert second == "True False"
     assert third == "25"
+
+
+def test_another_package_named_common_does_no_harm(installed: Path, server: str, tmp_path: Path) -> None:
+    """A distribution `common` and a folder `common` of the user leave the program alone."""
+    command = "import sysconfig; print(sysconfig.get_path('purelib'))"
+    site_packages = Path(run(installed / "python", "-c", command, cwd=tmp_path).strip())
+    others = [site_packages / "common", tmp_path / "common", tmp_path / "robot_client"]
+    (tmp_path / "program.py").write_text(PROGRAM)
+    try:
+        for folder in others:
+            folder.mkdir()
+            (folder / "__init__.py").write_text("raise ImportError('not the package that you want')\n")
+        assert run(installed / "python", "program.py", server, cwd=tmp_path).startswith("168 ")
+    finally:
+        shutil.rmtree(others[0])
 
 
 def test_a_task_whose_source_differs_stays_onboard(installed: Path, server: str, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Predictors that follow a site that changes, and do not jump at an outlier."""
+"""Predictors that follow a changing site, and do not jump at an outlier."""
 
 from random import Random
 
@@ -46,7 +46,7 @@ def at(predictor: Predictor, size: float = 3.0) -> float:
 
 @pytest.mark.parametrize("name", ROBUST)
 def test_one_outlier_pulls_by_three_deviations_at_most(name: str) -> None:
-    """A time a thousand times as long moves the next prediction by no more than the clip, 30 ms here."""
+    """A time that is a thousand times as long moves the next prediction by at most the clip, 30 ms here."""
     predictor = taught(name, stream(100))
     before = at(predictor)
     predictor.learn(3.0, 500.0)
@@ -54,11 +54,11 @@ def test_one_outlier_pulls_by_three_deviations_at_most(name: str) -> None:
     plain = RecursiveLeastSquares(50)
     for row in [*stream(100), (3.0, 500.0)]:
         plain.learn(*row)
-    assert at(plain) > 5.0, "what is not clipped is carried away"
+    assert at(plain) > 5.0, "without clipping the outlier decides"
 
 
-def test_what_is_clipped_is_learnt_as_if_it_lay_there() -> None:
-    """Huber's psi: an error beyond the clip leaves the same line behind as one at the clip."""
+def test_an_error_beyond_the_clip_counts_as_the_clip() -> None:
+    """Huber's psi: errors beyond the clip and at the clip give the same line."""
     far, near = ClippedLeastSquares(50), ClippedLeastSquares(50)
     for row in stream(100):
         far.learn(*row)
@@ -71,7 +71,7 @@ def test_what_is_clipped_is_learnt_as_if_it_lay_there() -> None:
 
 
 def test_before_eight_errors_nothing_is_an_outlier() -> None:
-    """The first times may be of any size; nothing is known of the usual error."""
+    """At first the usual error is unknown, so any time is believed."""
     scale = Scale()
     for n in range(CLIP_FROM):
         assert scale.clip == float("inf"), n
@@ -79,8 +79,8 @@ def test_before_eight_errors_nothing_is_an_outlier() -> None:
     assert scale.clip == pytest.approx(CLIP * NORMAL)
 
 
-def test_the_scale_grows_by_so_much_an_error() -> None:
-    """One huge error counts as GROWTH clips; many of them in a row are the new scale."""
+def test_one_error_makes_the_scale_grow_by_a_bounded_amount() -> None:
+    """One huge error counts as GROWTH times the clip. Many in a row become the new scale."""
     scale = Scale()
     for _ in range(100):
         scale.add(1.0)
@@ -91,8 +91,8 @@ def test_the_scale_grows_by_so_much_an_error() -> None:
     assert scale.deviation == pytest.approx(50.0 * NORMAL, rel=0.1)
 
 
-def test_one_outlier_in_twenty_five_stays_one() -> None:
-    """However many of them come: the scale settles, and never takes the next one for usual."""
+def test_regular_outliers_stay_outliers() -> None:
+    """With one outlier in 25 tasks the scale settles, and the next outlier is still clipped."""
     scale, random = Scale(), Random(1)
     for _ in range(100):
         scale.add(random.gauss(0, 1))
@@ -106,14 +106,14 @@ def test_one_outlier_in_twenty_five_stays_one() -> None:
     [("kalman", 30), ("blind-average", 30), ("average", 30), ("clipped-least-squares", 120)],
 )
 def test_a_lasting_change_is_followed(name: str, tasks: int) -> None:
-    """When every task takes three times as long the prediction is within a fifth of that after so many."""
+    """If every task takes three times as long, the prediction is soon within a fifth of that."""
     rows = stream(200)
     predictor = taught(name, [*rows, *((size, 3 * seconds) for size, seconds in stream(tasks, seed=2))])
     assert at(predictor) == pytest.approx(1.5, rel=0.2)
 
 
 def test_kalman_follows_a_step_within_five_tasks() -> None:
-    """After two innovations of one sign beyond two deviations the level is open for the next ones."""
+    """After two innovations of the same sign beyond two deviations, the level follows the next ones."""
     predictor = taught("kalman", stream(200))
     for size, seconds in stream(5, seed=2):
         predictor.learn(size, seconds + 0.2)
@@ -125,7 +125,7 @@ def test_kalman_follows_a_step_within_five_tasks() -> None:
 
 
 def test_kalman_does_not_follow_noise() -> None:
-    """Without a change its predictions stay within half the noise of the truth."""
+    """Without a change, predictions stay within half the noise of the true line."""
     predictor, off = taught("kalman", stream(100)), []
     for size, seconds in stream(300, seed=3):
         off.append(abs(at(predictor, size) - 0.2 - 0.1 * size))
@@ -133,8 +133,8 @@ def test_kalman_does_not_follow_noise() -> None:
     assert sum(off) / len(off) < 0.006
 
 
-def test_an_outlier_behind_a_small_one_is_no_change() -> None:
-    """An innovation of three deviations and then one a hundred times as large: the level stays near."""
+def test_a_large_outlier_after_a_small_one_is_no_change() -> None:
+    """After an innovation of three deviations, one a hundred times as large hardly moves the level."""
     predictor = taught("kalman", stream(200))
     predictor.learn(3.0, 0.53)
     predictor.learn(3.0, 3.5)
@@ -142,9 +142,9 @@ def test_an_outlier_behind_a_small_one_is_no_change() -> None:
 
 
 @pytest.mark.parametrize("name", ["blind-average", "average"])
-def test_a_pace_seen_on_small_tasks_is_that_of_large_ones(name: str) -> None:
-    """A quarter of the CPU, and only tasks of size 1 to 2 go there meanwhile: one of 5 takes four times as
-    long too, and is quick again when they are."""
+def test_the_pace_of_small_tasks_holds_for_large_ones(name: str) -> None:
+    """A site has a quarter of its CPU while it only runs tasks of size 1 to 2. The prediction for size 5 is
+    four times as long too, and recovers with theirs."""
     rng = Random(4)
     predictor = taught(name, stream(200))
     for slower, expected in ((4, 2.8), (1, 0.7)):
@@ -156,15 +156,15 @@ def test_a_pace_seen_on_small_tasks_is_that_of_large_ones(name: str) -> None:
 
 @pytest.mark.parametrize("name", FOLLOWING)
 @pytest.mark.parametrize("window", [2, WINDOW_MAX])
-def test_every_window_that_is_allowed_will_do(name: str, window: int) -> None:
-    """The shortest and the longest; what is longer is refused by its own number."""
+def test_every_allowed_window_works(name: str, window: int) -> None:
+    """The shortest and the longest window work. A longer one is refused, and the error names it."""
     assert at(taught(name, stream(20), window)) == pytest.approx(0.5, abs=0.1)
     with pytest.raises(ConfigError, match=rf"^window {WINDOW_MAX + 1}: "):
         taught(name, stream(20), WINDOW_MAX + 1)
 
 
 def test_a_pace_is_bounded() -> None:
-    """Times of 0 for long, and then any: neither is divided by nothing."""
+    """Neither many times of 0 nor a larger one after them divide by 0."""
     one = Paced(10)
     for seconds in [*[1.0] * 20, *[0.0] * 2000, *[1e15] * 2000]:
         one.learn(2.0, seconds)
@@ -176,7 +176,7 @@ def test_a_pace_is_bounded() -> None:
 @pytest.mark.parametrize("factor", [1e3, 1e-3])
 @pytest.mark.parametrize("of", ["seconds", "sizes"])
 def test_no_unit_matters(name: str, factor: float, of: str) -> None:
-    """The same stream in other units gives the same predictions, to 1e-9, outliers included."""
+    """The same stream in other units gives the same predictions within 1e-9, including outliers."""
     rows = [(size, 9 * seconds if n % 17 == 0 else seconds) for n, (size, seconds) in enumerate(stream(200))]
     rows += [(size, 2 * seconds) for size, seconds in stream(30, seed=2)]
     along, high = (factor, 1.0) if of == "sizes" else (1.0, factor)
@@ -190,14 +190,14 @@ def test_no_unit_matters(name: str, factor: float, of: str) -> None:
         assert other.spread_s == pytest.approx(high * one.spread_s, rel=1e-9)
 
 
-def test_the_standard_error_falls_with_what_is_known() -> None:
-    """It is least where most sizes were, and less than a quarter after 16 times as many."""
+def test_the_standard_error_falls_with_observations() -> None:
+    """It is smallest where most sizes were, and below a quarter after 16 times as many observations."""
     assert mean_error(20, 3.0) < mean_error(20, 12.0)
     assert mean_error(320, 3.0) < mean_error(20, 3.0) / 4
 
 
 def mean_error(count: int, size: float) -> float:
-    """The standard error after so many observations, the mean of 40 repetitions."""
+    """The mean standard error of 40 repetitions."""
     total = 0.0
     for seed in range(40):
         found = taught("bayesian-least-squares", stream(count, seed), window=1000).predict(size)
@@ -208,7 +208,7 @@ def mean_error(count: int, size: float) -> float:
 
 
 def test_the_posterior_holds_the_truth_as_often_as_it_says() -> None:
-    """In 400 repetitions the mean time is within 2 standard errors in 95 %, to 4 points."""
+    """In 400 repetitions, the true mean is within 2 standard errors in 95 %, give or take 4 points."""
     held = 0
     for seed in range(400):
         found = taught("bayesian-least-squares", stream(40, seed=seed, noise=0.05)).predict(3.0)

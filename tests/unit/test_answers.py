@@ -90,7 +90,7 @@ def test_a_restarted_run_continues_after_the_answers(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "error", "message"),
     [
-        ("my thesis\n", ConfigError, "answers .* the file is there and is no answers"),
+        ("my thesis\n", ConfigError, "answers .* the file exists and is no answers"),
         ('{"v":1,"i":0,"id":"s-0","kind":"echo"}\n', DataError, ":1: no field 'due_s'"),
         ('{"v":2}\n', DataError, ":1: v = 2"),
         ('{"v":1,"i":-1,"id":"","due_s":0,"began_s":0,"ended_s":0,"error":"","answer":0}\n',

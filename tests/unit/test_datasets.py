@@ -1,4 +1,4 @@
-"""The committed datasets, and what docs/evaluation.md prints of them."""
+"""The committed datasets, and the tables of them on the results page."""
 
 import json
 from pathlib import Path
@@ -7,9 +7,10 @@ import pytest
 
 from offboard.loadgen.table.rows import read
 from offboard.loadgen.table.table_two import PAPER_WINDOWS, Evaluation, TableConfig, table_text
-from tests.unit.test_evaluate import expected_table, lines_of, replay, rows_of, section
+from tests.unit.test_evaluate import expected_table, lines_of, replay, rows_of
 
 FOLDER = Path(__file__).parents[2] / "loadgen" / "datasets"
+RESULTS = (FOLDER.parents[1] / "docs" / "results.md").read_text(encoding="utf-8")
 NAMES = ("congested", "paper")
 
 
@@ -60,7 +61,8 @@ def test_the_page_prints_what_the_command_prints(name: str, feedback: str) -> No
     """Each figure of the page's tables is the one under the same heading of the command's."""
     printed = table_text(FOLDER / f"{name}.csv", TableConfig(feedback=feedback)).splitlines()
     headings, lines = cells(printed[-15]), [cells(line) for line in printed[-13:]]
-    page = section(f"{name}.csv, feedback {feedback}").strip().splitlines()
+    section = RESULTS.split(f"### {name}.csv, feedback {feedback}\n")[1].split("\n#")[0]
+    page = [line for line in section.splitlines() if line.startswith("|")]
     places = [headings.index(heading) for heading in cells(page[0])]
     assert len(places) == 16
     assert [cells(line) for line in page[2:]] == [[line[place] for place in places] for line in lines]

@@ -1,4 +1,4 @@
-"""What predictors make of what was measured beside times."""
+"""Predictors that use the measured condition of a site."""
 
 from random import Random
 
@@ -17,7 +17,7 @@ def measured(window: int = 50) -> Measured:
 
 
 def taught(one: Measured, condition: Condition, factor: float, tasks: int = 200, seed: int = 1) -> Measured:
-    """Learnt 0.1 s a size times `factor` under `condition`, with 5 % noise, and as many without."""
+    """A predictor that learnt 0.1 s per size, `factor` times as much under `condition`, with 5 % noise."""
     rng = Random(seed)
     for n in range(tasks):
         now = condition if n % 2 else QUIET
@@ -35,7 +35,7 @@ def seconds(one: Measured, condition: Condition, size: float = 2.0) -> float:
 @pytest.mark.parametrize("condition", [Condition(queue=1), Condition(load=0.9)], ids=["queue", "load"])
 @pytest.mark.parametrize(("factor", "more"), [(3.0, True), (1.0, False)])
 def test_a_gain_moves_towards_what_the_feature_does(condition: Condition, factor: float, more: bool) -> None:
-    """Where a feature costs more than at first believed the prediction grows, else it falls."""
+    """If a feature costs more than assumed, the prediction grows; otherwise it falls."""
     believed = seconds(measured_of(0.2), condition)
     learnt = seconds(taught(measured(), condition, factor), condition)
     assert (learnt > believed) == more
@@ -51,21 +51,21 @@ def measured_of(at_2: float) -> Measured:
 
 @pytest.mark.parametrize("factor", [0.001, 1_000.0])
 def test_gains_stay_within_bounds(factor: float) -> None:
-    """Whatever a feature goes with, its gain is from 0 to GAIN_MAX."""
+    """A gain is always from 0 to GAIN_MAX."""
     for condition in (Condition(queue=40), Condition(load=1.0)):
         one = taught(measured(), condition, factor)
         for gain in (one._gains.queue, one._gains.load):
             assert 0 <= gain <= GAIN_MAX
 
 
-def test_a_feature_that_says_little_teaches_little() -> None:
-    """Below GAIN_FROM the gain stays where it is."""
+def test_a_small_feature_changes_no_gain() -> None:
+    """Features below GAIN_FROM leave their gain alone."""
     one = taught(measured(), Condition(load=0.2), 5.0)
     assert one._gains.load == 1.0
 
 
 def test_a_link_that_changes_needs_no_relearning() -> None:
-    """The round trip is taken out: when it grows from 20 to 300 ms the very next prediction is right."""
+    """When the round trip grows from 20 to 300 ms, the next prediction is right at once."""
     one = measured()
     for size in (1.0, 2.0, 3.0, 4.0):
         one.learn(size, 0.02 + 0.1 * size, Condition(round_trip_s=0.02))
@@ -74,14 +74,14 @@ def test_a_link_that_changes_needs_no_relearning() -> None:
 
 
 def test_a_task_shorter_than_its_round_trip_is_no_negative_time() -> None:
-    """What is left for the server is then 0."""
+    """The time at the server is then 0."""
     one = measured()
     one.learn(1.0, 0.01, Condition(round_trip_s=0.5))
     assert seconds(one, QUIET) == 0.0
 
 
-def test_spread_and_standard_error_grow_with_the_crowd() -> None:
-    """Behind one waiting task both are twice as large as alone; bandits explore by the latter."""
+def test_spread_and_standard_error_grow_with_the_queue() -> None:
+    """With one task in the queue, both are twice as large as without."""
     one = predictors.make("features:bayesian-least-squares", 50)
     assert isinstance(one, Measured)
     rng = Random(1)

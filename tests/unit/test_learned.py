@@ -1,4 +1,4 @@
-"""What the learned predictors add to the contract: exact shortcuts, series, networks and river's names."""
+"""Random forest, ARIMA, LSTM and river: what they promise beyond the contract of predictors."""
 
 import math
 import random
@@ -14,7 +14,7 @@ from offboard.robot_client.predictors import LEAST_SQUARES, Predictor, make
 
 Row = tuple[float, float]  # size, seconds
 
-# Predictor: the fixture that it needs, and the part of its observations after which it is fitted anew.
+# For each predictor, the fixture that it needs, and after which share of its observations it is fitted again.
 REFITTED = {"random-forest": ("forest", 10), "arima": ("series", 4), "lstm": ("torch", 2)}
 
 
@@ -50,7 +50,7 @@ def online() -> Any:
 def rows_of(
     shape: Callable[[float], float], count: int, noise_s: float, series: Iterable[float] = (), seed: int = 5
 ) -> list[Row]:
-    """Sizes from 0 to 5 and their times, with normal noise, or with `series` where given."""
+    """Sizes from 0 to 5 and their times, with normal noise or the given `series`."""
     rng = random.Random(seed)
     sizes = [rng.uniform(0, 5) for _ in range(count)]
     noise = list(series) or [rng.gauss(0, noise_s) for _ in range(count)]
@@ -62,7 +62,7 @@ def line(size: float) -> float:
 
 
 def bend(size: float) -> float:
-    """Flat up to the middle, a parabola from there."""
+    """Flat up to the middle, then a parabola."""
     return 0.1 + 0.03 * max(0.0, size - 2.5) ** 2
 
 
@@ -80,13 +80,13 @@ def seconds(predictor: Predictor, size: float, ahead: int = 1) -> float:
 
 
 def error(predictor: Predictor, shape: Callable[[float], float]) -> float:
-    """Mean absolute error inside the sizes of `rows_of`."""
+    """Mean absolute error within the sizes of `rows_of`."""
     sizes = np.linspace(0.2, 4.8, 60).tolist()
     return float(np.mean([abs(seconds(predictor, size) - shape(size)) for size in sizes]))
 
 
 def error_ahead(name: str, window: int, rows: list[Row]) -> float:
-    """Mean absolute error of the next time, for each row after the first `window`, learnt one by one."""
+    """Mean absolute error of the next time, for each row after the first `window` rows."""
     predictor = taught(name, window, rows[:window])
     errors = []
     for row in rows[window:]:
@@ -117,10 +117,10 @@ def arma(
 
 @pytest.mark.parametrize("count", [20, 40])
 @pytest.mark.parametrize("name", REFITTED)
-def test_a_fit_lasts_until_its_part_of_new_observations_came(
+def test_a_fit_lasts_for_a_share_of_its_observations(
     name: str, count: int, request: pytest.FixtureRequest
 ) -> None:
-    """While the window fills and when it is full, a fit stands for a fixed part of what it was made on."""
+    """A model is fitted again after a fixed share of the observations of its last fit."""
     library, part = REFITTED[name]
     request.getfixturevalue(library)
     predictor = taught(name, 40, [(i % 7, 0.1) for i in range(count)])
@@ -133,8 +133,8 @@ def test_a_fit_lasts_until_its_part_of_new_observations_came(
 
 
 @pytest.mark.parametrize("count", [2, 5, 60, 400])
-def test_the_step_function_is_the_forest(forest: Any, count: int) -> None:
-    """For any size, seen or not, the prediction is that of scikit-learn's forest, to the bit."""
+def test_the_step_function_equals_the_forest(forest: Any, count: int) -> None:
+    """For any size, the prediction is exactly that of scikit-learn's forest."""
     rows = [(0.0, 0.1), (1.0, 0.2)] + [(size / 5, time) for size, time in rows_of(bend, count - 2, 0.02)]
     predictor = taught("random-forest", count, rows, seed=9)
     x, y = (np.array(column) for column in zip(*rows, strict=True))
@@ -148,8 +148,8 @@ def test_the_step_function_is_the_forest(forest: Any, count: int) -> None:
 
 
 @pytest.mark.usefixtures("forest")
-def test_the_forest_takes_any_range_of_sizes() -> None:
-    """Sizes that 32 bits cannot tell apart, or hold, are told apart."""
+def test_the_forest_accepts_any_range_of_sizes() -> None:
+    """It distinguishes sizes that are equal in 32 bits, or too large for them."""
     for low, step in ((1e12, 1.0), (0.0, 1e300), (0.0, 1e-300)):
         predictor = taught("random-forest", 60, [(low + step * i, 0.1 if i < 30 else 0.4) for i in range(60)])
         assert seconds(predictor, low + 5 * step) == pytest.approx(0.1)
@@ -158,7 +158,7 @@ def test_the_forest_takes_any_range_of_sizes() -> None:
 
 @pytest.mark.usefixtures("forest")
 def test_the_spread_of_the_forest_is_that_of_the_noise() -> None:
-    """Out of bag, so noise of 20 ms in 40 observations is not explained away: in sample it would be 16 ms."""
+    """It is out of bag, so 20 ms of noise in 40 observations stay 20 ms; in sample it would be 16 ms."""
     found = [
         taught("random-forest", 40, rows_of(line, 40, 0.02, seed=seed)).predict(2.0) for seed in range(5)
     ]
@@ -171,7 +171,7 @@ def test_the_spread_of_the_forest_is_that_of_the_noise() -> None:
     [(0, arma(600, 0.7, 0.3)), (0, arma(600, 0.9, -0.6)), (10, arma(600, 0.5, 0.2, 0.6, -0.3))],
 )
 def test_the_recursion_equals_statsmodels(series: Any, season: int, residuals: list[float]) -> None:
-    """Fitted on 400 residuals and told 200 more, it forecasts as statsmodels does, one and 40 steps on."""
+    """After a fit on 400 residuals and 200 more, it forecasts 1 and 40 steps as statsmodels does."""
     values = np.array(residuals)
     ours, _ = series.fit_series(values[:400], season)
     scale = values[:400].std()
@@ -189,18 +189,18 @@ def test_the_recursion_equals_statsmodels(series: Any, season: int, residuals: l
 
 
 @pytest.mark.usefixtures("series")
-def test_arima_uses_what_the_residuals_say() -> None:
-    """Where the residuals keep two thirds of their last value, it errs a fifth less than least squares."""
+def test_arima_uses_the_residuals() -> None:
+    """If residuals keep two thirds of their last value, its error is a fifth below least squares."""
     rows = rows_of(line, 500, 0.0, series=arma(500, 0.67, 0.0))
     arima, plain = error_ahead("arima", 200, rows), error_ahead(LEAST_SQUARES, 200, rows)
     assert arima < 0.8 * plain, (arima, plain)
-    # The best there is knows phi, and errs by the mean absolute value of noise of 10 ms.
+    # The best predictor would know phi. Its error is the mean absolute value of noise of 10 ms.
     assert arima < 1.1 * 0.01 * math.sqrt(2 / math.pi), arima
 
 
 @pytest.mark.usefixtures("series")
-def test_sarima_uses_what_a_season_ago_says() -> None:
-    """Where every tenth residual is alike, SARIMA errs less than ARIMA, which does not look so far."""
+def test_sarima_uses_the_last_season() -> None:
+    """If every tenth residual is similar, the error of SARIMA is below that of ARIMA."""
     rows = rows_of(line, 300, 0.0, series=arma(300, 0.0, 0.0, 0.8))
     sarima, arima = error_ahead("sarima", 200, rows), error_ahead("arima", 200, rows)
     assert sarima < 0.8 * arima, (sarima, arima)
@@ -208,7 +208,7 @@ def test_sarima_uses_what_a_season_ago_says() -> None:
 
 @pytest.mark.parametrize("name", ["arima", "sarima"])
 def test_the_forecast_fades_to_the_line(series: Any, name: str) -> None:
-    """The longer ago the last observation, the nearer is the prediction to least squares."""
+    """With each task since the last observation, the prediction comes closer to least squares."""
     rows = rows_of(line, 200, 0.0, series=[*arma(199, 0.8, 0.0), 0.08])
     predictor, plain = taught(name, 200, rows), taught(LEAST_SQUARES, 200, rows)
     apart = [abs(seconds(predictor, 2.0, ahead) - seconds(plain, 2.0)) for ahead in (1, 3, 10, 40, 200)]
@@ -220,7 +220,7 @@ def test_the_forecast_fades_to_the_line(series: Any, name: str) -> None:
 
 @pytest.mark.parametrize("name", ["arima", "sarima"])
 def test_without_a_series_the_prediction_is_the_line(series: Any, name: str) -> None:
-    """With too few observations, or residuals that flip for ever, it is least squares."""
+    """With too few observations, or residuals that alternate for ever, it is least squares."""
     few = series.Arima.observations_min if name == "arima" else series.Sarima.observations_min
     rows = rows_of(line, few - 1, 0.0, series=arma(few - 1, 0.8, 0.0, seed=4))
     flips = [(float(i // 2 % 3), 1.0 + 0.01 * (-1) ** i) for i in range(99)]
@@ -234,8 +234,8 @@ def test_without_a_series_the_prediction_is_the_line(series: Any, name: str) -> 
 
 @pytest.mark.usefixtures("torch")
 @pytest.mark.parametrize(("shape", "gain"), [(line, 0.15), (bend, 0.25)])
-def test_lstm_learns_a_line_and_a_bend(shape: Callable[[float], float], gain: float) -> None:
-    """It errs by a small part of what the mean time does; on a bend also far less than a line."""
+def test_lstm_learns_a_line_and_a_curve(shape: Callable[[float], float], gain: float) -> None:
+    """Its error is far below that of the mean time, and on a curve also far below that of a line."""
     rows = rows_of(shape, 300, 0.005)
     lstm = error(taught("lstm", 300, rows), shape)
     mean = sum(time for _, time in rows) / len(rows)
@@ -246,8 +246,8 @@ def test_lstm_learns_a_line_and_a_bend(shape: Callable[[float], float], gain: fl
 
 
 @pytest.mark.usefixtures("torch")
-def test_lstm_saturates_beyond_the_sizes_seen() -> None:
-    """Far beyond them the prediction is a constant, not the line that it learnt."""
+def test_lstm_saturates_beyond_the_observed_sizes() -> None:
+    """Far beyond them the prediction is constant instead of the learnt line."""
     predictor = taught("lstm", 100, rows_of(line, 100, 0.002))
     far = [seconds(predictor, size) for size in (1e6, 1e9, 1e300)]
     assert far[0] == pytest.approx(far[1], rel=1e-3)
@@ -255,8 +255,8 @@ def test_lstm_saturates_beyond_the_sizes_seen() -> None:
     assert far[0] < line(30)
 
 
-def test_lstm_answers_by_its_seed_alone(torch: Any) -> None:
-    """Same seed, same answer, whatever torch's own generator did; another seed, another answer."""
+def test_lstm_depends_on_its_seed_only(torch: Any) -> None:
+    """The same seed gives the same answer for any state of torch's generator; another seed does not."""
     rows = rows_of(bend, 60, 0.005)
 
     def answer(seed: int) -> float:
@@ -268,7 +268,7 @@ def test_lstm_answers_by_its_seed_alone(torch: Any) -> None:
 
 
 def test_lstm_leaves_torch_as_it_was(torch: Any) -> None:
-    """Neither the state of torch's generator nor its threads change."""
+    """Neither the state of torch's generator nor its number of threads changes."""
     before, threads = torch.get_rng_state(), torch.get_num_threads()
     torch.set_num_threads(2)
     try:
@@ -279,8 +279,8 @@ def test_lstm_leaves_torch_as_it_was(torch: Any) -> None:
     assert torch.equal(torch.get_rng_state(), before)
 
 
-def test_lstm_learns_inside_the_inference_of_another(torch: Any) -> None:
-    """A task may itself be a torch model, and the caller in a mode that allows no training."""
+def test_lstm_learns_inside_inference_mode(torch: Any) -> None:
+    """A task may be a torch model, and its caller in a mode that forbids training."""
     rows = rows_of(line, 60, 0.005)
     for mode in (torch.no_grad, torch.inference_mode):
         with mode():
@@ -290,7 +290,7 @@ def test_lstm_learns_inside_the_inference_of_another(torch: Any) -> None:
 
 
 def test_every_regressor_of_river_learns_at_any_scale(online: Any) -> None:
-    """Each on offer predicts; 1,024 times longer tasks of 2^-20 of the size are the same to it."""
+    """Each one predicts, and gives the same for tasks 1,024 times as long and 2^-20 times the size."""
     rows = rows_of(line, 60, 0.005)
     assert {"linear_model.BayesianLinearRegression", "tree.HoeffdingTreeRegressor"} <= set(online.known())
     for path in online.known():
@@ -302,7 +302,7 @@ def test_every_regressor_of_river_learns_at_any_scale(online: Any) -> None:
 
 @pytest.mark.usefixtures("online")
 def test_a_linear_model_of_river_finds_the_line() -> None:
-    """Bayesian regression is least squares but for its faint prior; its spread is the noise."""
+    """Bayesian regression has a weak prior, so it is close to least squares. Its spread is the noise."""
     rows = rows_of(line, 400, 0.01)
     predictor = taught("river:linear_model.BayesianLinearRegression", 100, rows)
     assert error(predictor, line) < 0.002
@@ -312,18 +312,18 @@ def test_a_linear_model_of_river_finds_the_line() -> None:
 
 
 @pytest.mark.usefixtures("online")
-def test_river_takes_the_seed() -> None:
-    """Where a model draws, the seed decides."""
+def test_river_uses_the_seed() -> None:
+    """If a model is random, the seed decides."""
     rows = rows_of(line, 60, 0.01)
     one, same, other = (seconds(taught("river:forest.ARFRegressor", 50, rows, s), 3.0) for s in (1, 1, 2))
     assert one == same != other
 
 
 @pytest.mark.parametrize("answer", [None, math.nan, math.inf])
-def test_without_an_answer_of_the_model_it_is_the_mean(
+def test_if_the_model_has_no_answer_the_mean_is_predicted(
     online: Any, answer: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A model that has no answer, or none that is a number, does not leave the robot without one."""
+    """This holds also if the answer of the model is not a finite number."""
 
     class Mute(online.Regressor):  # type: ignore[misc]
         def learn_one(self, x: object, y: object) -> None: ...
@@ -357,8 +357,8 @@ def test_without_an_answer_of_the_model_it_is_the_mean(
         ("a\nb.C", "no regressor"),
     ],
 )
-def test_a_path_that_is_no_regressor_of_river_is_refused(path: str, said: str) -> None:
-    """One line names the path and what there is instead; nothing outside of river is loaded."""
+def test_an_unusable_path_of_river_is_refused(path: str, said: str) -> None:
+    """One line names the path and the alternatives, and nothing outside of river is loaded."""
     with pytest.raises(ConfigError) as refused:
         make(f"river:{path}", 50)
     text = str(refused.value)

@@ -1,4 +1,4 @@
-"""Recursive least squares against exact arithmetic; test_window.py does so for least squares."""
+"""Recursive least squares, compared with exact arithmetic."""
 
 import math
 import random
@@ -18,7 +18,7 @@ RELATIVE = 1e-9
 
 
 def exact(rows: list[Row], forgetting: float, size: float) -> Fraction:
-    """Least squares with weights forgetting^(n - i), in rational numbers; the mean where sizes are equal."""
+    """Least squares with weights forgetting^(n - i), in rational numbers. Equal sizes give the mean."""
     fade = Fraction(forgetting)
     w = [fade ** (len(rows) - 1 - i) for i in range(len(rows))]
     d, t = ([Fraction(row[column]) for row in rows] for column in (0, 1))
@@ -36,7 +36,7 @@ def seconds_of(predictor: RecursiveLeastSquares, size: float) -> float:
 
 @st.composite
 def streams(draw: st.DrawFn) -> list[Row]:
-    """Sizes that are wide, far from zero, jumping, mostly equal or equal; noisy seconds."""
+    """Streams of sizes (wide, far from zero, jumping, mostly equal, equal) and noisy seconds."""
     rng = random.Random(draw(st.integers(0, 2**32)))
     size = draw(
         st.sampled_from(
@@ -56,7 +56,7 @@ def streams(draw: st.DrawFn) -> list[Row]:
 @given(streams(), st.integers(2, 60), st.booleans())
 @settings(max_examples=70, deadline=None)
 def test_predictions_equal_weighted_least_squares(rows: list[Row], window: int, fades: bool) -> None:
-    """With the window's forgetting and with none every prediction equals the rational one to 1e-9."""
+    """Every prediction equals exact arithmetic to 1e-9, with the default forgetting and without."""
     predictor = RecursiveLeastSquares(window, forgetting=None if fades else 1.0)
     assert predictor.forgetting == (1 - 1 / window if fades else 1.0)
     for i, row in enumerate(rows):
@@ -67,8 +67,8 @@ def test_predictions_equal_weighted_least_squares(rows: list[Row], window: int, 
             assert abs(Fraction(seconds_of(predictor, row[0])) - truth) <= RELATIVE * scale, f"row {i}"
 
 
-def test_nothing_fades_over_100_000_executions() -> None:
-    """With forgetting 1 the line after 100,000 executions is that of least squares on all of them."""
+def test_without_forgetting_100_000_executions_count_equally() -> None:
+    """With forgetting 1, the line after 100,000 executions is that of least squares over all of them."""
     rows = [(1e7 + 100 * size, seconds) for size, seconds in line(100_000)]
     predictor = RecursiveLeastSquares(50, forgetting=1.0)
     teach(predictor, rows)
@@ -81,8 +81,8 @@ def test_nothing_fades_over_100_000_executions() -> None:
 
 @given(st.floats(0, 1e15), st.floats(0.5, 1), st.integers(0, 2**32))
 @settings(max_examples=60, deadline=None)
-def test_constant_times_are_predicted_to_the_bit(seconds: float, forgetting: float, seed: int) -> None:
-    """Whatever the sizes, times that never change come back as they are, with no spread."""
+def test_constant_times_are_predicted_exactly(seconds: float, forgetting: float, seed: int) -> None:
+    """Times that never change are predicted exactly, with spread 0, for any sizes."""
     rng = random.Random(seed)
     predictor = RecursiveLeastSquares(50, forgetting=forgetting)
     teach(predictor, [(10 ** rng.uniform(-9, 15), seconds) for _ in range(60)])
@@ -93,7 +93,7 @@ def test_constant_times_are_predicted_to_the_bit(seconds: float, forgetting: flo
 
 
 def same_size(size: float, rounded: bool) -> Iterator[float]:
-    """One size for ever; `rounded`: off by one unit in the last place now and then."""
+    """Many tasks of one size; with `rounded` some are off by one unit in the last place."""
     rng = random.Random(8)
     while True:
         yield math.nextafter(size, math.inf) if rounded and rng.random() < 0.5 else size
@@ -106,7 +106,7 @@ def same_size(size: float, rounded: bool) -> Iterator[float]:
 def test_a_long_run_of_one_size_neither_bends_the_line_nor_keeps_it(
     size: float, window: int, rounded: bool
 ) -> None:
-    """The slope stays that of the varied sizes before while they weigh at all, and is 0 in the end."""
+    """The slope of earlier sizes stays while these have weight, and becomes 0 in the end."""
     predictor = RecursiveLeastSquares(window)
     rng = random.Random(3)
     teach(predictor, [(size + d, t) for d, t in line(4 * window)])
@@ -124,8 +124,8 @@ def test_a_long_run_of_one_size_neither_bends_the_line_nor_keeps_it(
     assert seconds_of(predictor, size) == pytest.approx(times / weights, rel=1e-12)
 
 
-def test_sizes_that_hardly_differ_are_told_apart() -> None:
-    """Around 1e7, sizes that differ by a millionth still give their slope; by the last digit they do not."""
+def test_sizes_that_hardly_differ_give_a_slope() -> None:
+    """Near 1e7, sizes that differ by a millionth have a slope; sizes that differ in the last digit do not."""
     rng = random.Random(2)
     rows = [(1e7 + rng.random() * 1e-6, 0.0) for _ in range(200)]
     rows = [(size, 0.1 + 1e5 * (size - 1e7)) for size, _ in rows]
@@ -140,7 +140,7 @@ def test_sizes_that_hardly_differ_are_told_apart() -> None:
 
 
 def test_the_spread_is_that_of_the_weighted_residuals() -> None:
-    """Its square is the weighted residual sum of squares over W - 2 sum(w^2) / W; None below 3 executions."""
+    """Its square is the weighted residual sum of squares over W - 2 sum(w^2) / W. It needs 3 executions."""
     rows, window = line(70), 20
     predictor = RecursiveLeastSquares(window)
     for i, row in enumerate(rows, start=1):
@@ -159,7 +159,7 @@ def test_the_spread_is_that_of_the_weighted_residuals() -> None:
 
 @pytest.mark.parametrize("count", [4, 10, 300])
 def test_the_spread_is_unbiased(count: int) -> None:
-    """Its square, averaged over 2,000 streams, is the variance of the noise to 6 %."""
+    """Over 2,000 streams, the mean of its square is the variance of the noise within 6 %."""
     squares = []
     for seed in range(2000):
         prediction = teach(RecursiveLeastSquares(10), line(count, seed)[-60:]).predict(1.0)

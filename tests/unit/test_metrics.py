@@ -1,4 +1,4 @@
-"""The robot's metrics."""
+"""The metrics of the robot."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from tests.unit.test_trace import record
 
 
 def test_a_record_is_counted_once_by_site_and_outcome() -> None:
-    """A task that the cloud lost and onboard answered is one task, two executions and one wait."""
+    """A task that fails in the cloud and is answered onboard is one task, two executions and one wait."""
     registry = CollectorRegistry()
     observe = Metrics(registry)
     observe(record(0))
@@ -36,8 +36,8 @@ def test_a_record_is_counted_once_by_site_and_outcome() -> None:
 @pytest.mark.parametrize(
     ("seconds", "inside"), [(0.079, "false"), (0.08, "true"), (0.15, "true"), (0.2, "false")]
 )
-def test_intervals_are_held_to_what_came(seconds: float, inside: str) -> None:
-    """Each answer counts as inside or outside; sites without an interval, and failures, do not."""
+def test_answers_count_as_inside_or_outside_their_interval(seconds: float, inside: str) -> None:
+    """Failures, and sites without an interval, do not count."""
     registry = CollectorRegistry()
     observe = Metrics(registry)
     for failure in (None, CloudBroken("gone")):
@@ -53,8 +53,8 @@ def test_intervals_are_held_to_what_came(seconds: float, inside: str) -> None:
     } == {(ONBOARD, inside): 1.0}
 
 
-def test_regret_is_the_last_estimate_with_its_bounds() -> None:
-    """Mean and both ends, and 0 until probes have told."""
+def test_regret_is_the_last_estimate() -> None:
+    """The mean and both ends of its interval are shown. They are 0 before the first estimate."""
     registry = CollectorRegistry()
     observe = Metrics(registry)
     observe(replace(record(0), regret=None))

@@ -17,9 +17,9 @@ BAYES = "river:linear_model.BayesianLinearRegression"
 NAMES = (*predictors.names(), BAYES)
 
 
-# The error on a plain line is below this share of the mean time's; those that do not assume a line err more.
+# Limits of the error on a straight line, as a share of the error of the mean time.
 GAINS = dict.fromkeys(NAMES, 0.05) | {"random-forest": 0.2, "lstm": 0.3}
-EXTRAS = {  # predictor: libraries it cannot do without, and the extra that brings them
+EXTRAS = {  # for each predictor, the library that it needs, and the extra that installs it
     "random-forest": ("sklearn", "learned"),
     "arima": ("statsmodels", "learned"),
     "sarima": ("statsmodels", "learned"),
@@ -53,12 +53,12 @@ def test_contract(check: Callable[[checks.Make], None], make: checks.Make) -> No
 
 
 def test_a_line_is_learnt(name: str, make: checks.Make) -> None:
-    """Every predictor uses the input size: on a plain line it errs far less than the mean time does."""
+    """Every predictor uses the input size: on a line its error is far below that of the mean time."""
     checks.learns_a_line(make, GAINS[name])
 
 
 def test_an_unknown_name_is_refused_with_all_names() -> None:
-    """A misspelt predictor gets every name there is, and how river's are written."""
+    """The error lists every name, and how names of river are written."""
     for refuse in (predictors.check_name, lambda name: predictors.make(name, 50)):
         with pytest.raises(ConfigError) as refused:
             refuse("theil-send")
@@ -68,14 +68,14 @@ def test_an_unknown_name_is_refused_with_all_names() -> None:
 
 @pytest.mark.parametrize("length", [0, 1, 10**9])
 def test_a_window_out_of_bounds_is_refused(name: str, length: int) -> None:
-    """No predictor takes a window shorter than 2 or longer than its limit."""
+    """No predictor accepts a window shorter than 2 or longer than its limit."""
     with pytest.raises(ConfigError, match=f"window {length}: "):
         predictors.make(name, length)
 
 
 @pytest.mark.parametrize(("name", "library", "extra"), [(name, *needs) for name, needs in EXTRAS.items()])
 def test_a_missing_library_names_its_extra(name: str, library: str, extra: str) -> None:
-    """Without its library a predictor cannot be made, and one line says what to install."""
+    """Without its library a predictor cannot be made, and one line names the extra to install."""
     said = python(
         "import sys\n"
         f"sys.modules[{library!r}] = None\n"
@@ -91,7 +91,7 @@ def test_a_missing_library_names_its_extra(name: str, library: str, extra: str) 
 
 
 def test_the_base_predictors_load_no_heavy_library() -> None:
-    """Those that need no extra learn and predict on numpy alone."""
+    """Predictors that need no extra work with numpy only."""
     said = python(
         "import sys\n"
         "from offboard.robot_client import predictors\n"
@@ -106,7 +106,7 @@ def test_the_base_predictors_load_no_heavy_library() -> None:
 
 
 def python(code: str) -> str:
-    """What the code prints, in a process of its own."""
+    """What the code prints, run in a new process."""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=30)
     assert done.returncode == 0, done.stderr
     return done.stdout

@@ -1,4 +1,4 @@
-"""Theil-Sen and Huber against scipy, scikit-learn and their own definitions, and on awkward data."""
+"""Theil-Sen and Huber, compared with scipy, scikit-learn and their definitions, and on awkward data."""
 
 import math
 import random
@@ -61,8 +61,8 @@ def windows(draw: st.DrawFn, shortest: int = 2) -> tuple[Column, Column]:
 
 @given(windows())
 @settings(max_examples=100, deadline=None)
-def test_theil_sen_is_that_of_scipy(window: tuple[Column, Column]) -> None:
-    """Line and spread equal scipy's `theilslopes` and `median_abs_deviation` to 1e-12."""
+def test_theil_sen_equals_scipy(window: tuple[Column, Column]) -> None:
+    """Line and spread equal scipy's `theilslopes` and `median_abs_deviation` within 1e-12."""
     from scipy.stats import median_abs_deviation, theilslopes
 
     sizes, seconds = window
@@ -84,15 +84,15 @@ def test_theil_sen_is_that_of_scipy(window: tuple[Column, Column]) -> None:
 
 @pytest.mark.parametrize("n", [1, 2, 3, 5 * SAMPLE, 5 * SAMPLE + 1, 5 * SAMPLE + 2, 31_999])
 def test_the_median_is_exact(n: int) -> None:
-    """Of few and many values, even and odd, tied, in order, and where a sample says nothing of the rest."""
+    """It is exact for few, many, tied and sorted values, and if a sample misleads."""
     values = np.random.default_rng(n).standard_cauchy(n)
     misleading = np.where(np.arange(n) % max(1, n // SAMPLE) == 0, 1e9, values)
     for one in (values, np.round(values), np.sort(values), misleading):
         assert median(one) == np.median(one)
 
 
-def test_theil_sen_takes_2000_and_no_more() -> None:
-    """The longest window allowed is fitted; a longer one is refused with the limit and its reason."""
+def test_theil_sen_accepts_windows_up_to_2000() -> None:
+    """The longest allowed window is fitted. A longer one is refused with the limit and its reason."""
     sizes = np.random.default_rng(0).uniform(0, 5, TheilSen.WINDOW_MAX)
     predictor = taught("theil-sen", sizes, 0.1 + 0.03 * sizes)
     assert predicted(predictor, 2.0).seconds == pytest.approx(0.16, rel=1e-12)
@@ -101,10 +101,11 @@ def test_theil_sen_takes_2000_and_no_more() -> None:
 
 
 @pytest.mark.parametrize("sizes", range(len(SIZES)))
-def test_huber_is_that_of_scikit_learn(sizes: int) -> None:
-    """The criterion is never above theirs; where they reached the minimum the two agree.
+def test_huber_equals_scikit_learn(sizes: int) -> None:
+    """The objective is never above that of scikit-learn, and equal if its solver reached the minimum.
 
-    Predictions to 1e-4 of the deviation of the times, sigma to 1e-3: as near as their solver comes.
+    Predictions then agree within 1e-4 of the deviation of the times, and sigma within 1e-3, the precision of
+    its solver.
     """
     from sklearn.linear_model import HuberRegressor
 
@@ -113,7 +114,7 @@ def test_huber_is_that_of_scikit_learn(sizes: int) -> None:
         d, t = window_of(seed, 5, SIZES[sizes], NOISES[seed % 4])
         x, y = standard(d), standard(t)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # its solver says when it gives up
+            warnings.simplefilter("ignore")  # the solver of scikit-learn warns when it gives up
             theirs = HuberRegressor(epsilon=EPSILON, alpha=0, tol=1e-10, max_iter=10_000).fit(x[:, None], y)
         intercept, slope, sigma = float(theirs.intercept_), float(theirs.coef_[0]), float(theirs.scale_)
         assert objective(x, y, *huber_line(x, y)) <= objective(x, y, intercept, slope, sigma) * (1 + 1e-12)
@@ -131,7 +132,7 @@ def test_huber_is_that_of_scikit_learn(sizes: int) -> None:
 @given(windows(shortest=3))
 @settings(max_examples=100, deadline=None)
 def test_huber_minimises_its_objective(window: tuple[Column, Column]) -> None:
-    """The gradient vanishes, or where there is none no line near by costs less."""
+    """The gradient is 0, or if there is none, no nearby line costs less."""
     assert_minimum(*(standard(column) for column in window))
 
 
@@ -140,7 +141,7 @@ def standard(column: Column) -> Column:
 
 
 def objective(x: Column, y: Column, intercept: float, slope: float, sigma: float) -> float:
-    """Owen's criterion as it is written: sum(sigma + H(r / sigma) sigma)."""
+    """Owen's objective as published: sum(sigma + H(r / sigma) sigma)."""
     r = np.abs(y - intercept - slope * x)
     if sigma == 0:
         return float(2 * EPSILON * r.sum())
@@ -150,13 +151,13 @@ def objective(x: Column, y: Column, intercept: float, slope: float, sigma: float
 
 
 def stationary(x: Column, y: Column, intercept: float, slope: float, sigma: float) -> float:
-    """The largest derivative of the criterion, per observation."""
+    """The largest derivative of the objective, per observation."""
     z = np.clip((y - intercept - slope * x) / sigma, -EPSILON, EPSILON)
     return float(max(abs(z.mean()), abs((z * x).mean()), abs(1 - (z**2).mean())))
 
 
 def assert_minimum(x: Column, y: Column) -> None:
-    """The criterion is convex: what is stationary, or lowest of all near by, is its minimum."""
+    """The objective is convex, so a stationary point, or the lowest nearby, is its minimum."""
     fit = huber_line(x, y)
     if fit[2] > 0 and stationary(x, y, *fit) <= 1e-7:
         return
@@ -171,7 +172,7 @@ def assert_minimum(x: Column, y: Column) -> None:
 
 @pytest.mark.parametrize("n", [3, 4, 6, 10, 40])
 def test_huber_minimises_its_objective_on_awkward_windows(n: int) -> None:
-    """The same for few points, two sizes, rounded times, far points, a line that most lie on exactly."""
+    """It also does for few points, two sizes, rounded times, distant points, and points exactly on a line."""
     rng = np.random.default_rng(n)
     for _ in range(25):
         few = rng.integers(0, 3, n) / 2
@@ -186,8 +187,8 @@ def test_huber_minimises_its_objective_on_awkward_windows(n: int) -> None:
 
 
 @pytest.mark.parametrize("shift", [0.0, 1e7])
-def test_a_line_that_most_points_lie_on_is_found(shift: float) -> None:
-    """With 14 of 50 times far off and the rest on a line, Huber gives that line and Theil-Sen its slope."""
+def test_the_line_through_most_points_is_found(shift: float) -> None:
+    """If 14 of 50 times are far from a line, Huber finds that line and Theil-Sen its slope."""
     rng = np.random.default_rng(1)
     steps = rng.permutation(50)
     seconds = 1.0 + 0.25 * steps
@@ -201,7 +202,7 @@ def test_a_line_that_most_points_lie_on_is_found(shift: float) -> None:
 
 @pytest.mark.parametrize("name", ROBUST)
 def test_a_collinear_window_is_exact(name: str) -> None:
-    """Points on one line give that line to 1e-12, from two points on, and a spread of 0 to rounding."""
+    """Two or more points on a line give that line within 1e-12, and a spread of 0 up to rounding."""
     rng = random.Random(6)
     for n in (2, 3, 4, 50):
         sizes = np.array([rng.uniform(0, 5) for _ in range(n)])
@@ -214,7 +215,7 @@ def test_a_collinear_window_is_exact(name: str) -> None:
 
 @pytest.mark.parametrize("name", ROBUST)
 def test_equal_sizes_give_a_robust_middle(name: str) -> None:
-    """With one size the slope is 0, and a fifth of the times being absurd moves it by less than the noise."""
+    """With one size the slope is 0. A fifth of absurd times moves the prediction by less than the noise."""
     rng = np.random.default_rng(2)
     seconds = rng.normal(0.2, 0.01, 50)
     seconds[::5] = 200.0
@@ -224,8 +225,8 @@ def test_equal_sizes_give_a_robust_middle(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ROBUST)
-def test_equal_times_come_back_to_the_bit(name: str) -> None:
-    """Whatever the sizes, times that are all equal are the prediction, with spread 0."""
+def test_equal_times_are_predicted_exactly(name: str) -> None:
+    """If all times are equal, they are the prediction for any size, with spread 0."""
     for n in (1, 2, 3, 50):
         for seconds in (0.0, 0.1, 7.3, 1e15):
             predictor = taught(name, np.arange(float(n)), np.full(n, seconds))
@@ -235,7 +236,7 @@ def test_equal_times_come_back_to_the_bit(name: str) -> None:
 
 @pytest.mark.parametrize("name", ROBUST)
 def test_the_spread_is_the_deviation_of_normal_noise(name: str) -> None:
-    """Over 2,000 observations with normal noise of 10 ms the spread is 10 ms to 5 %."""
+    """For 2,000 observations with normal noise of 10 ms, the spread is 10 ms within 5 %."""
     rng = np.random.default_rng(3)
     sizes = rng.uniform(0, 5, 2000)
     predictor = taught(name, sizes, 0.3 + 0.03 * sizes + rng.normal(0, 0.01, 2000))
@@ -249,7 +250,7 @@ values = st.floats(0, 1e15) | st.sampled_from([0.0, 5e-324, 1e-300, 1e-100, 1.0,
 @given(st.lists(st.tuples(values, values), min_size=1, max_size=12), values)
 @settings(max_examples=200, deadline=None)
 def test_any_data_give_a_finite_prediction(name: str, rows: list[Row], size: float) -> None:
-    """Any sizes and seconds up to 1e15, however small or near each other: finite, and no warning."""
+    """Predictions are finite, and nothing warns, for any sizes and seconds up to 1e15."""
     predictor = make(name, 12)
     for row in rows:
         predictor.learn(*row)

@@ -1,4 +1,4 @@
-"""Writing and reading the trace."""
+"""Writing the trace, and reading it."""
 
 import json
 import logging
@@ -15,7 +15,7 @@ import pytest
 from offboard.common.errors import CloudTimeout, ConfigError, DataError
 from offboard.robot_client.learning.regret import Regret
 from offboard.robot_client.policies import Decision, Outlook
-from offboard.robot_client.records.trace import WAITING_MAX, WRITE_EVERY_S, Late, Record, Trace, read
+from offboard.robot_client.records.trace import WAITING_MAX, Late, Record, Trace, read
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution
 
 ROOT = Path(__file__).parents[2]
@@ -46,7 +46,7 @@ def record(i: int = 0) -> Record:
 
 
 def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
-    """One record becomes one JSON line with the fields of docs/formats.md, units in the names."""
+    """A record becomes one JSON line with the fields of docs/formats.md."""
     trace = Trace(tmp_path / "trace.jsonl")
     trace.write(record())
     trace.close()
@@ -131,7 +131,7 @@ def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
 
 
 def test_a_torn_last_line_is_skipped_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """A line without its newline, as power loss leaves it, does not spoil the rest."""
+    """After a power loss the last line may lack its end. The others are read."""
     path = write(tmp_path, 3)
     with path.open("a") as file:
         file.write('{"v": 1, "i": 3, "id"')
@@ -141,7 +141,7 @@ def test_a_torn_last_line_is_skipped_with_a_warning(tmp_path: Path, caplog: pyte
 
 
 def test_a_restarted_robot_appends_after_a_torn_line(tmp_path: Path) -> None:
-    """Opening a torn trace cuts the torn line off, so the next record is whole."""
+    """Opening a torn trace removes the torn line, so that the next record is complete."""
     path = write(tmp_path, 2)
     os.truncate(path, path.stat().st_size - 5)
     trace = Trace(path)
@@ -152,7 +152,7 @@ def test_a_restarted_robot_appends_after_a_torn_line(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["my thesis", "my thesis\nchapter 1\n", '{"a": 1}'])
 def test_a_file_that_is_no_trace_is_left_alone(tmp_path: Path, text: str) -> None:
-    """--trace with the name of another file is refused, and the file is what it was."""
+    """A file that is no trace is refused and stays unchanged."""
     path = tmp_path / "thesis.txt"
     path.write_text(text)
     with pytest.raises(ConfigError, match="is no trace"):
@@ -170,7 +170,7 @@ def test_a_file_that_is_no_trace_is_left_alone(tmp_path: Path, text: str) -> Non
     ],
 )
 def test_any_other_bad_line_names_file_and_line(tmp_path: Path, line: str, message: str) -> None:
-    """A bad line in the middle is an error, not a gap."""
+    """A bad line in the middle is an error."""
     path = write(tmp_path, 1)
     with path.open("a") as file:
         file.write(line)
@@ -178,20 +178,20 @@ def test_any_other_bad_line_names_file_and_line(tmp_path: Path, line: str, messa
         list(read(path))
 
 
-def test_a_missing_trace_is_named(tmp_path: Path) -> None:
+def test_a_missing_trace_is_an_error(tmp_path: Path) -> None:
     """The error names the file."""
     with pytest.raises(DataError, match=r"none\.jsonl: No such file"):
         list(read(tmp_path / "none.jsonl"))
 
 
 def test_a_trace_that_cannot_be_opened_is_a_config_error(tmp_path: Path) -> None:
-    """A directory in the trace's place is said at start."""
+    """A directory with the name of the trace is an error at start."""
     with pytest.raises(ConfigError, match="Is a directory"):
         Trace(tmp_path)
 
 
 def test_a_full_disk_is_logged_and_tasks_go_on(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """A record that does not fit is counted and leaves no torn line, and the next one is whole."""
+    """A record that does not fit is counted, leaves no torn line, and does not affect the next one."""
     path = write(tmp_path, 1)
     trace = Trace(path)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -207,8 +207,8 @@ def test_a_full_disk_is_logged_and_tasks_go_on(tmp_path: Path, caplog: pytest.Lo
     assert [fields["i"] for fields in read(path)] == [0, 2]
 
 
-def test_a_closed_trace_takes_no_more(tmp_path: Path) -> None:
-    """A task that ends after the trace was closed leaves no line and no error; closing twice is once."""
+def test_a_closed_trace_ignores_records(tmp_path: Path) -> None:
+    """A task that ends after `close` leaves neither a line nor an error. Closing twice is allowed."""
     trace = Trace(tmp_path / "trace.jsonl")
     trace.write(record(0))
     trace.close()
@@ -218,23 +218,24 @@ def test_a_closed_trace_takes_no_more(tmp_path: Path) -> None:
     assert [fields["i"] for fields in read(trace.path)] == [0]
 
 
-def test_lines_are_written_without_being_asked_for(tmp_path: Path) -> None:
-    """A robot that goes on, or is killed, has left its records but for those of the last moments."""
+def test_records_are_written_in_the_background(tmp_path: Path) -> None:
+    """Without `close` or `flush`, at most WAITING_MAX records wait, and soon none."""
     trace = Trace(tmp_path / "trace.jsonl")
     for i in range(WAITING_MAX + 3):
         trace.write(record(i))
     written = len(list(read(trace.path)))
-    assert WAITING_MAX + 3 - written <= WAITING_MAX + 1, "so many wait, and one is being written"
-    until = time.monotonic() + 10
+    assert WAITING_MAX + 3 - written <= WAITING_MAX + 1, (
+        "WAITING_MAX records may wait, and one may be half written"
+    )
+    until_s = time.monotonic() + 10
     while len(list(read(trace.path))) < WAITING_MAX + 3:
-        assert time.monotonic() < until
-        time.sleep(WRITE_EVERY_S)
+        assert time.monotonic() < until_s
     assert [fields["i"] for fields in read(trace.path)] == list(range(WAITING_MAX + 3))
     trace.close()
 
 
-def test_a_program_that_ends_without_closing_it_loses_nothing(tmp_path: Path) -> None:
-    """The last records are written when the interpreter ends."""
+def test_a_program_that_does_not_close_the_trace_loses_nothing(tmp_path: Path) -> None:
+    """The waiting records are written when the interpreter exits."""
     path = tmp_path / "trace.jsonl"
     program = (
         "from pathlib import Path; from tests.unit.test_trace import Trace, record; "

@@ -57,7 +57,7 @@ FILES = {
         ),
         (
             ["robot_client", "drive", "--map", "open.map", "--trace", "words.txt"],
-            "words.txt: the file is there and is no",
+            "words.txt: the file exists and is no",
         ),
         (["robot_client", "drive", "--map", "m.yaml", "--window", "0"], "--window: 0 is below 2"),
         (

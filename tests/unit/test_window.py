@@ -1,4 +1,4 @@
-"""The window and least squares against exact arithmetic."""
+"""The window and least squares, compared with exact arithmetic."""
 
 import math
 import random
@@ -14,14 +14,14 @@ from offboard.common.errors import ConfigError
 from offboard.robot_client.predictors import LEAST_SQUARES, make
 from offboard.robot_client.predictors.window import Window
 
-SPREAD_MIN = 1e-5  # of the mean of d: above it predictions are exact to RELATIVE
+SPREAD_MIN = 1e-5  # share of the mean of d above which predictions are exact to RELATIVE
 
 
 RELATIVE = 1e-9
 
 
 def exact(window: deque[tuple[float, float]], size: float) -> Fraction:
-    """Least squares in rational numbers; p = mean t where all sizes are equal."""
+    """Least squares in rational numbers. If all sizes are equal, p = mean t."""
     d = [Fraction(size) for size, _ in window]
     t = [Fraction(seconds) for _, seconds in window]
     mean_d, mean_t = sum(d) / len(d), sum(t) / len(t)
@@ -31,14 +31,14 @@ def exact(window: deque[tuple[float, float]], size: float) -> Fraction:
 
 
 def spread_of(window: deque[tuple[float, float]]) -> float:
-    """Range of the sizes as a share of their mean."""
+    """The range of the sizes, as a share of their mean."""
     sizes = [size for size, _ in window]
     mean = math.fsum(sizes) / len(sizes)
     return (max(sizes) - min(sizes)) / mean if mean else 0.0
 
 
 def sizes_stream(kind: str, rng: random.Random, count: int) -> list[float]:
-    """Streams that have broken rolling sums before: large offsets, jumps, outliers, equal runs."""
+    """Streams that are hard for rolling sums: large offsets, jumps, outliers, runs of equal sizes."""
     if kind == "wide":
         return [rng.uniform(0, 1e7) for _ in range(count)]
     if kind == "offset":
@@ -62,14 +62,14 @@ STREAMS = ("wide", "offset", "jumps", "runs", "outliers", "equal")
 )
 @settings(max_examples=120, deadline=None)
 def test_predictions_equal_exact_arithmetic(stream: str, length: int, seed: int) -> None:
-    """Every prediction over a random stream equals the rational one to 1e-9; equal sizes give the mean."""
+    """Every prediction equals exact arithmetic within 1e-9. Equal sizes give the mean."""
     rng = random.Random(seed)
     count = min(4 * length, 260) + 3
     check_stream(sizes_stream(stream, rng, count), length, rng)
 
 
 def test_predictions_equal_exact_arithmetic_at_a_window_of_1000() -> None:
-    """The same for N = 1,000, on the streams that cancel the most."""
+    """The same holds for N = 1,000, on the streams with the most cancellation."""
     for stream in ("offset", "outliers"):
         rng = random.Random(9)
         check_stream(sizes_stream(stream, rng, 2300), 1000, rng, every=331)
@@ -97,20 +97,20 @@ def compare(predicted: float, window: deque[tuple[float, float]], size: float) -
         import warnings
 
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # polyfit says itself that the fit is poor
+            warnings.simplefilter("ignore")  # polyfit warns that the fit is poor
             rival = np.polyval(np.polyfit(d, t, 1), size)
         assert error <= max(RELATIVE, float(abs(Fraction(float(rival)) - truth) / scale))
 
 
-def test_a_near_constant_size_is_fitted_at_least_as_well_as_polyfit() -> None:
-    """Below a spread of 1e-5 of the mean the line is no further from the truth than numpy.polyfit."""
+def test_nearly_equal_sizes_are_fitted_as_well_as_by_polyfit() -> None:
+    """If sizes differ by less than 1e-5 of their mean, the line is at least as exact as numpy.polyfit."""
     rng = random.Random(4)
     for width in (1e-2, 1e-4, 1e-6):
         check_stream([1e7 + rng.random() * width for _ in range(200)], 50, rng, every=11)
 
 
 def test_the_window_keeps_the_last_n_in_order() -> None:
-    """Appending to a full window drops the oldest observation and no other."""
+    """Appending to a full window drops only the oldest observation."""
     window = Window(3)
     for i in range(5):
         assert window.full == (i >= 3)
@@ -119,7 +119,7 @@ def test_the_window_keeps_the_last_n_in_order() -> None:
 
 
 def test_the_spread_is_the_standard_deviation_of_the_residuals() -> None:
-    """Spread is the root of the residual sum of squares over N - 2, and unknown for two observations."""
+    """It is the root of the residual sum of squares over N - 2, and unknown for two observations."""
     predictor = make(LEAST_SQUARES, 10)
     points = [(1.0, 1.0), (2.0, 2.5), (3.0, 2.5), (4.0, 4.0)]
     for size, seconds in points[:2]:
@@ -135,7 +135,7 @@ def test_the_spread_is_the_standard_deviation_of_the_residuals() -> None:
 
 @pytest.mark.parametrize("bad", [(math.nan, 1.0), (1.0, math.inf), (-1.0, 1.0), (1.0, -0.1)])
 def test_a_bad_observation_is_refused(bad: tuple[float, float]) -> None:
-    """NaN, infinite and negative values never enter a window."""
+    """NaN, infinite and negative values raise ValueError."""
     predictor = make(LEAST_SQUARES, 5)
     with pytest.raises(ValueError, match="finite and not negative"):
         predictor.learn(*bad)
@@ -148,9 +148,3 @@ def test_a_window_length_out_of_bounds_is_refused(length: int) -> None:
     """The message says what is allowed."""
     with pytest.raises(ConfigError, match="must be from 2 to"):
         Window(length)
-
-
-def test_an_unknown_predictor_names_the_known_ones() -> None:
-    """A misspelt predictor gets the list."""
-    with pytest.raises(ConfigError, match="least-squares"):
-        make("least-square", 5)

@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.integration, pytest.mark.timeout(90)]
 
 
 def test_a_robot_that_is_known_is_served(keys: Keys, serve: Serve, robot: Robot) -> None:
-    """With keys on both sides tasks run in the cloud, and nobody can read their arguments on the way."""
+    """With keys on both sides tasks run in the cloud, and no argument crosses the network in plain text."""
     folder = keys.add("arm")
     served = serve(keys)
     with recorded(served.port) as way:
@@ -42,7 +42,7 @@ def test_a_robot_without_keys_is_not_served(keys: Keys, serve: Serve, robot: Rob
 
 
 def test_a_robot_that_is_not_known_is_refused(keys: Keys, serve: Serve, robot: Robot) -> None:
-    """Both sides log the refusal and the server counts it. Once the server has its key, the robot is served."""
+    """Both sides say why, and the server counts it. Once its key is added, the robot is served."""
     served = serve(keys)
     offload = robot(served.endpoint, keys.make("stranger"))
     until(lambda: UNKNOWN_ROBOT in why_not(offload))
