@@ -63,14 +63,14 @@ def _demo(argv: Sequence[str]) -> int:
     parser = CommandParser(prog="loadgen demo", description=_demo.__doc__)
     add_flags(parser, DemoConfig, ENVIRONMENT)
     config = resolve(DemoConfig, parser.parse_args(argv), environ=os.environ, prefix=ENVIRONMENT)
-    from offboard.loadgen.play.play import play_demo
+    from offboard.loadgen.play.play_scenario import play_demo
 
     return play_demo(config.out)
 
 
 def _run(argv: Sequence[str]) -> int:
     """play a scenario: its trace, the truth about its link, its events and the verdict of its checks"""
-    from offboard.loadgen.scenario.scenario import find_scenario, read_scenario, shipped
+    from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario, shipped
 
     parser = CommandParser(prog="loadgen run", description=_run.__doc__)
     help = f"TOML file, or a shipped one: {', '.join(shipped())}"
@@ -78,7 +78,7 @@ def _run(argv: Sequence[str]) -> int:
     add_flags(parser, RunConfig, ENVIRONMENT)
     flags = parser.parse_args(argv)
     config = resolve(RunConfig, flags, environ=os.environ, prefix=ENVIRONMENT)
-    from offboard.loadgen.play.play import play
+    from offboard.loadgen.play.play_scenario import play
 
     _find_modules_here()
     scenario = read_scenario(find_scenario(flags.scenario)).changed(
@@ -96,8 +96,9 @@ def _run(argv: Sequence[str]) -> int:
 
 def _compare(argv: Sequence[str]) -> int:
     """play scenarios once per policy and seed, in turn, and compare the policies with intervals"""
-    from offboard.loadgen.compare.compare import CompareConfig, run_compare
-    from offboard.loadgen.scenario.scenario import shipped
+    from offboard.loadgen.compare.compare import run_compare
+    from offboard.loadgen.compare.compare_settings import CompareConfig
+    from offboard.loadgen.scenario.scenario_file import shipped
 
     parser = CommandParser(prog="loadgen compare", description=_compare.__doc__)
     help = f"TOML files, or shipped ones: {', '.join(shipped())}"
@@ -110,7 +111,8 @@ def _compare(argv: Sequence[str]) -> int:
 
 def _table(argv: Sequence[str]) -> int:
     """the paper's Table II, and what it left out, from a trace or CSV"""
-    from offboard.loadgen.table.table_two import TableConfig, run_table
+    from offboard.loadgen.table.table_settings import TableConfig
+    from offboard.loadgen.table.table_two import run_table
 
     return run_table(*_file_and_config("table", _table.__doc__, TableConfig, argv))
 
@@ -135,7 +137,7 @@ def _report(argv: Sequence[str]) -> int:
 
 def _dataset(argv: Sequence[str]) -> int:
     """measure a scenario's plans on both sites: NAME.csv, and how it was measured"""
-    from offboard.loadgen.play.dataset import DatasetConfig, run_dataset
+    from offboard.loadgen.play.measure_dataset import DatasetConfig, run_dataset
 
     parser = CommandParser(prog="loadgen dataset", description=_dataset.__doc__)
     parser.add_argument("scenario", metavar="SCENARIO", help="TOML file, or a shipped one: paper, congested")
@@ -147,7 +149,7 @@ def _dataset(argv: Sequence[str]) -> int:
 
 def _export(argv: Sequence[str]) -> int:
     """the tasks of a trace that ran on both sites, as a CSV dataset"""
-    from offboard.loadgen.play.dataset import ExportConfig, run_export
+    from offboard.loadgen.table.export_dataset import ExportConfig, run_export
 
     return run_export(*_file_and_config("export", _export.__doc__, ExportConfig, argv))
 

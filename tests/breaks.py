@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from offboard.common.tasks import Kind, kinds, load_modules
+from offboard.loadgen.scenario.event_timeline import Event
 from offboard.loadgen.scenario.scenario import Scenario
-from offboard.loadgen.scenario.timeline import Event
-from offboard.loadgen.testbed.processes import COMMANDS, LocalTestbed
+from offboard.loadgen.testbed.local_testbed import COMMANDS, LocalTestbed
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, Setup
 
 LEAK_BYTES = 300_000

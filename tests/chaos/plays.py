@@ -2,7 +2,7 @@
 
 import os
 
-from offboard.loadgen.scenario.scenario import find_scenario, read_scenario, shipped
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario, shipped
 
 ALL = os.environ.get("CHAOS") == "1"
 SCENARIOS = [name for name in shipped() if read_scenario(find_scenario(name)).checks]

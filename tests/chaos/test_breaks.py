@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from offboard.loadgen.play import play as player
-from offboard.loadgen.play.play import Played, play
-from offboard.loadgen.scenario.scenario import Scenario, find_scenario, read_scenario
+from offboard.loadgen.play import play_scenario as player
+from offboard.loadgen.play.play_scenario import Played, play
+from offboard.loadgen.scenario.scenario import Scenario
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.robot_client import policies
 from tests.breaks import BREAKS, bed_with
 from tests.chaos.plays import ALL, BROKEN, LEAK_TASKS, SCENARIOS, WRONG

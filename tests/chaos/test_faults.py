@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 
 from offboard.common.errors import OffloadError
-from offboard.loadgen.play import play as player
-from offboard.loadgen.play.play import Played, play
-from offboard.loadgen.play.player import EVENTS, TRACE
+from offboard.loadgen.play import play_scenario as player
+from offboard.loadgen.play.play_scenario import Played, play
+from offboard.loadgen.play.run_files import EVENTS, TRACE
+from offboard.loadgen.scenario.event_timeline import Event
 from offboard.loadgen.scenario.scenario import CloudPart, RobotPart, Scenario, Workload
-from offboard.loadgen.scenario.timeline import Event
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, Setup, Testbed
 from offboard.robot_client.records import trace
 from tests.chaos.plays import ALL, FAULT_TIMES, FEW_FAULTS

@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from offboard.loadgen.play import play as player
-from offboard.loadgen.play.play import play
-from offboard.loadgen.play.player import EVENTS, TRACE
-from offboard.loadgen.scenario.outcome import read_lines
-from offboard.loadgen.scenario.scenario import find_scenario, read_scenario
-from offboard.loadgen.scenario.timeline import Event
+from offboard.loadgen.play import play_scenario as player
+from offboard.loadgen.play.play_scenario import play
+from offboard.loadgen.play.run_files import EVENTS, TRACE
+from offboard.loadgen.scenario.event_timeline import Event
+from offboard.loadgen.scenario.outcome_files import read_lines
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.robot_client.records import trace
 from tests.chaos.plays import IN_CONTAINERS, ON_LOOPBACK, SOAK_TASKS
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from offboard.common.errors import ConfigError
-from offboard.loadgen.testbed.containers import OWNER, DockerTestbed
+from offboard.loadgen.testbed.docker_testbed import OWNER, DockerTestbed
 from offboard.loadgen.testbed.testbed import Setup
 from tests.compose.conftest import ROOT, docker, made_by_docker
 from tests.testbeds import CONTRACT, Bench, setups, start
@@ -29,7 +29,7 @@ HOST = """
 import signal, sys, time
 from datetime import datetime
 from pathlib import Path
-from offboard.loadgen.testbed.containers import DockerTestbed
+from offboard.loadgen.testbed.docker_testbed import DockerTestbed
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores Ctrl-C
 with DockerTestbed(Path(sys.argv[1])) as bed:
     bed.start("wan")

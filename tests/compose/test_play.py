@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from offboard.loadgen.table.rows import read
-from offboard.loadgen.testbed.containers import PREFIX
+from offboard.loadgen.table.measured_rows import read
+from offboard.loadgen.testbed.docker_testbed import PREFIX
 from tests.compose.conftest import ROOT, docker, made_by_docker
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600), pytest.mark.usefixtures("engine")]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from offboard.loadgen.table.rows import read
+from offboard.loadgen.table.measured_rows import read
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
 

@@ -14,8 +14,8 @@ import pytest
 
 from offboard.common.errors import ConfigError, OffloadError
 from offboard.loadgen.testbed.cpu_quota import SignalQuota
-from offboard.loadgen.testbed.part import Part
-from offboard.loadgen.testbed.processes import LocalTestbed
+from offboard.loadgen.testbed.local_testbed import LocalTestbed
+from offboard.loadgen.testbed.part_process import Part
 from offboard.loadgen.testbed.testbed import Setup
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
@@ -75,7 +75,7 @@ print(1e3 * min(trip() for _ in range(15)))
 HOST = """
 import signal, sys
 from pathlib import Path
-import offboard.loadgen.testbed.processes as processes
+import offboard.loadgen.testbed.local_testbed as processes
 from offboard.loadgen.testbed.cpu_quota import SignalQuota
 from offboard.loadgen.testbed.testbed import Setup
 from tests_commands import COMMANDS
@@ -266,7 +266,7 @@ def test_a_command_that_does_not_exist_says_so(tmp_path: Path) -> None:
 
 def test_a_part_that_ignores_sigterm_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A part and a worker of its own that ignore SIGTERM are gone after close."""
-    monkeypatch.setattr("offboard.loadgen.testbed.part.TERMINATE_S", 0.2)
+    monkeypatch.setattr("offboard.loadgen.testbed.part_process.TERMINATE_S", 0.2)
     code = (
         "import os, signal, time; signal.signal(15, signal.SIG_IGN); os.fork(); print('up'); time.sleep(99)"
     )

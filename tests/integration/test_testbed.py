@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from offboard.common.errors import ConfigError
-from offboard.loadgen.testbed.containers import DockerTestbed
-from offboard.loadgen.testbed.processes import HOG, LocalTestbed
+from offboard.loadgen.testbed.docker_testbed import DockerTestbed
+from offboard.loadgen.testbed.local_testbed import HOG, LocalTestbed
 from offboard.loadgen.testbed.testbed import Setup
 from tests.testbeds import CONTRACT, Bench, setups
 

@@ -5,9 +5,12 @@ from dataclasses import replace
 
 import pytest
 
-from offboard.loadgen.compare.compare import CompareConfig, table, turned
-from offboard.loadgen.scenario.check import Check
-from offboard.loadgen.scenario.outcome import FIGURES, Answered, Outcome, Reading, Reference
+from offboard.loadgen.compare.compare import rotated
+from offboard.loadgen.compare.compare_settings import CompareConfig
+from offboard.loadgen.compare.comparison_table import comparison_table
+from offboard.loadgen.scenario.outcome import Answered, Outcome, Reading, Reference
+from offboard.loadgen.scenario.outcome_figures import FIGURES
+from offboard.loadgen.scenario.pass_fail_check import Check
 from offboard.loadgen.scenario.scenario import Scenario, Workload
 
 
@@ -118,7 +121,7 @@ def test_a_verdict_says_by_how_much(run: Outcome, check: Check, said: str) -> No
 
 def test_each_policy_comes_first_equally_often() -> None:
     """Whatever the machine does besides meets all alike."""
-    assert [turned("abc", n) for n in range(4)] == [list("abc"), list("bca"), list("cab"), list("abc")]
+    assert [rotated("abc", n) for n in range(4)] == [list("abc"), list("bca"), list("cab"), list("abc")]
 
 
 @pytest.fixture
@@ -139,7 +142,9 @@ def test_a_comparison_pairs_the_same_tasks(outcome: Callable[[float], Outcome]) 
     """Twice the time on every task is a ratio of 2 with an interval of nothing; regret is as by hand."""
     config = CompareConfig(policies=("paper", "cloud"), seeds=2)
     runs = {"paper": [outcome(0.1)] * 2, "cloud": [outcome(0.2)] * 2}
-    compared = table(Scenario("small", 1, Workload(task="m:f", sizes=("constant:1",))), config, runs)
+    compared = comparison_table(
+        Scenario("small", 1, Workload(task="m:f", sizes=("constant:1",))), config, runs
+    )
     paper, *_, cloud, low, high = compared.lines
     assert (paper.policy, paper.tasks, paper.over_first) == ("paper", 80, 1.0)
     assert cloud.over_first == pytest.approx(2.0)
@@ -155,7 +160,7 @@ def test_a_lost_task_is_counted_and_not_paired(outcome: Callable[[float], Outcom
     config = CompareConfig(policies=("paper", "cloud"), seeds=1)
     whole, part = outcome(0.1), outcome(0.2)
     part = Outcome(part.asked, part.answered[5:], part.references, deadline_s=part.deadline_s)
-    compared = table(
+    compared = comparison_table(
         Scenario("small", 1, Workload(task="m:f", sizes=("constant:1",))),
         config,
         {"paper": [whole], "cloud": [part]},

@@ -9,10 +9,12 @@ import pytest
 
 from offboard.cloud_server.config import ServerConfig
 from offboard.common.config import load
-from offboard.loadgen.play.player import Files, Lines, make_room, setups
+from offboard.loadgen.play.part_setups import setups
+from offboard.loadgen.play.run_files import LineCounter, RobotFiles, clear_folder
 from offboard.loadgen.relay.link.link_settings import as_flags
 from offboard.loadgen.relay.wan import WanConfig
-from offboard.loadgen.scenario.scenario import Scenario, Workload, find_scenario, read_scenario, shipped
+from offboard.loadgen.scenario.scenario import Scenario, Workload
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario, shipped
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN
 from offboard.robot_client.records.trace import alone_path, reference_path
 from offboard.robot_client.simulated.config import RobotConfig
@@ -65,7 +67,7 @@ def test_robots_plan_as_the_scenario_says(tmp_path: Path) -> None:
 
 def test_robots_differ_and_the_first_has_plain_names(tmp_path: Path) -> None:
     """Each robot has files and a seed of its own."""
-    files = list(Files.of(scenario(robots=3), tmp_path))
+    files = list(RobotFiles.of(scenario(robots=3), tmp_path))
     assert [one.trace.name for one in files] == ["trace.jsonl", "trace-2.jsonl", "trace-3.jsonl"]
     assert [one.answers.name for one in files] == ["answers.jsonl", "answers-2.jsonl", "answers-3.jsonl"]
     assert files[0].seed == 7
@@ -75,11 +77,11 @@ def test_robots_differ_and_the_first_has_plain_names(tmp_path: Path) -> None:
 def test_nothing_of_an_earlier_run_is_left(tmp_path: Path) -> None:
     """All that a run writes goes, also what the next one will not write; what else is there stays."""
     out = tmp_path / "new" / "out"
-    make_room(out)
+    clear_folder(out)
     trace = out / "trace.jsonl"
     for path in (trace, alone_path(trace), reference_path(trace), out / "answers-2.jsonl", out / "table.md"):
         path.write_text("old")
-    make_room(out)
+    clear_folder(out)
     assert [path.name for path in out.iterdir()] == ["table.md"]
 
 
@@ -92,7 +94,7 @@ def test_fewer_tasks_mean_fewer_plans_alone(tasks: int | None, alone: int) -> No
 
 def test_lines_are_counted_as_they_come(tmp_path: Path) -> None:
     """Whole lines count, half a one when it is finished, and a file that is not there has none."""
-    lines = Lines(tmp_path / "a")
+    lines = LineCounter(tmp_path / "a")
     assert lines.count() == 0
     with (tmp_path / "a").open("w", buffering=1) as file:
         file.write("one\ntwo\nthr")

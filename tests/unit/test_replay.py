@@ -9,14 +9,14 @@ import pytest
 
 from offboard.common.errors import ConfigError, DataError
 from offboard.loadgen.table import table_two as evaluate
+from offboard.loadgen.table.measured_rows import read
 from offboard.loadgen.table.replay import ReplayConfig, replay, run_replay
-from offboard.loadgen.table.rows import read
-from offboard.loadgen.table.table_two import TableConfig
+from offboard.loadgen.table.table_settings import TableConfig
 from offboard.robot_client import policies
 from offboard.robot_client.policies import Decision, Forecast, Outlook, rules
 from offboard.robot_client.records.trace import Record, Trace
 from offboard.robot_client.sites.runner import Execution
-from tests.unit.test_evaluate import THOUSAND, TWELVE, csv_of
+from tests.table_loops import THOUSAND, TWELVE, csv_of
 
 Replayed = Callable[..., list[dict[str, Any]]]
 

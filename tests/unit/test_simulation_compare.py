@@ -9,7 +9,7 @@ import pytest
 
 from offboard.loadgen.__main__ import main
 from offboard.loadgen.compare.simulated_tables import summary_table
-from offboard.loadgen.table.render import FORMATS, Table, render
+from offboard.loadgen.table.table_formats import FORMATS, Table, render
 
 TABLES = (
     "compare",

@@ -1,0 +1,72 @@
+"""The committed datasets, and what docs/evaluation.md prints of them."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from offboard.loadgen.table.measured_rows import read
+from offboard.loadgen.table.predictor_evaluation import Evaluation
+from offboard.loadgen.table.table_settings import PAPER_WINDOWS, TableConfig
+from offboard.loadgen.table.table_two import table_text
+from tests.table_loops import expected_table, lines_of, replay, rows_of, section
+
+FOLDER = Path(__file__).parents[2] / "loadgen" / "datasets"
+NAMES = ("congested", "paper")
+
+
+def test_every_dataset_is_known_here() -> None:
+    """Each has its file of how it was measured."""
+    assert sorted(path.stem for path in FOLDER.glob("*.csv")) == list(NAMES)
+    assert sorted(path.stem for path in FOLDER.glob("*.json")) == list(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_dataset_holds_a_thousand_measured_rows(name: str) -> None:
+    """Its JSON says how many, from which commit and settings, and how the sites disturb each other."""
+    rows, about = read(FOLDER / f"{name}.csv"), json.loads((FOLDER / f"{name}.json").read_text())
+    assert len(rows) == about["rows"] == 1000
+    assert about["testbed"] == "docker"
+    assert "dirty" not in about["commit"]
+    assert about["scenario"]["name"] == name
+    assert about["disturbance"]["plans"] == 100
+
+
+@pytest.mark.parametrize("feedback", ["chosen", "full"])
+@pytest.mark.parametrize("name", NAMES)
+def test_least_squares_equal_plain_loops(name: str, feedback: str) -> None:
+    """On measured rows too every printed figure is that of an independent computation."""
+    text = (FOLDER / f"{name}.csv").read_text()
+    found = lines_of(table_text(FOLDER / f"{name}.csv", TableConfig(feedback=feedback)))
+    assert found == expected_table(rows_of(text), PAPER_WINDOWS, feedback)
+
+
+@pytest.mark.parametrize("feedback", ["chosen", "full"])
+@pytest.mark.parametrize("name", NAMES)
+def test_predictions_equal_plain_loops(name: str, feedback: str) -> None:
+    """Every single prediction, for short and long windows and the split, to 1e-9 s."""
+    lines, rows = rows_of((FOLDER / f"{name}.csv").read_text()), read(FOLDER / f"{name}.csv")
+    evaluation = Evaluation(rows, TableConfig())
+    for window in ("5", "50", "500", "full"):
+        found = evaluation.predictions("least-squares", window, feedback)
+        assert found is not None
+        length = 800 if window == "full" else int(window)
+        steps = replay(lines, length, length, "none" if window == "full" else feedback)
+        assert found.cloud_predicted_s == pytest.approx([step.p_cloud for step in steps], rel=0, abs=1e-9)
+        assert found.onboard_predicted_s == pytest.approx([step.p_onboard for step in steps], rel=0, abs=1e-9)
+
+
+@pytest.mark.parametrize("feedback", ["chosen", "full"])
+@pytest.mark.parametrize("name", NAMES)
+def test_the_page_prints_what_the_command_prints(name: str, feedback: str) -> None:
+    """Each figure of the page's tables is the one under the same heading of the command's."""
+    printed = table_text(FOLDER / f"{name}.csv", TableConfig(feedback=feedback)).splitlines()
+    headings, lines = cells(printed[-15]), [cells(line) for line in printed[-13:]]
+    page = section(f"{name}.csv, feedback {feedback}").strip().splitlines()
+    places = [headings.index(heading) for heading in cells(page[0])]
+    assert len(places) == 16
+    assert [cells(line) for line in page[2:]] == [[line[place] for place in places] for line in lines]
+
+
+def cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.strip("|").split("|")]
