@@ -1,4 +1,4 @@
-"""The judge of answers: it passes what is right, and says of everything else what is wrong with it."""
+"""Verifying the answers of a run: right answers pass, and for a wrong one it says what is wrong."""
 
 import re
 from dataclasses import replace
@@ -22,7 +22,7 @@ CALLS = Workload(task="offboard.loadgen.scenario.hash_tasks:hash_rounds", sizes=
 
 
 def answered_rightly(workload: Workload) -> list[Answered]:
-    """The tasks of the workload, each answered as it should be."""
+    """The tasks of the workload, each with its right answer."""
     work = make_work(workload.robot(SEED))
     found = []
     for i in range(workload.tasks):
@@ -33,8 +33,8 @@ def answered_rightly(workload: Workload) -> list[Answered]:
 
 
 @pytest.mark.parametrize("workload", [PLANS, CALLS], ids=["plans", "calls"])
-def test_right_answers_are_right_in_any_order(workload: Workload) -> None:
-    """Also where some are missing, as after a crash, and a task that failed has nothing to be wrong."""
+def test_right_answers_pass_in_any_order(workload: Workload) -> None:
+    """Answers may be missing, as after a crash, and a failed task has no answer to be wrong."""
     found = answered_rightly(workload)
     failed = replace(found[2], error="TaskFailed: no", answer=None)
     judged = verified([found[7], failed, found[0], found[5]], workload, SEED)
@@ -43,21 +43,21 @@ def test_right_answers_are_right_in_any_order(workload: Workload) -> None:
 
 @pytest.mark.parametrize("workload", [PLANS, CALLS], ids=["plans", "calls"])
 def test_the_answer_of_another_task_is_wrong(workload: Workload) -> None:
-    """An answer that went to the wrong task is found out."""
+    """An answer that belongs to another task is found to be wrong."""
     found = answered_rightly(workload)
     judged = verified([replace(found[3], answer=found[4].answer)], workload, SEED)
     assert judged[0].wrong is not None
 
 
-def test_what_cannot_be_made_again_is_left_as_it_is() -> None:
-    """A robot that drives its answers asks for tasks that only those tell."""
+def test_tasks_that_cannot_be_made_again_are_not_verified() -> None:
+    """If the next task depends on the previous answer, the tasks cannot be made again from the seed."""
     found = [replace(answered_rightly(PLANS)[0], answer={"status": "nonsense"})]
     assert verified(found, replace(PLANS, jump=False), SEED) == found
 
 
 @pytest.fixture
 def asked() -> tuple[Any, Any, dict[str, Any]]:
-    """A task with a path of some length, its plan, and the answer that is right."""
+    """A request with a path of more than ten cells, its plan, and its right answer."""
     work = make_work(PLANS.robot(SEED))
     while True:
         request = work.request()
@@ -74,22 +74,22 @@ def changed(plan: Any, cells: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda _plan, answer: answer | {"status": "NO_PATH"}, "status NO_PATH where NONE was expected"),
-        (lambda _plan, answer: answer | {"cost": answer["cost"] * 1.01}, "cost .* of a path that is .* long"),
-        (lambda plan, _answer: changed(plan, plan.cells[::-1]), "not from the robot to its goal"),
-        (lambda plan, _answer: changed(plan, plan.cells[:-1]), "not from the robot to its goal"),
-        (lambda plan, _answer: changed(plan, there_and_back(plan.cells)), "cost .* of a path that is"),
+        (lambda _plan, answer: answer | {"status": "NO_PATH"}, "status NO_PATH, but NONE was expected"),
+        (lambda _plan, answer: answer | {"cost": answer["cost"] * 1.01}, "cost .*, but the path is .* long"),
+        (lambda plan, _answer: changed(plan, plan.cells[::-1]), "does not join the robot and its goal"),
+        (lambda plan, _answer: changed(plan, plan.cells[:-1]), "does not join the robot and its goal"),
+        (lambda plan, _answer: changed(plan, there_and_back(plan.cells)), "cost .*, but the path is"),
         (
             lambda plan, answer: {
                 **changed(plan, there_and_back(plan.cells)),
                 "cost": answer["cost"] + 2 * float(np.linalg.norm(plan.cells[1] - plan.cells[0])),
             },
-            "where one of .* m was expected",
+            "m long, but .* m was expected",
         ),
     ],
 )
-def test_a_wrong_path_is_found_out(asked: Any, change: Any, said: str) -> None:
-    """Status, ends, cost and length: each is looked at."""
+def test_a_wrong_path_is_found(asked: Any, change: Any, said: str) -> None:
+    """A wrong status, start, end, cost or length is found and named."""
     request, plan, answer = asked
     assert wrong_plan(answer, plan, request) is None
     wrong = wrong_plan(change(plan, answer), plan, request)
@@ -98,12 +98,12 @@ def test_a_wrong_path_is_found_out(asked: Any, change: Any, said: str) -> None:
 
 
 def there_and_back(cells: Any) -> Any:
-    """The same path with one step taken twice too often."""
+    """The same path, with its first step taken there, back, and there again."""
     return np.concatenate([cells[:2], cells[:1], cells[1:]])
 
 
-def test_a_path_through_a_wall_is_found_out(asked: Any) -> None:
-    """Whoever walks straight through what the map or the scan holds occupied is named with the cell."""
+def test_a_path_through_a_wall_is_found(asked: Any) -> None:
+    """A path through an occupied cell is wrong, and the message names the cell."""
     request, plan, answer = asked
     grid = request[0]
     blocked = grid.cells.copy()
@@ -111,4 +111,4 @@ def test_a_path_through_a_wall_is_found_out(asked: Any) -> None:
     blocked[tuple(middle)] = 100
     walled = (replace(grid, cells=blocked), *request[1:])
     wrong = wrong_plan(answer, plan, walled)
-    assert wrong == f"a path through {tuple(middle)}, where the robot does not fit"
+    assert wrong == f"the path crosses {tuple(middle)}, where the robot does not fit"

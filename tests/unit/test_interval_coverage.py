@@ -1,4 +1,4 @@
-"""Whether predictions' intervals held, by hand from records as a trace holds them."""
+"""Coverage and width of prediction intervals, computed by hand from trace records."""
 
 import numpy as np
 import pytest
@@ -29,20 +29,20 @@ def record(site: str, seconds: float, *, ok: bool = True, censored: bool = False
         (record("onboard", 0.3), [True]),
         (record("onboard", 0.4), [True]),
         (record("onboard", 0.05), [False]),
-        (record("cloud", 0.3), [False]),  # within onboard's: its own counts
-        (record("edge", 0.3), []),  # it had none
-        (record("cloud", 0.5, ok=False, censored=True), [False]),  # longer than the interval, at least
-        (record("cloud", 0.1, ok=False, censored=True), []),  # nobody knows
-        (record("cloud", 0.1, ok=False), []),  # a failure is no time
+        (record("cloud", 0.3), [False]),  # within the interval of onboard, but its own counts
+        (record("edge", 0.3), []),  # the site had no interval
+        (record("cloud", 0.5, ok=False, censored=True), [False]),  # certainly longer than the interval
+        (record("cloud", 0.1, ok=False, censored=True), []),  # its true time is unknown
+        (record("cloud", 0.1, ok=False), []),  # a failed execution has no time
     ],
 )
-def test_an_execution_is_held_to_the_interval_of_its_site(run: dict, held: list[bool]) -> None:
-    """Both ends are within; what was given up after the upper end missed it."""
+def test_a_time_is_compared_with_the_interval_of_its_own_site(run: dict, held: list[bool]) -> None:
+    """Both ends belong to the interval; an execution given up after the upper end is a miss."""
     assert [one.held for one in intervals_of(run, {})] == held
 
 
-def test_a_late_answer_counts_with_its_true_time() -> None:
-    """A run that was overtaken is told by the record that its end was written in."""
+def test_a_late_execution_counts_with_its_true_time() -> None:
+    """An overtaken execution counts with the time that a later record reports for it."""
     overtaken = record("cloud", 0.01, ok=False, censored=True)
     late = [{"id": "a-1", "site": "cloud", "seconds": 0.09, "ok": True, "censored": False}]
     (found,) = intervals_of(overtaken, late_seconds([overtaken, record("onboard", 0.2, late=late)]))
@@ -54,8 +54,8 @@ def interval(width_s: float, held: bool, *, site: str = "cloud", error_s: float 
     return Interval(site, 2.0, width_s, error_s, held)
 
 
-def test_coverage_and_width_are_of_all_executions_of_the_picked_tasks() -> None:
-    """Three times held of four is 75 %; the median width is that of the middle two; nothing is undefined."""
+def test_coverage_and_width_are_over_all_executions_of_the_picked_tasks() -> None:
+    """Three of four times within the interval are 75 %; without executions the figures are undefined."""
     tasks = [
         (interval(2.0, True), interval(8.0, False)),
         (),
@@ -69,9 +69,12 @@ def test_coverage_and_width_are_of_all_executions_of_the_picked_tasks() -> None:
     assert all(np.isnan(figure).all() for figure in nothing.values())
 
 
-def test_a_width_is_compared_with_the_constant_one_of_its_site_that_holds_as_many() -> None:
-    """By hand: of the cloud's errors -1, 0, 1, 5 s three were held, and 2 s are enough for three; onboard two
-    of 0, 4 s and one that was given up, for which it takes 4 s."""
+def test_a_width_is_compared_with_the_best_constant_width_of_its_site() -> None:
+    """The best constant interval is 2 s wide for the cloud and 4 s onboard.
+
+    Cloud: three of the errors -1, 0, 1 and 5 s were within the interval, and 2 s contain three of them.
+    Onboard: two of 0 s, 4 s and one that was given up were within it, and 4 s contain two of them.
+    """
     cloud = [(interval(3.0, held, error_s=error_s),) for error_s, held in ((-1, 1), (0, 1), (1, 1), (5, 0))]
     onboard = [
         (interval(8.0, held, site="onboard", error_s=error_s),)

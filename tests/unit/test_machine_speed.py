@@ -1,4 +1,4 @@
-"""The machine's speed is taken out of a comparison, and what a policy does is not."""
+"""A comparison removes differences in machine speed, but not differences between policies."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,7 +18,7 @@ CONFIG = CompareConfig(policies=("paper", "cloud"), seeds=SEEDS)
 
 
 def runs(slowness: Sequence[float], *, extra_s: float = 0.0, chosen: str = "cloud") -> list[Outcome]:
-    """Every task is so much work, on a machine that is so slow in each run, and waits for the link."""
+    """Runs of the same tasks on the same link; in each run the machine is `slowness` times slower."""
     work_s = np.random.default_rng(1).uniform(0.005, 0.025, (SEEDS, TASKS))
     found = []
     for seed, slow in enumerate(slowness):
@@ -44,7 +44,7 @@ def runs(slowness: Sequence[float], *, extra_s: float = 0.0, chosen: str = "clou
 
 
 def lines(first: list[Outcome], other: list[Outcome]) -> dict[str, Line]:
-    """Those of the second policy by their bound."""
+    """The lines of the second policy, by their bound."""
     of_both = comparison_table(
         read_scenario(find_scenario("calm")), CONFIG, {"paper": first, "cloud": other}
     ).lines
@@ -62,8 +62,8 @@ def slow(seed: int) -> Any:
 
 
 @pytest.mark.parametrize("seed", range(2, 8))
-def test_a_slower_machine_is_not_a_slower_policy(seed: int) -> None:
-    """Where only the machine differed the ratio at one speed is nearer to 1 than the plain one."""
+def test_a_slower_machine_does_not_make_the_policy_look_slower(seed: int) -> None:
+    """If only the machine differed, the corrected ratio is nearer to 1 and its interval is narrower."""
     found = lines(runs(slow(1)), runs(1.15 * slow(seed)))
     ratio, alone = of(found[""], "over_first"), of(found[""], "at_one_speed")
     assert of(found[""], "server_over_first") > 1.03
@@ -73,15 +73,16 @@ def test_a_slower_machine_is_not_a_slower_policy(seed: int) -> None:
     assert width["at_one_speed"] < width["over_first"]
 
 
-def test_a_slower_policy_stays_one() -> None:
-    """What is added to each task is in the ratio, whatever the machine did."""
+def test_a_slower_policy_still_looks_slower() -> None:
+    """Time that the policy adds to each task stays in the corrected ratio, whatever the machine did."""
     plain = lines(runs(slow(1)), runs(slow(1), extra_s=0.0045))[""]
     assert plain.at_one_speed == pytest.approx(1.1, abs=0.02)
     found = lines(runs(slow(1)), runs(1.2 * slow(2), extra_s=0.0045))[""]
     assert found.at_one_speed == pytest.approx(1.1, abs=0.02)
 
 
-def test_without_a_task_that_both_sent_there_nothing_is_known_of_the_speed() -> None:
+def test_without_common_cloud_tasks_the_machine_speed_is_unknown() -> None:
+    """If no task ran in the cloud under both policies, there is a plain ratio but no corrected one."""
     found = lines(runs(slow(1)), runs(slow(2), chosen="onboard"))[""]
     assert found.over_first is not None
     assert (found.server_over_first, found.at_one_speed) == (None, None)

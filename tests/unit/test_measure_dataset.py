@@ -1,4 +1,4 @@
-"""Datasets: what is written beside the rows, what is read back, and what the containers are told."""
+"""Datasets: exporting rows, their notes, and what measuring in containers needs."""
 
 import json
 from pathlib import Path
@@ -23,8 +23,8 @@ ROOT = Path(__file__).parents[2]
 CSV = "size,onboard_s,cloud_s\n1,0.1,0.2\n2,0.2,0.1\n3,0.3,0.1\n"
 
 
-def test_export_writes_what_read_reads(tmp_path: Path) -> None:
-    """The rows come back to the last digit; a task without both times is left out."""
+def test_exported_rows_are_read_back_exactly(tmp_path: Path) -> None:
+    """Exported rows keep their last digit, and a task without both times is left out."""
     trace = Trace(tmp_path / "trace.jsonl")
     for i in range(5):
         sites = {"onboard": 0.1 + i / 3, "cloud": 0.2 + i / 7} if i != 2 else {"onboard": 0.1}
@@ -41,8 +41,8 @@ def test_export_writes_what_read_reads(tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(written, name), getattr(known, name))
 
 
-def test_export_that_cannot_write_leaves_the_old_file(tmp_path: Path) -> None:
-    """One line names the file; nothing is half written."""
+def test_a_failed_export_leaves_no_file(tmp_path: Path) -> None:
+    """If the file cannot be written, the error names it and no partial file is left."""
     (tmp_path / "d.csv").write_text(CSV)
     (tmp_path / "folder.csv").mkdir()
     with pytest.raises(ConfigError, match=r"folder\.csv: cannot be written: Is a directory"):
@@ -51,7 +51,7 @@ def test_export_that_cannot_write_leaves_the_old_file(tmp_path: Path) -> None:
 
 
 def test_notes_are_printed_with_the_table(tmp_path: Path) -> None:
-    """What NAME.json says of the measurement stands under the caption of every table of NAME.csv."""
+    """The notes in NAME.json are printed below the caption of every table of NAME.csv."""
     (tmp_path / "d.csv").write_text(CSV)
     (tmp_path / "d.json").write_text(json.dumps({"notes": ["Robot 0.2 CPU.", "Ratio 1.02."]}))
     lines = table_text(tmp_path / "d.csv", TableConfig(windows=("2",))).splitlines()
@@ -65,15 +65,15 @@ def test_notes_are_printed_with_the_table(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("{", r"d\.json: holds no notes: Expecting property name"),
-        ("[]", r"d\.json: holds no notes: list indices"),
-        ("{}", r"d\.json: holds no notes: 'notes'"),
-        ('{"notes": "x"}', r"d\.json: notes: not a list of lines"),
-        ('{"notes": [1]}', r"d\.json: notes: not a list of lines"),
+        ("{", r"d\.json: no notes found: Expecting property name"),
+        ("[]", r"d\.json: no notes found: list indices"),
+        ("{}", r"d\.json: no notes found: 'notes'"),
+        ('{"notes": "x"}', r"d\.json: notes is not a list of lines"),
+        ('{"notes": [1]}', r"d\.json: notes is not a list of lines"),
     ],
 )
-def test_notes_of_somebody_else_are_named(tmp_path: Path, text: str, expected: str) -> None:
-    """A NAME.json that `loadgen dataset` did not write is one DataError."""
+def test_a_foreign_json_file_is_refused(tmp_path: Path, text: str, expected: str) -> None:
+    """A NAME.json that `loadgen dataset` did not write is an error that names the file."""
     (tmp_path / "d.json").write_text(text)
     with pytest.raises(DataError, match=expected):
         notes(tmp_path / "d.csv")
@@ -82,21 +82,21 @@ def test_notes_of_somebody_else_are_named(tmp_path: Path, text: str, expected: s
 @pytest.mark.parametrize(
     ("docker", "said"),
     [
-        (None, r"docker cannot be asked: .*No such file"),
+        (None, r"docker cannot be run: .*No such file"),
         (
             "echo Cannot connect >&2; exit 1",
-            r"docker does not answer to `docker compose version`: Cannot connect",
+            r"docker: `docker compose version` failed: Cannot connect",
         ),
         (
             'test "$2" = version || exit 0; echo unknown command >&2; exit 125',
-            r"docker does not answer to `docker compose version`: unknown command",
+            r"docker: `docker compose version` failed: unknown command",
         ),
     ],
 )
 def test_containers_need_an_engine(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, docker: str | None, said: str
 ) -> None:
-    """No docker, no engine, no Compose: one line with what docker said, and nothing is written."""
+    """Without Docker, its engine or Compose the error quotes Docker's own message, and nothing is written."""
     if docker is not None:
         (tmp_path / "docker").write_text(f"#!/bin/sh\n{docker}\n")
         (tmp_path / "docker").chmod(0o755)
@@ -109,8 +109,8 @@ def test_containers_need_an_engine(
 
 
 def test_containers_need_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Elsewhere one line says what is missing, before anything is written."""
+    """Outside a checkout the error says so, and nothing is written."""
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigError, match=r"--testbed: docker needs docker-compose\.yml of a checkout"):
+    with pytest.raises(ConfigError, match=r"--testbed: docker: docker-compose\.yml not found; run this in a"):
         run_dataset("paper", DatasetConfig(), ["loadgen", "dataset", "paper"])
     assert not list(tmp_path.iterdir())

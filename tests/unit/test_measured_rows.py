@@ -1,4 +1,4 @@
-"""Reading rows with both times from traces and CSV datasets."""
+"""Reading measured rows from traces and CSV datasets."""
 
 import json
 import logging
@@ -33,10 +33,10 @@ def write_csv(path: Path, text: str) -> Path:
     return path
 
 
-def test_trace_gives_tasks_with_both_times_in_order(tmp_path: Path) -> None:
-    """Only tasks with an ok, uncensored execution on both sites count, in order; the rest are counted."""
+def test_a_trace_gives_its_tasks_with_both_times(tmp_path: Path) -> None:
+    """Tasks that both sites answered become rows, in order; the other tasks are counted as left out."""
     late = CloudTimeout("late")
-    again = Execution(ONBOARD, 0.5), Execution(ONBOARD, 0.9)  # the first good time of a site counts
+    again = Execution(ONBOARD, 0.5), Execution(ONBOARD, 0.9)  # the first successful time of a site counts
     path = write_trace(
         tmp_path / "trace.jsonl",
         record(1, Execution(ONBOARD, 0.3), Execution(CLOUD, 0.1), size=7.0),
@@ -53,16 +53,16 @@ def test_trace_gives_tasks_with_both_times_in_order(tmp_path: Path) -> None:
     assert found.left_out == 4
 
 
-def test_trace_of_chosen_sites_only_says_what_is_needed(tmp_path: Path) -> None:
-    """A trace without a task measured on both sites is one clear error naming --measure both."""
+def test_a_trace_without_a_measured_task_says_how_to_measure(tmp_path: Path) -> None:
+    """A trace without a task on both sites is an error that names --measure both."""
     chosen = (record(1, Execution(ONBOARD, 0.3)), record(2, Execution(CLOUD, 0.3)))
     path = write_trace(tmp_path / "t.jsonl", *chosen)
-    with pytest.raises(DataError, match=r"t\.jsonl: no task ran well on both sites.*--measure both"):
+    with pytest.raises(DataError, match=r"t\.jsonl: no task was answered by both sites.*--measure both"):
         rows.read(path)
 
 
-def test_torn_last_line_is_skipped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """A trace cut by power loss is read up to its last whole line, with a warning."""
+def test_a_torn_last_line_is_skipped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A trace that a power loss cut off is read up to its last whole line, with a warning."""
     path = write_trace(tmp_path / "t.jsonl", record(1, Execution(ONBOARD, 0.3), Execution(CLOUD, 0.1)))
     with path.open("a") as file:
         file.write('{"v": 1, "i"')
@@ -71,14 +71,14 @@ def test_torn_last_line_is_skipped(tmp_path: Path, caplog: pytest.LogCaptureFixt
     assert "torn last line" in caplog.text
 
 
-def test_trace_of_several_kinds_needs_one_chosen(tmp_path: Path) -> None:
-    """Kinds are not mixed in one window: the error names them, `kind` picks one."""
+def test_a_trace_with_several_kinds_needs_a_choice(tmp_path: Path) -> None:
+    """Kinds are not mixed in one window: the error names them, and `kind` selects one."""
     both = (Execution(ONBOARD, 0.3), Execution(CLOUD, 0.1))
     path = write_trace(tmp_path / "t.jsonl", record(1, *both), record(2, *both, kind="empty", size=0.0))
     with pytest.raises(DataError, match=r"several kinds: plan_path \(line 1\), empty \(line 2\); .*--kind"):
         rows.read(path)
     assert rows.read(path, "empty").size.tolist() == [0.0]
-    with pytest.raises(DataError, match="no walk ran well"):
+    with pytest.raises(DataError, match="no walk was answered by both sites"):
         rows.read(path, "walk")
 
 
@@ -88,7 +88,7 @@ def test_trace_of_several_kinds_needs_one_chosen(tmp_path: Path) -> None:
         ("size", "big", r"t\.jsonl:2: size: 'big' is not a finite number from 0"),
         ("size", 10**400, r"t\.jsonl:2: size: 1000.*\.\. is not"),
         ("size", float("nan"), r"t\.jsonl:2: size: nan is not"),
-        ("executions", 3, r"t\.jsonl:2: executions: .*each holds site, seconds, ok, censored"),
+        ("executions", 3, r"t\.jsonl:2: executions: .*each needs site, seconds, ok and censored"),
         ("executions", [{"site": "onboard", "ok": True}], r"t\.jsonl:2: executions: KeyError\('censored'\)"),
         (
             "executions",
@@ -102,10 +102,10 @@ def test_trace_of_several_kinds_needs_one_chosen(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_bad_trace_field_names_file_line_and_value(
+def test_a_wrong_value_in_a_trace_is_an_error_with_its_line(
     tmp_path: Path, field: str, value: object, expected: str
 ) -> None:
-    """A line of a trace whose values cannot be used is an error naming file, line, field and value."""
+    """The error names file, line, field and value."""
     good = as_dict(record(1, Execution(ONBOARD, 0.3), Execution(CLOUD, 0.1)))
     path = write_csv(
         tmp_path / "t.jsonl", json.dumps(good) + "\n" + json.dumps({**good, field: value}) + "\n"
@@ -115,7 +115,7 @@ def test_bad_trace_field_names_file_line_and_value(
 
 
 def test_csv_columns_are_found_by_name(tmp_path: Path) -> None:
-    """Order, further columns, blank lines, a byte order mark and Windows line ends do not matter."""
+    """The order of the columns, further columns, blank lines, a byte order mark and CRLF do not matter."""
     text = "\ufeffcloud_s,size,note,onboard_s\r\n0.5,3,far,0.25\r\n\r\n0,4,,1e-3\r\n"
     found = rows.read(write_csv(tmp_path / "d.CSV", text))
     assert (found.size.tolist(), found.onboard_s.tolist()) == ([3, 4], [0.25, 0.001])
@@ -126,35 +126,35 @@ def test_csv_columns_are_found_by_name(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("", r"d\.csv:1: no header; the first line must be size,onboard_s,cloud_s"),
-        ("\n1,2,3\n", r"d\.csv:1: no header"),
-        (HEADER, r"d\.csv: no rows below the header"),
+        ("", r"d\.csv:1: the header is missing; the first line must be size,onboard_s,cloud_s"),
+        ("\n1,2,3\n", r"d\.csv:1: the header is missing"),
+        (HEADER, r"d\.csv: there are no rows below the header"),
         (
             "size,onboard_s\n1,2\n",
             r"d\.csv:1: header 'size,onboard_s' has no column 'cloud_s'; it must be",
         ),
         ("1,2,3\n1,2,3\n", r"d\.csv:1: header '1,2,3' has no column 'size'"),
-        ("size,size,onboard_s,cloud_s\n", r"d\.csv:1: .* names 'size' twice"),
+        ("size,size,onboard_s,cloud_s\n", r"d\.csv:1: .* has the column 'size' twice"),
         (HEADER + "1,2,3\n1,fast,3\n", r"d\.csv:3: onboard_s: 'fast' is not a finite number from 0"),
         (HEADER + "1,2,\n", r"d\.csv:2: cloud_s: '' is not a finite"),
         (HEADER + "nan,2,3\n", r"d\.csv:2: size: 'nan' is not a finite"),
         (HEADER + "1,inf,3\n", r"d\.csv:2: onboard_s: 'inf' is not a finite"),
         (HEADER + "1,2,-3\n", r"d\.csv:2: cloud_s: '-3' is not a finite"),
         (HEADER + "1,2,1e16\n", r"d\.csv:2: cloud_s: '1e16' is not a finite number from 0 to 1e\+15"),
-        (HEADER + "1,2\n", r"d\.csv:2: 2 cells; the header names 3"),
-        (HEADER + "1,0,5,0,7\n", r"d\.csv:2: 5 cells; the header names 3"),
+        (HEADER + "1,2\n", r"d\.csv:2: 2 cells, but the header has 3"),
+        (HEADER + "1,0,5,0,7\n", r"d\.csv:2: 5 cells, but the header has 3"),
         (HEADER + "1," + "9" * 200_000 + ",3\n", r"d\.csv:2: field larger than field limit"),
     ],
 )
-def test_bad_csv_names_file_line_column_and_value(tmp_path: Path, text: str, expected: str) -> None:
-    """Every unusable CSV is one DataError that says where, what, and what is allowed."""
+def test_a_wrong_csv_is_an_error_with_its_line(tmp_path: Path, text: str, expected: str) -> None:
+    """The error has one line and names file, line, column, value, and what is allowed."""
     with pytest.raises(DataError, match=expected) as caught:
         rows.read(write_csv(tmp_path / "d.csv", text))
     assert "\n" not in str(caught.value)
 
 
-def test_csv_that_cannot_be_opened_or_decoded_is_named(tmp_path: Path) -> None:
-    """A missing file, a directory and a file that is not text are each one DataError."""
+def test_a_file_that_cannot_be_read_is_an_error(tmp_path: Path) -> None:
+    """A missing file, a folder, and a file that is not text are errors that name the file."""
     (tmp_path / "folder.csv").mkdir()
     (tmp_path / "image.csv").write_bytes(b"\xff\xd8\xff\xe0")
     for name, expected in (
@@ -168,14 +168,14 @@ def test_csv_that_cannot_be_opened_or_decoded_is_named(tmp_path: Path) -> None:
         rows.read(tmp_path / "none.jsonl")
 
 
-def test_kind_is_for_traces(tmp_path: Path) -> None:
-    """A kind given for a CSV, which holds none, is refused instead of ignored."""
-    with pytest.raises(ConfigError, match="--kind: 'plan_path' is for traces"):
+def test_a_kind_is_refused_for_a_csv(tmp_path: Path) -> None:
+    """A CSV has no kinds, so that --kind is an error and is not ignored."""
+    with pytest.raises(ConfigError, match="--kind: 'plan_path' works only with traces"):
         rows.read(write_csv(tmp_path / "d.csv", HEADER + "1,2,3\n"), "plan_path")
 
 
-def test_rows_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A file beyond the limit is refused, one at the limit is read."""
+def test_the_number_of_rows_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file at the limit is read, a longer one is refused."""
     path = write_csv(tmp_path / "d.csv", HEADER + "1,2,3\n" * 4)
     monkeypatch.setattr(rows, "ROWS_MAX", 4)
     assert len(rows.read(path)) == 4

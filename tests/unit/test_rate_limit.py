@@ -1,4 +1,4 @@
-"""What one robot may send in a second."""
+"""The rate limit of the server: how much one robot may send per second."""
 
 from offboard.cloud_server.rate_limit import (
     BUSY_A_S,
@@ -17,8 +17,8 @@ def verdicts(quota: Quota, robot: bytes, count: int, now_s: float, size: int = 1
     return [quota.judge(robot, size, now_s) for _ in range(count)]
 
 
-def test_small_messages_are_bounded_by_number() -> None:
-    """As many as the rate bears at 64 KiB each, then refusals, then what is not even read, then the end."""
+def test_small_messages_are_limited_by_number() -> None:
+    """Messages beyond the rate (64 KiB each) are refused; then the robot is cut off for a while."""
     quota = Quota(RATE, MESSAGE_BYTES)
     found = verdicts(quota, b"a", 1_000, 0.0)
     refused, excess = int(BUSY_A_S), int(EXCESS_S * 100)
@@ -30,42 +30,41 @@ def test_small_messages_are_bounded_by_number() -> None:
     assert verdicts(quota, b"a", 1, CUT_OFF_S) == [Verdict.TAKE]
 
 
-def test_twice_the_rate_is_dropped_but_not_cut_off() -> None:
-    """A robot that is a little too eager loses messages, not its connection."""
+def test_a_robot_at_twice_the_rate_is_not_cut_off() -> None:
+    """A robot that sends nearly twice as much as allowed loses messages, but not its connection."""
     quota = Quota(RATE, MESSAGE_BYTES)
     found = [quota.judge(b"a", 10, n / 192) for n in range(100_000)]
     assert Verdict.CUT_OFF not in found
     assert found.count(Verdict.REFUSE) > 40_000
 
 
-def test_the_rate_is_what_it_says() -> None:
-    """In ten seconds a robot that never stops has ten seconds' worth taken, and its burst."""
+def test_the_rate_is_kept_over_time() -> None:
+    """In ten seconds, a robot that never stops sending gets its burst and ten seconds of its rate."""
     quota = Quota(RATE, MESSAGE_BYTES)
     found = [quota.judge(b"a", 10, n / 128) for n in range(1_281)]
     assert found.count(Verdict.TAKE) == 1_100
 
 
-def test_a_message_of_the_largest_size_is_taken_at_any_rate() -> None:
-    """However low the rate, one of them may be sent at first, and again once it is paid for."""
+def test_a_message_of_the_largest_size_is_accepted_at_any_rate() -> None:
+    """Even at a low rate the largest message is accepted, and again after the time that it costs."""
     quota = Quota(1_000.0, 10**6)
     assert verdicts(quota, b"a", 1, 0.0, 10**6) == [Verdict.TAKE]
     assert verdicts(quota, b"a", 1, 999.0, 10**6) == [Verdict.REFUSE]
     assert verdicts(quota, b"a", 1, 1_000.0, 10**6) == [Verdict.TAKE]
 
 
-def test_what_is_refused_costs_nothing() -> None:
-    """A robot that asks on and on is served at its rate, not shut out."""
+def test_a_refused_message_does_not_use_up_the_rate() -> None:
+    """A robot that keeps sending too much is still served at its rate."""
     quota = Quota(RATE, MESSAGE_BYTES)
     verdicts(quota, b"a", 250, 0.0)
     assert verdicts(quota, b"a", 50, 0.5) == [Verdict.TAKE] * 50
 
 
-def test_robots_do_not_share_a_quota() -> None:
-    """One that has spent all leaves another as it was; the silent ones are forgotten beyond a number."""
+def test_every_robot_has_its_own_limit() -> None:
+    """A robot at its limit does not affect others; beyond ROBOTS_MAX robots the quietest are forgotten."""
     quota = Quota(RATE, MESSAGE_BYTES)
     verdicts(quota, b"a", 10_000, 0.0)
     assert verdicts(quota, b"b", 1, 0.0) == [Verdict.TAKE]
     for n in range(ROBOTS_MAX):
         quota.judge(n.to_bytes(4, "big"), 10, 0.0)
-    assert len(quota._robots) == ROBOTS_MAX
-    assert b"a" not in quota._robots
+    assert verdicts(quota, b"a", 1, 0.0) == [Verdict.TAKE], "forgotten, so it starts anew"

@@ -414,7 +414,7 @@ def test_what_is_no_run_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[s
     for name, said in (
         ("none", "none: neither a run's folder nor a trace or CSV file"),
         ("other", "other: no trace.jsonl in this folder; `loadgen run` and `loadgen demo` write one"),
-        ("empty", "no task ran well on both sites"),
+        ("empty", "no task was answered by both sites"),
     ):
         assert main(["report", str(tmp_path / name)]) == 2
         error = capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Scenario files: events, checks and chaos as data, and one line for whatever cannot be."""
+"""Scenario files: what is read from them, and that every mistake in one is an error of one line."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,7 +25,7 @@ robots = 2
 
 @pytest.fixture
 def read(tmp_path: Path) -> Callable[[str], Scenario]:
-    """Reads a scenario of the head above and what is given."""
+    """Reads a scenario file that consists of the head above and the given text."""
 
     def factory(text: str) -> Scenario:
         path = tmp_path / "small.toml"
@@ -35,8 +35,8 @@ def read(tmp_path: Path) -> Callable[[str], Scenario]:
     return factory
 
 
-def test_events_are_due_once_by_time_and_by_task(read: Callable[[str], Scenario]) -> None:
-    """Each comes when its second, or its task, has come, and those due together in the file's order."""
+def test_an_event_is_due_once_by_time_or_by_task(read: Callable[[str], Scenario]) -> None:
+    """An event is returned once, when it is due; events due together keep their order in the file."""
     events = read(
         '[[event]]\nat_s = 2\nkill = "cloud"\n[[event]]\nat_task = 3\nstart = "cloud"\n'
         "[[event]]\nat_s = 1.5\nlink = {delay_ms = 3}\n"
@@ -49,8 +49,8 @@ def test_events_are_due_once_by_time_and_by_task(read: Callable[[str], Scenario]
     assert not timeline.left()
 
 
-def test_a_part_that_is_started_by_an_event_is_not_there_before(read: Callable[[str], Scenario]) -> None:
-    """Its first event says so; one that is killed and started again was there."""
+def test_a_part_that_an_event_starts_is_absent_before(read: Callable[[str], Scenario]) -> None:
+    """A part is absent at first if its first event is a start, but not if it is killed before that."""
     events = read(
         '[[event]]\nat_task = 3\nstart = "robot-2"\n[[event]]\nat_task = 4\nkill = "cloud"\n'
         '[[event]]\nat_task = 5\nstart = "cloud"\n'
@@ -58,8 +58,8 @@ def test_a_part_that_is_started_by_an_event_is_not_there_before(read: Callable[[
     assert absent_at_first(events) == {"robot-2"}
 
 
-def test_chaos_is_drawn_from_the_seed() -> None:
-    """The same seed gives the same faults, another one others; each begins and ends within its time."""
+def test_random_faults_are_drawn_from_the_seed() -> None:
+    """The same seed gives the same faults, another seed other ones, and all lie within the run."""
     chaos = Chaos(every_s=10, last_s=2)
     assert chaos.events(3, 600, LINK) == chaos.events(3, 600, LINK)
     assert chaos.events(3, 600, LINK) != chaos.events(4, 600, LINK)
@@ -70,8 +70,8 @@ def test_chaos_is_drawn_from_the_seed() -> None:
     assert set(FAULTS) >= {"outage", "hang", "truncate", "reset"}
 
 
-def test_chaos_leaves_the_link_as_it_was() -> None:
-    """After each fault both directions have the conditions of the scenario again."""
+def test_random_faults_restore_the_link() -> None:
+    """After each fault, both directions of the link have the conditions of the scenario again."""
     link = LINK
     for event in Chaos(every_s=1, last_s=0.5).events(1, 400, LINK):
         if event.action == "link":
@@ -85,44 +85,46 @@ def test_chaos_leaves_the_link_as_it_was() -> None:
     ("text", "said"),
     [
         ('[[event]]\nat_s = 1\nklil = "cloud"\n', r":9: unknown event or key 'klil'; did you"),
-        ('[[event]]\nat_s = 1\nkill = "clod"\n', r":9: kill: 'clod' is not a part; cloud, wan,"),
+        ('[[event]]\nat_s = 1\nkill = "clod"\n', r":9: kill: 'clod' is not one of cloud, wan,"),
         ('[[event]]\nat_s = -1\nkill = "cloud"\n', r":8: at_s: -1 is not a number from 0 to 86400"),
-        ('[[event]]\nkill = "cloud"\n', r":7: either at_s or at_task is needed, none is given"),
-        ("[[event]]\nat_task = 1\n", r":7: an event without an action; one of link,"),
+        ('[[event]]\nkill = "cloud"\n', r":7: give either at_s or at_task, not none"),
+        ("[[event]]\nat_task = 1\n", r":7: an event without an action; give one of link,"),
         ("[[event]]\nat_task = 1.5\nreset = true\n", r":8: at_task: 1\.5 is not a whole number"),
         ("[[event]]\nat_task = 1\nreset = 1\n", r":9: reset: 1 is not true"),
         ("[[event]]\nat_task = 1\nlink = {delai_ms = 3}\n", r":9: link: .*delai_ms"),
         ("[[event]]\nat_task = 1\ncpus = {robot = 900}\n", r":9: cpus: 900 is not a number from 0\.05 to 64"),
-        ("[[event]]\nat_task = 1\nhogs = {wan = 1}\n", r":9: hogs: the relay is held to no quota"),
+        ("[[event]]\nat_task = 1\nhogs = {wan = 1}\n", r":9: hogs: the relay has no CPU quota"),
         ("event = 3\n", r"workload|unknown key 'event'"),
         ('[[check]]\nfigure = "lots"\nat_most = 1\n', r":8: .*unknown figure 'lots'; did you mean 'lost'\?"),
         ('[[check]]\nfigure = "lost"\nat_mots = 1\n', r":9: unknown key 'at_mots'; did you mean 'at_most'\?"),
-        ('[[check]]\nfigure = "lost"\n', r":8: .*at_most or at_least is needed"),
+        ('[[check]]\nfigure = "lost"\n', r":8: .*give either at_most or at_least"),
         ('[[check]]\nfigure = "regret_ms"\nat_most = 2\n', r":8: .*cannot be .* without workload\.reference"),
         ('[[check]]\nfigure = "late_percent"\nat_most = 2\n', r":8: .* without workload\.deadline"),
         ('[[check]]\nfigure = "lost"\nat_most = 0\nfrom_task = 50\n', r":8: .*task 50 is not among the 50"),
-        ("[chaos]\nevery_s = 3\n", r"chaos: faults by the second need arrivals that are not closed"),
+        ("[chaos]\nevery_s = 3\n", r"chaos: .*; workload\.arrivals must not be closed"),
         ("reference = -1\n", r"workload\.reference: -1 is below 0"),
         ('planner = "theta"\n', r"workload\.planner: 'theta' is not one of dijkstra, astar, jps"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_one_line(read: Callable[[str], Scenario], text: str, said: str) -> None:
-    """File, line or field, the value, and what is allowed."""
+def test_a_mistake_in_a_file_is_an_error_of_one_line(
+    read: Callable[[str], Scenario], text: str, said: str
+) -> None:
+    """The error names the file, the line or field, the value, and what is allowed."""
     with pytest.raises(DataError, match=said) as caught:
         read(text)
     assert "small.toml" in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_too_few_tasks_for_a_check_is_a_mistake(read: Callable[[str], Scenario]) -> None:
-    """A run that is shortened below what a check looks at could not tell."""
+def test_a_check_needs_its_tasks(read: Callable[[str], Scenario]) -> None:
+    """A run cannot be made shorter than the first task of a check."""
     scenario = read('[[check]]\nfigure = "lost"\nat_most = 0\nfrom_task = 40\n')
     with pytest.raises(ConfigError, match="task 40 is not among the 20 of the workload"):
         scenario.changed(tasks=20)
 
 
-def test_a_scenario_is_found_by_name_or_file() -> None:
-    """Its shipped name, or else one line with all names."""
+def test_a_scenario_is_found_by_name_or_path() -> None:
+    """A shipped scenario is found by its name; an unknown name is an error that lists all names."""
     assert find_scenario("calm").is_file()
     with pytest.raises(
         DataError, match=r"scenario 'clam' is neither a file nor one of bandwidth, burst, calm"
@@ -130,8 +132,8 @@ def test_a_scenario_is_found_by_name_or_file() -> None:
         find_scenario("clam")
 
 
-def test_robots_that_are_paused_only_make_load() -> None:
-    """A task that one of them was paused in took as long as the pause, whatever its policy."""
+def test_a_paused_robot_does_not_count_in_a_comparison() -> None:
+    """A robot that an event pauses is not compared: its task takes as long as the pause."""
     scenario = read_scenario(find_scenario("cloud-busy"))
     assert len(scenario.robots()) == 4
     assert scenario.compared() == ("robot",)

@@ -1,4 +1,4 @@
-"""The disturbance: which records make a plan, and the figures, worked out by hand."""
+"""The disturbance between the sites: which records form a plan, and the figures, worked out by hand."""
 
 import json
 import math
@@ -33,7 +33,7 @@ def record(size: float, *executions: Execution) -> Record:
 def plan(
     size: float, o: float = 0.2, c: float = 0.1, both_o: float = 0.2, both_c: float = 0.1
 ) -> list[Record]:
-    """The three records of one plan: seconds onboard and in the cloud, alone and then both at once."""
+    """The three records of one plan: onboard alone, in the cloud alone, on both sites at once."""
     return [
         record(size, onboard(o)),
         record(size, cloud(c)),
@@ -55,8 +55,8 @@ def measured(folder: Path, *records: Record) -> Disturbance:
     return found
 
 
-def test_the_figures_of_three_plans(tmp_path: Path) -> None:
-    """Medians of times and of ratios, worked out by hand; three ratios are too few for an interval."""
+def test_the_figures_of_three_plans_are_right(tmp_path: Path) -> None:
+    """Medians of times and ratios equal those by hand; three ratios are too few for an interval."""
     found = measured(
         tmp_path,
         record(1.0, onboard(0.10, 0.02), cloud(0.06, 0.045, 0.01)),
@@ -83,16 +83,16 @@ def test_the_figures_of_three_plans(tmp_path: Path) -> None:
 
 
 def near(pairs: int, alone_s: float, beside_s: float, ratio: float, *ends: float) -> Change:
-    """Equal but for rounding; without ends there is no interval."""
+    """A change with these figures, within rounding; without `ends` it has no interval."""
     figures = (pytest.approx(figure) for figure in (alone_s, beside_s, ratio))
     return Change(pairs, *figures, *((pytest.approx(end) for end in ends) if ends else (None, None)))
 
 
-def test_the_interval_of_eleven_plans(tmp_path: Path) -> None:
-    """Of eleven ratios the interval goes from the third least to the third most.
+def test_the_interval_of_eleven_plans_is_right(tmp_path: Path) -> None:
+    """Of eleven ratios, the interval goes from the third smallest to the third largest.
 
-    The median of a resample of eleven is one of the two least ratios with probability 0.7 % and one of the
-    three least with 5.1 % (binomial, at least 6 of 11): 2.5 % lies between.
+    The median of a resample of eleven is one of the two smallest ratios with probability 0.7 %, one of the
+    three smallest with probability 5.1 % (binomial, at least 6 of 11); 2.5 % lies between them.
     """
     ratios = [1.4, 1.1, 1.7, 1.2, 1.5, 1.3, 1.6, 2.1, 1.8, 2.0, 1.9]
     plans = [plan(n, o=0.5, both_o=0.5 * ratio) for n, ratio in enumerate(ratios)]
@@ -102,7 +102,7 @@ def test_the_interval_of_eleven_plans(tmp_path: Path) -> None:
 
 
 def test_the_same_seed_gives_the_same_interval(tmp_path: Path) -> None:
-    """The bootstrap draws by its seed alone, and another seed draws otherwise."""
+    """The interval depends on the seed: the same seed gives the same one, other seeds give others."""
     plans = [plan(n, both_c=0.1 + 0.001 * n * n) for n in range(40)]
     path = write(tmp_path, *(one for three in plans for one in three))
     assert measure(path, seed=3) == measure(path, seed=3)
@@ -110,7 +110,7 @@ def test_the_same_seed_gives_the_same_interval(tmp_path: Path) -> None:
 
 
 def test_one_plan_is_enough(tmp_path: Path) -> None:
-    """One pair has a ratio, and no interval."""
+    """A single pair has a ratio, but no interval."""
     found = measured(tmp_path, *plan(1.0, c=0.1, both_c=0.125))
     assert found.sites[CLOUD].seconds == near(1, 0.1, 0.125, 1.25)
     assert found.sites[CLOUD].cpu_share is None
@@ -129,20 +129,22 @@ def test_one_plan_is_enough(tmp_path: Path) -> None:
     ],
     ids=["torn off", "twice onboard", "fell back", "late beside", "other size", "other site", "late"],
 )
-def test_what_is_no_plan_is_skipped_and_counted(tmp_path: Path, between: list[Record], skipped: int) -> None:
-    """Anything but three neighbours of one size in three ways is left out; the plans around it are not."""
+def test_incomplete_plans_are_skipped_and_counted(
+    tmp_path: Path, between: list[Record], skipped: int
+) -> None:
+    """Only three neighbouring records of one size, run in the three ways, form a plan; others are skipped."""
     found = measured(tmp_path, *plan(1.0), *between, *plan(2.0), *between)
     assert (found.plans, found.skipped) == (2, 2 * skipped)
 
 
-def test_a_trace_without_a_whole_plan_gives_nothing(tmp_path: Path) -> None:
-    """Where the cloud was away all the time there is nothing to tell."""
+def test_a_trace_without_a_complete_plan_has_no_disturbance(tmp_path: Path) -> None:
+    """If the cloud never answered, there is no complete plan, and the result is None."""
     assert measure(write(tmp_path)) is None
     assert measure(write(tmp_path, *[record(1.0, onboard(0.2))] * 9)) is None
 
 
-def test_a_trace_from_before_cpu_time_is_read(tmp_path: Path) -> None:
-    """Executions without the field give times, and no share of CPU."""
+def test_a_trace_without_cpu_time_is_read(tmp_path: Path) -> None:
+    """Older traces lack cpu_s: they give times, but no share of CPU time."""
     lines = [as_dict(one) for one in plan(1.0)]
     for line in lines:
         for one in line["executions"]:
@@ -160,7 +162,7 @@ def test_a_trace_from_before_cpu_time_is_read(tmp_path: Path) -> None:
         ({"size": "big"}, "size: 'big' is not a number from 0 to 1e+15"),
         ({"size": True}, "size: True is not a number"),
         ({"executions": 3}, "executions: TypeError"),
-        ({"executions": [{"site": ONBOARD}]}, "executions: KeyError('ok'); each holds site, seconds, ok"),
+        ({"executions": [{"site": ONBOARD}]}, "executions: KeyError('ok'); each needs site, seconds, ok"),
         ({"seconds": None}, "seconds of onboard: None is not a number from 1e-09 to 1e+15"),
         ({"seconds": 0}, "seconds of onboard: 0 is not a number from 1e-09"),
         ({"seconds": math.nan}, "seconds of onboard: nan is not a number"),
@@ -170,8 +172,10 @@ def test_a_trace_from_before_cpu_time_is_read(tmp_path: Path) -> None:
         ({"site": []}, "executions: TypeError"),
     ],
 )
-def test_a_bad_line_names_file_and_line(tmp_path: Path, changed: dict[str, object], message: str) -> None:
-    """What cannot be computed with is an error that names file, line, field and value."""
+def test_a_wrong_value_is_an_error_with_its_line(
+    tmp_path: Path, changed: dict[str, object], message: str
+) -> None:
+    """The error names file, line, field and value."""
     good, bad = as_dict(plan(1.0)[0]), as_dict(plan(1.0)[0])
     for name, value in changed.items():
         (bad if name in bad else bad["executions"][0])[name] = value
@@ -182,14 +186,14 @@ def test_a_bad_line_names_file_and_line(tmp_path: Path, changed: dict[str, objec
     assert str(caught.value).startswith(f"{path}:2: {message}")
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    """No measurement was made: the error names the file."""
+def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
+    """If the file does not exist, the error names it."""
     with pytest.raises(DataError, match=r"trace\.alone\.jsonl: No such file"):
         measure(tmp_path / ALONE)
 
 
-def test_it_is_told_to_people_and_machines(tmp_path: Path) -> None:
-    """A line for each comparison, and the same figures as JSON."""
+def test_it_is_printed_as_text_and_as_json(tmp_path: Path) -> None:
+    """The text has one line for each figure, and JSON holds the same figures."""
     found = measured(
         tmp_path,
         record(1.0, onboard(0.2, 0.04)),
@@ -197,13 +201,13 @@ def test_it_is_told_to_people_and_machines(tmp_path: Path) -> None:
         record(1.0, onboard(0.25, 0.05), cloud(0.12, 0.06, 0.06)),
     )
     assert found.lines() == [
-        "Disturbance, from 1 plans, each run on each site alone and on both at once "
-        "(0 records of no whole plan):",
-        "onboard, beside cloud: 200.0 ms alone, 250.0 ms beside, ratio 1.250",
-        "onboard, CPU time alone: 20% of the time that the task ran",
-        "cloud, beside onboard: 100.0 ms alone, 120.0 ms beside, ratio 1.200",
-        "cloud, outside the server: 40.0 ms alone, 60.0 ms beside, ratio 1.500",
-        "cloud, CPU time alone: 100% of the time that the task ran",
+        "Disturbance between the sites, from 1 plans that ran on each site alone and on both "
+        "at once (0 records of incomplete plans were skipped):",
+        "onboard, total time: 200.0 ms alone, 250.0 ms with both sites running, ratio 1.250",
+        "onboard, alone: the task used the CPU for 20% of its run time",
+        "cloud, total time: 100.0 ms alone, 120.0 ms with both sites running, ratio 1.200",
+        "cloud, time outside the server: 40.0 ms alone, 60.0 ms with both sites running, ratio 1.500",
+        "cloud, alone: the task used the CPU for 100% of its run time",
     ]
     told = json.loads(json.dumps(found.as_dict()))
     assert (told["plans"], told["skipped"]) == (1, 0)
@@ -219,6 +223,6 @@ def test_it_is_told_to_people_and_machines(tmp_path: Path) -> None:
     assert told["sites"]["cloud"]["cpu_share"] == pytest.approx(1.0)
 
 
-def test_the_name_of_the_file_is_the_robots() -> None:
-    """The bench looks where the robot writes."""
+def test_the_robot_writes_the_file_that_is_read() -> None:
+    """The file name here is the one that the robot uses."""
     assert alone_path(Path("out") / TRACE) == Path("out") / ALONE

@@ -1,4 +1,4 @@
-"""The table in its four formats, each parsed back."""
+"""The four output formats of a table, each parsed back."""
 
 import csv
 import io
@@ -32,8 +32,8 @@ def cells(line: str) -> list[str]:
     return [cell.strip() for cell in line.strip("|").split("|")]
 
 
-def test_markdown_has_all_columns_in_every_line() -> None:
-    """Caption, notes, heading, rule and one line a score, each with the same number of columns."""
+def test_every_line_of_markdown_has_all_columns() -> None:
+    """Markdown has caption, notes, headings and one line for each score, all with the same columns."""
     caption, note, blank, *lines = render([TABLE], "md").splitlines()
     assert (caption, note, blank) == ("my_trace 50%.jsonl: 1000 rows, feedback chosen.", "- A note.", "")
     assert [len(cells(line)) for line in lines] == [COLUMNS] * 4
@@ -42,14 +42,14 @@ def test_markdown_has_all_columns_in_every_line() -> None:
     assert cells(lines[3]) == ["500: not enough rows", *["–"] * 9, "0", *["–"] * 10]  # noqa: RUF001
 
 
-def test_rounding_to_nothing_has_no_sign() -> None:
-    """A residual of -1e-9 is printed as 0.00000."""
+def test_a_value_rounded_to_zero_has_no_sign() -> None:
+    """A residual of -1e-9 is printed as 0.00000, not as -0.00000."""
     table = table_of(Score("least-squares", "5", cloud_residual_s=-1e-9))
     assert cells(render([table], "md").splitlines()[-1])[5] == "0.00000"
 
 
-def test_csv_parses_back_to_full_precision() -> None:
-    """Every score is a line that names its table; numbers keep all digits; undefined cells are empty."""
+def test_csv_has_full_precision() -> None:
+    """Every line names its table, numbers keep all digits, and undefined cells are empty."""
     first, second = csv.DictReader(io.StringIO(render([TABLE], "csv")))
     assert first["source"] == "my_trace 50%.jsonl"
     assert (first["rows"], first["left_out"]) == ("1000", "3")
@@ -60,16 +60,16 @@ def test_csv_parses_back_to_full_precision() -> None:
     assert (second["note"], second["r_cloud"]) == ("not enough rows", "")
 
 
-def test_json_parses_back_to_the_tables() -> None:
-    """JSON holds exactly the tables, with null for what is undefined."""
+def test_json_holds_the_whole_tables() -> None:
+    """JSON holds all fields of the tables, with null for undefined figures."""
     parsed = json.loads(render([TABLE, TABLE], "json"))
     expected = {**TABLE.about, "notes": ["A note."], "scores": [asdict(SCORE), asdict(NO_FIGURES)]}
     assert parsed == {"tables": [expected, expected]}
     assert parsed["tables"][0]["scores"][1]["r_cloud"] is None
 
 
-def test_latex_has_a_row_for_every_score_and_escapes_text() -> None:
-    """Every line of the tabular has all cells; special signs of the file name are escaped."""
+def test_latex_has_all_columns_and_escapes_text() -> None:
+    """Every line of the tabular has all cells, and special characters of the file name are escaped."""
     text = render([TABLE], "latex")
     assert r"\caption{my\_trace 50\%.jsonl: 1000 rows" in text
     heading, *lines = [
@@ -86,7 +86,7 @@ def test_latex_has_a_row_for_every_score_and_escapes_text() -> None:
 
 @pytest.mark.parametrize("format", FORMATS)
 def test_every_format_holds_every_table(format: str) -> None:
-    """Two tables in, two feedback modes named in the output."""
+    """The output for two tables names the feedback modes of both."""
     full = replace(TABLE, caption="t, feedback full.", about=dict(TABLE.about) | {"feedback": "full"})
     text = render([TABLE, full], format)
     assert "chosen" in text
