@@ -4,7 +4,7 @@ Only the runners differ from a live run: they answer at once, with the time that
 """
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +23,7 @@ from offboard.loadgen.table.table_two_figures import Scored, Sides
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Decision, Forecast, Policy
+from offboard.robot_client.predictors import Predictor
 from offboard.robot_client.predictors.window import WINDOW, WINDOW_MAX
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
 
@@ -119,17 +120,30 @@ def tables(path: Path, config: ReplayConfig) -> list[Table]:
 def replay(
     rows: Rows, policy: str, *, predictor: str | None, window: int, feedback: str, seed: int = 1
 ) -> Played:
+    """Replay the policy with this name; without a `predictor` it uses its own."""
+    name = policies.predictor_of(policy) if predictor is None else predictor
+    return replay_policy(
+        rows,
+        policies.make(policy, seed),
+        predictor=lambda: predictors.make(name, window, seed),
+        window=window,
+        feedback=feedback,
+    )
+
+
+def replay_policy(
+    rows: Rows, policy: Policy, *, predictor: Callable[[], Predictor], window: int, feedback: str
+) -> Played:
     """Let `policy` decide every row, in order; its decisions on the rows after the first `window`.
 
     The warm-up runs on both sites for every policy, so that all policies are scored on the same rows.
     """
-    chooser = _Chooser(policies.make(policy, seed), every=feedback == FULL)
-    name = policies.predictor_of(policy) if predictor is None else predictor
+    chooser = _Chooser(policy, every=feedback == FULL)
     to_cloud, both = np.zeros((2, len(rows)), dtype=bool)
     with Offloader(
         [_Replaying(ONBOARD, rows.onboard_s), _Replaying(CLOUD, rows.cloud_s)],
         policy=chooser,
-        predictor=lambda: predictors.make(name, window, seed),
+        predictor=predictor,
     ) as offload:
         for row, size in enumerate(rows.size.tolist()):
             offload(_replayed, size, row, where=BOTH if row < window else None)

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,10 @@ import pytest
 from offboard.common.errors import ConfigError, DataError
 from offboard.loadgen.table import table_two as evaluate
 from offboard.loadgen.table.measured_rows import read
-from offboard.loadgen.table.replay import ReplayConfig, replay, run_replay
+from offboard.loadgen.table.replay import ReplayConfig, replay_policy, run_replay
 from offboard.loadgen.table.table_settings import TableConfig
-from offboard.robot_client import policies
-from offboard.robot_client.policies import Decision, Forecast, Outlook, rules
+from offboard.robot_client import policies, predictors
+from offboard.robot_client.policies import Decision, Forecast, Outlook
 from offboard.robot_client.records.trace import Record, Trace
 from offboard.robot_client.sites.runner import Execution
 from tests.table_loops import THOUSAND, TWELVE, csv_of
@@ -76,19 +77,16 @@ def test_the_twelve_rows_equal_those_by_hand(tmp_path: Path, replayed: Replayed)
     assert [line["cloud_percent"] for line in lines[1:3]] == [0, 100]
 
 
-def test_a_task_on_both_sites_takes_as_long_as_the_first_answer(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_task_on_both_sites_takes_as_long_as_the_first_answer(tmp_path: Path) -> None:
     """A policy that runs every task on both sites gets the faster site's time, and the table shows it."""
 
     class Twice:
         def decide(self, forecast: Forecast) -> Decision:  # noqa: ARG002
             return Decision("onboard", True, "", "twice")
 
-    monkeypatch.setitem(policies._RULES, "twice", policies._Rule())
-    monkeypatch.setitem(rules.RULES, "twice", lambda _: Twice())
     rows = read(dataset(tmp_path, TWELVE))
-    played = replay(rows, "twice", predictor="least-squares", window=3, feedback="chosen")
+    predictor = partial(predictors.make, "least-squares", 3, 1)
+    played = replay_policy(rows, Twice(), predictor=predictor, window=3, feedback="chosen")
     assert played.both.all()
     assert played.to_cloud.tolist() == (rows.cloud_s < rows.onboard_s)[3:].tolist()
 
