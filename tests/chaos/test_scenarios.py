@@ -1,4 +1,4 @@
-"""Scenarios played for real: their checks are computed, and the same seed asks the same of the same link."""
+"""Scenarios played with real processes: their checks are computed, and a seed always gives the same run."""
 
 import json
 from dataclasses import replace
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.timeout(600)
 def test_a_scenario_is_played_and_judged(
     request: pytest.FixtureRequest, tmp_path: Path, testbed: str, name: str
 ) -> None:
-    """By the published rule: every check has a figure, nothing is lost and nothing wrong."""
+    """With the published rule, every check has a value, and no answer is lost or wrong."""
     if testbed == "docker":
         request.getfixturevalue("engine")
     scenario = read_scenario(find_scenario(name))
@@ -48,8 +48,8 @@ def test_a_scenario_is_played_and_judged(
 
 
 @pytest.mark.integration
-def test_one_seed_is_one_run(tmp_path: Path) -> None:
-    """Twice the same scenario and seed: the same tasks, sizes, events and draws of the link."""
+def test_the_same_seed_gives_the_same_run(tmp_path: Path) -> None:
+    """Two runs with the same seed have the same tasks, sizes, events, and random delays of the link."""
     scenario = read_scenario(find_scenario("lossy")).changed(tasks=24, policy="cloud")
     runs = []
     for name in ("a", "b"):
@@ -69,9 +69,9 @@ def test_one_seed_is_one_run(tmp_path: Path) -> None:
 
 
 def drawn(truth: Path) -> dict[Any, tuple[float, float]]:
-    """Jitter and stall of each segment, by connection, direction and number.
+    """The jitter and the stall of each segment, by connection, direction and number.
 
-    How many chunks a segment comes in is a matter of the moment; the first of them has its stall.
+    The number of chunks of a segment depends on the moment; its first chunk has the stall.
     """
     found: dict[Any, tuple[float, float]] = {}
     for line in read_lines(truth):
@@ -82,8 +82,8 @@ def drawn(truth: Path) -> dict[Any, tuple[float, float]]:
 
 
 @pytest.mark.integration
-def test_a_while_of_faults_costs_nothing(tmp_path: Path) -> None:
-    """The soak, shortened: twenty tasks a second and random faults; none lost, none wrong, nothing grows."""
+def test_random_faults_cost_no_task(tmp_path: Path) -> None:
+    """In a shortened soak, with twenty tasks per second and random faults, every check holds."""
     played = play(read_scenario(find_scenario("soak")).changed(tasks=SOAK_TASKS), tmp_path, quiet=True)
     played.check_robots()
     print(*played.verdicts, sep="\n")
@@ -91,8 +91,8 @@ def test_a_while_of_faults_costs_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.integration
-def test_an_event_in_vain_is_skipped_and_says_why(tmp_path: Path) -> None:
-    """What cannot happen to a part as it is does not end the run."""
+def test_an_impossible_event_is_skipped_with_a_reason(tmp_path: Path) -> None:
+    """An event that is impossible for the state of its part is skipped, and the run goes on."""
     events = (
         Event("start", "cloud", at_task=2),
         Event("resume", "cloud", at_task=4),

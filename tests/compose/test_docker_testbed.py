@@ -1,4 +1,4 @@
-"""The Docker testbed is held to the testbed contract of `tests.testbeds`; and nothing of it is left."""
+"""The Docker testbed keeps the testbed contract of `tests.testbeds`, and leaves nothing behind."""
 
 import contextlib
 import os
@@ -21,10 +21,10 @@ from tests.testbeds import CONTRACT, Bench, setups, start
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600), pytest.mark.usefixtures("engine")]
 
 END_S = 60.0
-HOG = "/tmp/hog-"  # stands in no other command
+HOG = "/tmp/hog-"  # only commands of hogs contain this
 READINGS = 10
 ROUNDS = 4
-# A testbed in a process of its own, until it is ended.
+# A testbed in its own process, until it is ended.
 HOST = """
 import signal, sys, time
 from datetime import datetime
@@ -39,15 +39,15 @@ with DockerTestbed(Path(sys.argv[1])) as bed:
 
 
 def cpu(bed: DockerTestbed, part: str) -> tuple[float, float]:
-    """When it was read, and the CPU seconds that the part had used by then."""
-    stats = bed._containers[part].stats(stream=False, one_shot=True)
-    read_at = datetime.fromisoformat(stats["read"])  # the engine takes its time to answer
+    """The time of the reading, and the CPU seconds that the part had used by then."""
+    stats = bed.container(part).stats(stream=False, one_shot=True)
+    read_at = datetime.fromisoformat(stats["read"])  # earlier than now: the engine answers slowly
     return read_at.timestamp(), stats["cpu_stats"]["cpu_usage"]["total_usage"] / 1e9
 
 
 @pytest.fixture(scope="module")
-def bench(engine: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:  # noqa: ARG001 - it skips
-    """Cloud and relay, started; robots that can be."""
+def bench(engine: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:  # noqa: ARG001
+    """A testbed with cloud and relay started, and robots that can be started."""
     out = tmp_path_factory.mktemp("docker")
     with contextlib.chdir(ROOT), DockerTestbed(out, setups(out)) as bed:
         bed.start()
@@ -63,7 +63,7 @@ def bench(engine: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Be
 
 @pytest.fixture
 def host(tmp_path: Path) -> Iterator[Callable[[], tuple[subprocess.Popen[str], str]]]:
-    """Factory: a process with a started testbed, and the testbed's run."""
+    """Factory: starts a process with a testbed; the process, and the run of its testbed."""
     with contextlib.ExitStack() as stack:
 
         def run_host() -> tuple[subprocess.Popen[str], str]:
@@ -82,17 +82,19 @@ def host(tmp_path: Path) -> Iterator[Callable[[], tuple[subprocess.Popen[str], s
 
 
 def name(bed: DockerTestbed, part: str) -> str:
-    return str(bed._containers[part].name)
+    return str(bed.container(part).name)
 
 
 @pytest.mark.parametrize("sentence", CONTRACT, ids=lambda sentence: sentence.__name__)
 def test_the_docker_testbed_keeps_the_contract(bench: Bench, sentence: Callable[[Bench], None]) -> None:
-    """Each sentence of the contract, in containers."""
+    """Each sentence of the contract holds with containers."""
     sentence(bench)
 
 
-def test_an_unknown_flag_is_the_parts_own_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A part that does not know a flag says so, as ConfigError; then nothing is left."""
+def test_an_unknown_flag_is_reported_in_the_words_of_the_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A part that does not know a flag ends, its message becomes a ConfigError, and nothing is left."""
     monkeypatch.chdir(ROOT)
     with (
         DockerTestbed(tmp_path, {"wan": Setup({"dely_ms": 1.0})}) as bed,
@@ -102,8 +104,8 @@ def test_an_unknown_flag_is_the_parts_own_line(tmp_path: Path, monkeypatch: pyte
     assert made_by_docker(bed.run) == []
 
 
-def test_a_robot_reaches_the_relay_and_nothing_else(bench: Bench) -> None:
-    """On the robots' network the cloud has no name, and there is no way out."""
+def test_a_robot_can_reach_only_the_relay(bench: Bench) -> None:
+    """On the network of the robots, the cloud has no name, and there is no way out."""
     bed = bench.bed
     assert isinstance(bed, DockerTestbed)
     try_all = (
@@ -119,8 +121,8 @@ def test_a_robot_reaches_the_relay_and_nothing_else(bench: Bench) -> None:
     assert docker("exec", name(bed, "robot-2"), "python3", "-c", try_all) == "wan 5555"
 
 
-def test_a_container_is_its_callers(bench: Bench) -> None:
-    """The parts run as whoever runs the testbed; quotas are over 10 ms, and none is of the other kind."""
+def test_a_container_runs_as_our_user_with_a_short_quota_period(bench: Bench) -> None:
+    """The parts run as the user of the testbed; quotas have a period of 10 ms, and none is set by `cpus`."""
     bed = bench.bed
     assert isinstance(bed, DockerTestbed)
     assert docker("exec", name(bed, "cloud"), "id", "-u") == str(os.getuid())
@@ -129,16 +131,14 @@ def test_a_container_is_its_callers(bench: Bench) -> None:
 
 
 @pytest.mark.usefixtures("engine")
-def test_a_reading_costs_a_part_less_than_whatever_is_executed_in_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Less than half of the CPU time of a program that does nothing: a held robot would wait for that."""
+def test_a_usage_reading_costs_less_than_docker_exec(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reading takes less than half of the CPU time of an empty `docker exec`."""
     monkeypatch.chdir(ROOT)
     read_s, executed_s = [], []
-    with DockerTestbed(tmp_path, setups(tmp_path)) as bed:  # a relay that nobody uses
+    with DockerTestbed(tmp_path, setups(tmp_path)) as bed:  # only a relay, without traffic
         bed.start("wan")
         bed.usage("wan")
-        for _ in range(ROUNDS):  # its own start adds to some of them
+        for _ in range(ROUNDS):  # the start of the relay adds to some of them
             _, began_s = cpu(bed, "wan")
             for _ in range(READINGS):
                 bed.usage("wan")
@@ -154,7 +154,7 @@ def test_a_reading_costs_a_part_less_than_whatever_is_executed_in_it(
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_testbed_leaves_nothing(host: Callable[..., tuple], stop: signal.Signals) -> None:
-    """Ctrl-C and SIGTERM, pressed twice: when the testbed has ended nothing of it is left."""
+    """After Ctrl-C or SIGTERM, even twice, no container or network is left once the testbed has ended."""
     process, run = host()
     process.send_signal(stop)
     process.send_signal(stop)
@@ -162,10 +162,10 @@ def test_an_interrupted_testbed_leaves_nothing(host: Callable[..., tuple], stop:
     assert made_by_docker(run) == []
 
 
-def test_a_killed_testbed_is_cleared_away_by_the_next(
+def test_the_next_testbed_removes_what_a_killed_one_left(
     host: Callable[..., tuple], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What a testbed left that was killed is gone once another starts; that of a living one stays."""
+    """The next testbed removes what a killed testbed left behind, but not what a running one uses."""
     killed, left = host()
     killed.kill()
     killed.wait(END_S)

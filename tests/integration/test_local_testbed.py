@@ -1,4 +1,4 @@
-"""The local testbed with small real processes: readiness, faults, and that nothing outlives it."""
+"""The local testbed with small real processes: readiness, faults, and that no process outlives it."""
 
 import contextlib
 import os
@@ -28,7 +28,7 @@ from offboard.loadgen.relay.wan import WanConfig, run_wan
 settings = dict(prog="wan", description="", environ={}, prefix="WAN")
 sys.exit(run_command("wan", lambda: run_wan(load(WanConfig, sys.argv[1:], **settings))))
 """
-# Answers 200 on its HTTP port, and sends back what comes on the other.
+# Answers 200 on its HTTP port, and echoes everything on its other port.
 CLOUD = """
 import argparse, http.server, socketserver, sys, threading
 flags = argparse.ArgumentParser()
@@ -57,7 +57,7 @@ echo = socketserver.ThreadingTCPServer(address(flags.listen), Echo)
 threading.Thread(target=echo.serve_forever, daemon=True).start()
 http.server.ThreadingHTTPServer(address(flags.http), Ready).serve_forever()
 """
-# Prints the shortest round trip to the cloud in ms, or computes for ever.
+# Prints the shortest round trip to the cloud in ms, or computes forever.
 ROBOT = """
 import socket, sys, time
 if "--busy" in sys.argv:
@@ -71,7 +71,7 @@ def trip():
     return time.perf_counter() - start
 print(1e3 * min(trip() for _ in range(15)))
 """
-# A testbed in a process of its own: two parts and a held, busy robot, until it is ended.
+# A testbed in its own process, with two parts and a busy robot with a quota, until it is ended.
 HOST = """
 import signal, sys
 from pathlib import Path
@@ -96,7 +96,7 @@ with processes.LocalTestbed(Path(sys.argv[1]), robot, commands=COMMANDS) as bed:
 
 @pytest.fixture
 def commands(tmp_path: Path) -> dict[str, list[str]]:
-    """How small parts are started; their command lines hold the test's own directory."""
+    """The commands of the small parts; their command lines contain the folder of the test."""
     scripts = {"cloud": CLOUD, "wan": WAN, "robot": ROBOT}
     for name, code in scripts.items():
         (tmp_path / f"{name}.py").write_text(code)
@@ -105,7 +105,7 @@ def commands(tmp_path: Path) -> dict[str, list[str]]:
 
 @pytest.fixture
 def host(tmp_path: Path, commands: dict[str, list[str]]) -> Iterator[Callable[..., subprocess.Popen[str]]]:
-    """Factory: a testbed process whose robot is held and busy."""
+    """Factory: starts a testbed process with a busy robot that has a quota."""
     (tmp_path / "tests_commands.py").write_text(f"COMMANDS = {commands!r}")
     (tmp_path / "host.py").write_text(HOST)
     with contextlib.ExitStack() as stack:
@@ -127,7 +127,7 @@ def host(tmp_path: Path, commands: dict[str, list[str]]) -> Iterator[Callable[..
 
 
 def processes(tmp_path: Path) -> list[str]:
-    """Command lines of live processes that belong to this test; zombies have none."""
+    """Command lines of the live processes of this test; zombies have none."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
@@ -145,19 +145,19 @@ def wait_until(fact: Callable[[], Any]) -> None:
 
 
 def bed(delay_ms: float) -> dict[str, Setup]:
-    """A robot behind a link with this delay."""
+    """The setups of a robot behind a link with this delay."""
     return {"wan": Setup({"delay_ms": delay_ms}), "robot": Setup()}
 
 
 def robot_ms(testbed: LocalTestbed) -> float:
-    """The shortest round trip a robot measures: what else the machine does only adds to it."""
+    """The shortest round trip that a robot measures; other load on the machine can only make it longer."""
     testbed.start("robot")
     assert testbed.wait("robot", WAIT_S) == 0
     return float(testbed.child("robot").tail())
 
 
 def test_the_three_parts_work_together(tmp_path: Path, commands: Any) -> None:
-    """Robot, relay and cloud: 10 ms each way make the robot's round trip 20 ms."""
+    """With 10 ms each way, the round trip of the robot through the relay is 20 ms."""
     with LocalTestbed(tmp_path / "out", bed(10), commands=commands) as testbed:
         testbed.start()
         assert robot_ms(testbed) == pytest.approx(21, abs=1.5)
@@ -171,7 +171,7 @@ def test_the_three_parts_work_together(tmp_path: Path, commands: Any) -> None:
 
 
 def test_set_link_changes_what_the_relay_does(tmp_path: Path, commands: Any) -> None:
-    """A changed delay shows in the robot's next round trips; a bad one is refused with its name."""
+    """A changed delay changes the next round trips; an unknown condition is refused by its name."""
     with LocalTestbed(tmp_path / "out", bed(0), commands=commands) as testbed:
         testbed.start()
         assert robot_ms(testbed) == pytest.approx(1, abs=1.5)
@@ -182,7 +182,7 @@ def test_set_link_changes_what_the_relay_does(tmp_path: Path, commands: Any) -> 
 
 
 def test_a_killed_cloud_can_be_started_again(tmp_path: Path, commands: Any) -> None:
-    """After SIGKILL the same part starts again on the same ports, behind the same relay."""
+    """After SIGKILL, the cloud starts again on the same ports, behind the same relay."""
     with LocalTestbed(tmp_path / "out", bed(0), commands=commands) as testbed:
         testbed.start()
         testbed.kill("cloud")
@@ -192,8 +192,8 @@ def test_a_killed_cloud_can_be_started_again(tmp_path: Path, commands: Any) -> N
         assert robot_ms(testbed) > 0
 
 
-def test_a_paused_part_hangs_until_resumed(tmp_path: Path, commands: Any) -> None:
-    """A robot in front of a paused relay waits; when it is resumed it ends well."""
+def test_a_paused_part_hangs_until_it_is_resumed(tmp_path: Path, commands: Any) -> None:
+    """A robot waits for a paused relay, and ends normally after the relay is resumed."""
     with LocalTestbed(tmp_path / "out", bed(0), commands=commands) as testbed:
         testbed.start()
         testbed.pause("wan")
@@ -204,8 +204,8 @@ def test_a_paused_part_hangs_until_resumed(tmp_path: Path, commands: Any) -> Non
         assert testbed.wait("robot", WAIT_S) == 0
 
 
-def test_the_robot_is_held_from_its_start(tmp_path: Path, commands: Any) -> None:
-    """Since its start a busy robot has no more than its share, and that where the machine is free."""
+def test_a_quota_holds_from_the_start(tmp_path: Path, commands: Any) -> None:
+    """A busy robot never gets more than its share, and gets all of it when the machine is free."""
     robot = {"robot": Setup({"busy": True}, cpus=0.25)}
     with LocalTestbed(tmp_path / "out", robot, commands=commands) as testbed:
         testbed.start("robot")
@@ -221,11 +221,11 @@ def test_the_robot_is_held_from_its_start(tmp_path: Path, commands: Any) -> None
             shares.append((now[1] - before[1]) / (now[0] - before[0]))
             before = now
         assert before[1] / (before[0] - start_s) < 0.25 * 1.15
-        assert max(shares) > 0.25 * 0.85, "what else the machine does only takes from it"
+        assert max(shares) > 0.25 * 0.85, "other load on the machine can only reduce the share"
 
 
-def test_a_part_that_dies_at_start_says_why(tmp_path: Path, commands: Any) -> None:
-    """A cloud that ends at start is an error at once, with its exit code and what it logged."""
+def test_a_part_that_ends_during_start_is_an_error(tmp_path: Path, commands: Any) -> None:
+    """The error comes at once, with the exit code and the end of the log."""
     cloud = {"cloud": Setup({"fail": "no such task module: planer"})}
     with LocalTestbed(tmp_path / "out", cloud, commands=commands) as testbed:
         with pytest.raises(OffloadError) as caught:
@@ -233,12 +233,13 @@ def test_a_part_that_dies_at_start_says_why(tmp_path: Path, commands: Any) -> No
         assert not testbed.running("wan")
     log = tmp_path / "out" / "logs" / "cloud.log"
     assert str(caught.value) == (
-        f"cloud ended at start, exit code 1; {log} ends with:\ncloud-server: no such task module: planer"
+        f"cloud ended during start with exit code 1; {log} ends with:\n"
+        "cloud-server: no such task module: planer"
     )
 
 
-def test_wrong_usage_of_a_part_is_wrong_usage(tmp_path: Path, commands: Any) -> None:
-    """A part's exit code 2 becomes ConfigError with the part's own line."""
+def test_a_wrong_flag_of_a_part_is_a_config_error(tmp_path: Path, commands: Any) -> None:
+    """Exit code 2 of a part becomes a ConfigError with the part's own message."""
     with (
         LocalTestbed(tmp_path / "out", bed(-1), commands=commands) as testbed,
         pytest.raises(ConfigError, match=r"^wan: --delay-ms: -1.0 is below 0, the least allowed$"),
@@ -247,16 +248,16 @@ def test_wrong_usage_of_a_part_is_wrong_usage(tmp_path: Path, commands: Any) -> 
 
 
 def test_a_part_that_is_never_ready_is_an_error(tmp_path: Path, commands: Any) -> None:
-    """A part that runs but does not become ready is given up after the bound."""
+    """A part that runs but does not become ready in time is an error."""
     with LocalTestbed(tmp_path / "out", ready_s=1.0) as testbed:
         http = "127.0.0.1:1"
-        with pytest.raises(OffloadError, match="robot was not ready within 1 s; it logged"):
+        with pytest.raises(OffloadError, match="robot was not ready within 1 s; its log ends with"):
             testbed.start_part(Part("robot", (*commands["robot"], "--busy"), http=http))
     assert processes(tmp_path) == []
 
 
-def test_a_command_that_does_not_exist_says_so(tmp_path: Path) -> None:
-    """A part whose program is missing is an error that names it."""
+def test_a_missing_command_is_an_error(tmp_path: Path) -> None:
+    """If the program of a part is missing, the error names it."""
     with (
         LocalTestbed(tmp_path / "out") as testbed,
         pytest.raises(OffloadError, match="cannot run no-such-program"),
@@ -265,7 +266,7 @@ def test_a_command_that_does_not_exist_says_so(tmp_path: Path) -> None:
 
 
 def test_a_part_that_ignores_sigterm_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A part and a worker of its own that ignore SIGTERM are gone after close."""
+    """A part and its worker that ignore SIGTERM are gone after the testbed is closed."""
     monkeypatch.setattr("offboard.loadgen.testbed.part_process.TERMINATE_S", 0.2)
     code = (
         "import os, signal, time; signal.signal(15, signal.SIG_IGN); os.fork(); print('up'); time.sleep(99)"
@@ -280,7 +281,7 @@ def test_a_part_that_ignores_sigterm_is_killed(tmp_path: Path, monkeypatch: pyte
 @pytest.mark.parametrize("robot", ["running", "paused"])
 @pytest.mark.parametrize("kind", ["any", SignalQuota.kind])
 def test_a_killed_testbed_leaves_no_process(tmp_path: Path, host: Any, kind: str, robot: str) -> None:
-    """kill -9 of the testbed: cloud, relay and the held robot, stopped or not, are gone too."""
+    """After kill -9 of the testbed, its parts are gone too, even a stopped one."""
     process = host(kind, robot)
     assert len(processes(tmp_path)) == 4
     process.kill()
@@ -291,7 +292,7 @@ def test_a_killed_testbed_leaves_no_process(tmp_path: Path, host: Any, kind: str
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("kind", ["any", SignalQuota.kind])
 def test_an_interrupted_testbed_leaves_no_process(tmp_path: Path, host: Any, kind: str, stop: int) -> None:
-    """Ctrl-C and SIGTERM: when the testbed has ended nothing of it is left, however often it was pressed."""
+    """After Ctrl-C or SIGTERM, even twice, no process is left once the testbed has ended."""
     process = host(kind)
     process.send_signal(stop)
     time.sleep(0.05)
