@@ -46,7 +46,7 @@ class Bench:
 
 
 def setups(out: Path) -> dict[str, Setup]:
-    """`robot` makes a few plans; `robot-2` asks the cloud without end, `robot-3` plans onboard without end."""
+    """`robot` makes a few plans; `robot-2` asks the cloud forever, `robot-3` plans onboard forever."""
     common = {"map": MAP, "resolution": 0.05, "window": 2, "timeout": 0.5, "connect": 20.0}
 
     def robot(name: str, **flags: Any) -> Setup:
