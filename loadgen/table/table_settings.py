@@ -54,7 +54,9 @@ class TableConfig(MeasuredTimesConfig):
         metavar="N,N,..",
     )
     predictors: tuple[str, ...] = setting(
-        (predictors.LEAST_SQUARES,), f"{predictors.HELP}; or {ALL}", metavar="NAME,NAME,.."
+        (predictors.LEAST_SQUARES,),
+        f"predictors to evaluate: {predictors.HELP}; or {ALL}",
+        metavar="NAME,NAME,..",
     )
     every_window: bool = setting(
         False,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from offboard.loadgen.play import play_scenario as player
+from offboard.loadgen.play import play_scenario
 from offboard.loadgen.play.play_scenario import Played, play
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
@@ -30,7 +30,7 @@ def broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Scenari
         if name in policies.names():
             return play(scenario.changed(policy=name), tmp_path, quiet=True)
         change, cloud = BREAKS[name]
-        monkeypatch.setitem(player.TESTBEDS, "local", bed_with(cloud))
+        monkeypatch.setitem(play_scenario.TESTBEDS, "local", bed_with(cloud))
         return play(change(scenario), tmp_path, quiet=True)
 
     return run

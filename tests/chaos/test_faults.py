@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from offboard.common.errors import OffloadError
-from offboard.loadgen.play import play_scenario as player
+from offboard.loadgen.play import play_scenario
 from offboard.loadgen.play.play_scenario import Played, play
 from offboard.loadgen.play.run_files import EVENTS, TRACE
 from offboard.loadgen.scenario.event_timeline import Event
@@ -113,7 +113,7 @@ def scenario(fault: Fault | None, times: int) -> Scenario:
 
 def check(played: Played) -> None:
     """Every task was answered exactly once, correctly, and in time."""
-    figures = player.figures(played.outcome, played.scenario)
+    figures = play_scenario.figures(played.outcome, played.scenario)
     assert (figures["lost"], figures["wrong"], figures["failed"]) == (0, 0, 0), [
         one.wrong or one.error for one in played.outcome.answered if one.wrong or one.error
     ]
@@ -154,14 +154,14 @@ def test_a_full_disk_costs_the_trace_and_no_task(
     testbed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """If the trace cannot be written, all tasks are answered, and the robot says so and exits with 1."""
-    make: Callable[[Path, Mapping[str, Setup]], Testbed] = player.TESTBEDS[testbed]
+    make: Callable[[Path, Mapping[str, Setup]], Testbed] = play_scenario.TESTBEDS[testbed]
 
     def full(out: Path, setups: Mapping[str, Setup]) -> Testbed:
         robot = setups[ROBOT]
         flags = {**robot.flags, "trace": FULL_DISK}
         return make(out, {**setups, ROBOT: replace(robot, flags=flags)})
 
-    monkeypatch.setitem(player.TESTBEDS, testbed, full)
+    monkeypatch.setitem(play_scenario.TESTBEDS, testbed, full)
     played = play(scenario(None, 1), tmp_path, testbed, quiet=True)
     check(played)
     with pytest.raises(OffloadError, match="robot ended with exit code 1"):

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from offboard.loadgen.play import play_scenario as player
+from offboard.loadgen.play import play_scenario
 from offboard.loadgen.play.play_scenario import play
 from offboard.loadgen.play.run_files import EVENTS, TRACE
 from offboard.loadgen.scenario.event_timeline import Event
@@ -38,12 +38,12 @@ def test_a_scenario_is_played_and_judged(
     print(*played.verdicts, sep="\n")
     assert len(played.verdicts) == len(scenario.checks)
     assert all(verdict.value is not None for verdict in played.verdicts)
-    figures = player.figures(played.outcome, scenario)
+    figures = play_scenario.figures(played.outcome, scenario)
     assert (figures["lost"], figures["wrong"]) == (0, 0)
     happened = read_lines(tmp_path / EVENTS)
     assert len(happened) == len(scenario.timeline())
     assert all(event["happened_s"] is not None for event in happened)
-    summary = json.loads((tmp_path / player.SUMMARY).read_text())
+    summary = json.loads((tmp_path / play_scenario.SUMMARY).read_text())
     assert [check["holds"] for check in summary["checks"]] == [one.holds for one in played.verdicts]
 
 
@@ -104,7 +104,7 @@ def test_an_impossible_event_is_skipped_with_a_reason(tmp_path: Path) -> None:
     )
     scenario = read_scenario(find_scenario("calm")).changed(tasks=30)
     played = play(replace(scenario, events=events, checks=()), tmp_path, quiet=True)
-    assert player.figures(played.outcome, scenario)["lost"] == 0
+    assert play_scenario.figures(played.outcome, scenario)["lost"] == 0
     happened = read_lines(tmp_path / EVENTS)
     assert [event.get("skipped") for event in happened] == [
         "cloud was running",

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from offboard.loadgen.testbed.docker_testbed import RUN
+from offboard.loadgen.testbed.docker_engine import RUN
 
 ROOT = Path(__file__).parents[2]
 PROJECT = "offboard-test"

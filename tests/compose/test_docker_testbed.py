@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from offboard.common.errors import ConfigError
-from offboard.loadgen.testbed.docker_testbed import OWNER, DockerTestbed
+from offboard.loadgen.testbed.docker_engine import OWNER
+from offboard.loadgen.testbed.docker_testbed import DockerTestbed
 from offboard.loadgen.testbed.testbed import Setup
 from tests.compose.conftest import ROOT, docker, made_by_docker
 from tests.testbeds import CONTRACT, Bench, setups, start

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from offboard.loadgen.table.measured_rows import read
-from offboard.loadgen.testbed.docker_testbed import PREFIX
+from offboard.loadgen.testbed.docker_engine import PREFIX
 from tests.compose.conftest import ROOT, docker, made_by_docker
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600), pytest.mark.usefixtures("engine")]

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from offboard.common.errors import ConfigError, DataError
-from offboard.loadgen.table import table_two as evaluate
+from offboard.loadgen.table import table_two
 from offboard.loadgen.table.measured_rows import read
 from offboard.loadgen.table.replay import ReplayConfig, replay_policy, run_replay
 from offboard.loadgen.table.table_settings import TableConfig
@@ -58,7 +58,7 @@ def test_paper_policy_equals_the_table(tmp_path: Path, replayed: Replayed, feedb
     """The robot's own code gives the same figures as line N of the table, in both feedback modes."""
     path = dataset(tmp_path, csv_of(THOUSAND))
     (paper, *_) = replayed(path, policies=("paper",), window=30, feedback=feedback)
-    (table,) = evaluate.tables(path, read(path), TableConfig(windows=("30",), feedback=feedback))
+    (table,) = table_two.tables(path, read(path), TableConfig(windows=("30",), feedback=feedback))
     line = table.lines[0]
     for name in ("scored", "accuracy_percent", "cloud_percent", "time_over_oracle", "regret_s"):
         assert paper[name] == getattr(line, name), name
