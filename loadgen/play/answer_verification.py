@@ -24,7 +24,7 @@ COST_SHARE = 1e-6  # largest relative difference of two sums of the same steps
 def verified(answered: Sequence[Answered], workload: Workload, seed: int) -> list[Answered]:
     """The same tasks with `wrong` filled in; unchanged if the tasks cannot be made again.
 
-    They cannot if the next task depends on the previous answer (a map without `jump`).
+    That is so if the next task depends on the previous answer (a map without `jump`).
     """
     if not workload.known()["jump"]:
         return list(answered)

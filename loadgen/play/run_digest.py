@@ -15,12 +15,13 @@ from typing import Any
 from offboard.common.planning.maps import read_map
 from offboard.loadgen.scenario.scenario import Scenario
 
+# The packages that the parts of a testbed load.
 PARTS = (
     "offboard.common",
     "offboard.robot_client",
     "offboard.cloud_server",
     "offboard.loadgen.relay",
-)  # the packages that the parts of a testbed load
+)
 
 
 def digests(scenario: Scenario) -> dict[str, str]:

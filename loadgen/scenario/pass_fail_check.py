@@ -83,7 +83,7 @@ def parse_checks(
 ) -> tuple[Check, ...]:
     """The checks in a scenario file; DataError names file and line.
 
-    `tasks` and `known` describe the workload: a check that it can never compute is an error too.
+    `tasks` and `known` describe the workload. A check that no run of it can compute is an error too.
     """
     given = table.get("check", [])
     if not isinstance(given, list) or not all(isinstance(one, dict) for one in given):

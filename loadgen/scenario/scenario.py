@@ -157,7 +157,7 @@ class Scenario:
     def compared(self) -> tuple[str, ...]:
         """The robots whose times count in a comparison: the first one, and every robot that is never paused.
 
-        A robot that an event pauses only makes load: a task that was caught by the pause takes as long as it.
+        A robot that an event pauses only makes load: a task during the pause takes as long as the pause.
         """
         paused = {event.value for event in self.timeline() if event.action == "pause"}
         return tuple(robot for robot in self.robots() if robot == ROBOT or robot not in paused)

@@ -5,7 +5,7 @@
 
 import os
 import signal
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -98,15 +98,6 @@ def quota(cpus: float) -> dict[str, int]:
     check_cpus(cpus)
     period_us = round(1e6 * max(CGROUP_PERIOD_S, CGROUP_QUOTA_S_MIN / cpus))
     return {"cpu_period": period_us, "cpu_quota": round(cpus * period_us)}
-
-
-def hog(number: int) -> Sequence[str]:
-    """A command that keeps a CPU busy until the command of `end_hog` with the same number is executed."""
-    return ("sh", "-c", ': > "$0"; while [ -e "$0" ]; do :; done', f"/tmp/hog-{number}")
-
-
-def end_hog(number: int) -> Sequence[str]:
-    return ("rm", "-f", f"/tmp/hog-{number}")
 
 
 def measured(output: bytes) -> Usage:

@@ -32,7 +32,7 @@ class UsageMeter:
     def read(self) -> Usage:
         """The usage now; OSError if the shell has ended or does not answer in time.
 
-        Then the meter is useless.
+        After that, the meter cannot be used again.
         """
         self._socket.sendall(b"\n")
         output = b""

@@ -114,7 +114,7 @@ class Engine:
                 Mount(str(place), str(folder), type="bind", read_only=place in wanted.read_only)
                 for folder, place in wanted.folders.items()
             ],
-            # After a cut, a part finds no name. No other name server shall be asked, and not for long.
+            # A part that is cut off finds no names. It must not ask other servers, and must give up soon.
             dns=["127.0.0.1"],
             dns_search=["."],
             dns_opt=["timeout:1", "attempts:1"],

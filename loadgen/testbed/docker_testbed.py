@@ -18,6 +18,7 @@ from offboard.common.errors import ConfigError, OffloadError
 from offboard.loadgen.relay.client import RelayClient, ask
 from offboard.loadgen.relay.link.link_settings import as_flags
 from offboard.loadgen.testbed import container_part as inside
+from offboard.loadgen.testbed.container_hogs import ContainerHogs
 from offboard.loadgen.testbed.container_output import Output
 from offboard.loadgen.testbed.container_part import FAR, NEAR, kind_of
 from offboard.loadgen.testbed.container_usage import UsageMeter
@@ -42,11 +43,9 @@ from offboard.loadgen.testbed.part_process import (
 from offboard.loadgen.testbed.testbed import CLOUD, PART, WAN, Setup, Usage
 
 CONTROL = "control"
-CACHE = Path(
-    ".cache/containers"
-)  # the compiled planner, shared by all containers and all runs of this checkout
+# The compiled planner, shared by all containers and all runs of this checkout.
+CACHE = Path(".cache/containers")
 READY_S = 120.0  # the first compilation of the planner takes most of it
-HOG_END_S = 10.0
 PAUSE_TRIES = 10
 
 
@@ -73,7 +72,7 @@ class DockerTestbed:
         self._networks: dict[str, Any] = {}
         self._containers: dict[str, Any] = {}
         self._outputs: dict[str, Output] = {}
-        self._hogs: dict[str, list[str]] = {}  # ids of the `docker exec` of each hog
+        self._hogs: dict[str, ContainerHogs] = {}
         self._meters: dict[str, UsageMeter] = {}
         self._relay: RelayClient | None = None
         self._terminate_before: Any = None
@@ -171,14 +170,7 @@ class DockerTestbed:
 
     @docker_errors()
     def set_hogs(self, part: str, count: int) -> None:
-        container, hogs = self._containers[part], self._hogs[part]
-        while len(hogs) > count:
-            self._end_hog(part, len(hogs))
-            hogs.pop()
-        while len(hogs) < count:
-            hog = self._engine.api.exec_create(container.id, inside.hog(len(hogs) + 1))
-            self._engine.api.exec_start(hog["Id"], detach=True)
-            hogs.append(hog["Id"])
+        self._hogs[part].set(count)
 
     def set_link(self, **changes: Any) -> dict[str, Any]:
         return self._link().set_link(changes)
@@ -255,7 +247,7 @@ class DockerTestbed:
             output = output_of(container)  # attached before the start, so that nothing is missed
             self._outputs[name] = Output(name, output, log, again=again)
             self._outputs[name].start()
-            self._hogs[name] = []  # earlier hogs ended with the part
+            self._hogs[name] = ContainerHogs(name, self._engine.api, container)
             self._close_meter(name)
             container.start()
             with contextlib.suppress(Refusal):  # the part has ended already
@@ -266,7 +258,7 @@ class DockerTestbed:
     def _create(self, name: str, setup: Setup) -> Any:
         """The container of a part, connected to all its networks.
 
-        The one that we control it by comes first.
+        The network through which we control the part comes first.
         """
         kind = kind_of(name)
         flags, folders = inside.as_seen(name, setup.flags, self.out)
@@ -296,7 +288,7 @@ class DockerTestbed:
     def _wait_ready(self, name: str) -> None:
         """Poll until the part answers 200.
 
-        An error with its last output if it ends before, or takes too long.
+        If it ends before, or takes too long, the error contains its last output.
         """
         kind, output = kind_of(name), self._outputs[name]
         end_s = time.monotonic() + self.ready_s
@@ -332,15 +324,6 @@ class DockerTestbed:
     def _link(self) -> RelayClient:
         assert self._relay is not None, f"{WAN} was not started"
         return self._relay
-
-    def _end_hog(self, part: str, number: int) -> None:
-        end_s = time.monotonic() + HOG_END_S
-        while self._engine.api.exec_inspect(self._hogs[part][number - 1])["Running"]:
-            if time.monotonic() > end_s:
-                raise OffloadError(f"{part}: hog {number} has not ended after {HOG_END_S:g} s")
-            self._containers[part].exec_run(
-                inside.end_hog(number)
-            )  # repeated, because the hog may only just have begun
 
     def _endpoint(self, network: str, part: str) -> dict[str, Any]:
         """The name and the address of a part on a network; the network itself has the first address."""

@@ -140,7 +140,7 @@ def launch(part: Part, log: Path, *, again: bool) -> Child:
 def wait_ready(child: Child, timeout_s: float) -> None:
     """Poll until the part answers 200.
 
-    An error with the end of its log if it ends before, or takes too long.
+    If it ends before, or takes too long, the error contains the end of its log.
     """
     part = child.part
     assert part.http is not None

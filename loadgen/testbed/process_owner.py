@@ -1,4 +1,4 @@
-"""Names the process that made something which can outlive it, and tells whether that process is gone."""
+"""Names a process, and says whether it is gone, so that what it left behind can be removed."""
 
 import socket
 from pathlib import Path

@@ -67,4 +67,6 @@ def test_every_robot_has_its_own_limit() -> None:
     assert verdicts(quota, b"b", 1, 0.0) == [Verdict.TAKE]
     for n in range(ROBOTS_MAX):
         quota.judge(n.to_bytes(4, "big"), 10, 0.0)
-    assert verdicts(quota, b"a", 1, 0.0) == [Verdict.TAKE], "forgotten, so it starts anew"
+    assert verdicts(quota, b"a", 1, 0.0) == [Verdict.TAKE], (
+        "the robot was forgotten, so its limit starts again"
+    )

@@ -92,7 +92,7 @@ def test_a_task_on_both_sites_takes_as_long_as_the_first_answer(tmp_path: Path) 
 
 
 def test_a_live_trace_gives_only_the_line_of_the_recorded_run(tmp_path: Path, replayed: Replayed) -> None:
-    """A live trace tells nothing about other policies or the oracle: their lines say why."""
+    """A live trace has no times for other policies and the oracle, and their lines say so."""
     times = [0.1, 0.2, 0.3, 0.4]
     path = trace_of(
         tmp_path,

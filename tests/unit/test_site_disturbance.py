@@ -127,7 +127,7 @@ def test_one_plan_is_enough(tmp_path: Path) -> None:
         ([*plan(5.0)[:2], record(5.0, onboard(0.2), Execution("edge", 0.1, network_s=0.0, run_s=0.1))], 3),
         ([record(5.0, LATE)], 1),
     ],
-    ids=["torn off", "twice onboard", "fell back", "late beside", "other size", "other site", "late"],
+    ids=["torn off", "twice onboard", "fell back", "late in the cloud", "other size", "other site", "late"],
 )
 def test_incomplete_plans_are_skipped_and_counted(
     tmp_path: Path, between: list[Record], skipped: int
@@ -209,9 +209,9 @@ def test_it_is_printed_as_text_and_as_json(tmp_path: Path) -> None:
         "cloud, time outside the server: 40.0 ms alone, 60.0 ms with both sites running, ratio 1.500",
         "cloud, alone: the task used the CPU for 100% of its run time",
     ]
-    told = json.loads(json.dumps(found.as_dict()))
-    assert (told["plans"], told["skipped"]) == (1, 0)
-    assert told["sites"]["onboard"]["seconds"] == {
+    found_json = json.loads(json.dumps(found.as_dict()))
+    assert (found_json["plans"], found_json["skipped"]) == (1, 0)
+    assert found_json["sites"]["onboard"]["seconds"] == {
         "pairs": 1,
         "alone_s": 0.2,
         "beside_s": 0.25,
@@ -219,8 +219,8 @@ def test_it_is_printed_as_text_and_as_json(tmp_path: Path) -> None:
         "ratio_low": None,
         "ratio_high": None,
     }
-    assert told["sites"]["onboard"]["network"] is None
-    assert told["sites"]["cloud"]["cpu_share"] == pytest.approx(1.0)
+    assert found_json["sites"]["onboard"]["network"] is None
+    assert found_json["sites"]["cloud"]["cpu_share"] == pytest.approx(1.0)
 
 
 def test_the_robot_writes_the_file_that_is_read() -> None:
