@@ -65,5 +65,5 @@ RUN chown -R offboard /src
 USER offboard
 ENTRYPOINT ["python3", "-m", "pytest", "-p", "no:cacheprovider"]
 # The learned predictors, the tables of docs/, A* and jump points, reports and simulations take minutes, and are tested outside.
-CMD ["--numprocesses=2", "tests/unit", "--ignore=tests/unit/test_learned.py", "--ignore=tests/unit/test_committed_datasets.py", \
+CMD ["--numprocesses=2", "tests/unit", "--ignore=tests/unit/test_learned.py", "--ignore=tests/unit/test_datasets.py", \
   "--ignore=tests/unit/test_accelerations.py", "--ignore=tests/unit/test_report.py", "--ignore-glob=*test_simulation*"]

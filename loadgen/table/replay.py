@@ -97,7 +97,7 @@ HEADINGS: dict[str, Heading] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Played:
+class Replayed:
     """What a policy did with the scored rows: whether the cloud answered first, whether both sites ran."""
 
     to_cloud: Sides
@@ -119,7 +119,7 @@ def tables(path: Path, config: ReplayConfig) -> list[Table]:
 
 def replay(
     rows: Rows, policy: str, *, predictor: str | None, window: int, feedback: str, seed: int = 1
-) -> Played:
+) -> Replayed:
     """Replay the policy with this name; without a `predictor` it uses its own."""
     name = policies.predictor_of(policy) if predictor is None else predictor
     return replay_policy(
@@ -133,7 +133,7 @@ def replay(
 
 def replay_policy(
     rows: Rows, policy: Policy, *, predictor: Callable[[], Predictor], window: int, feedback: str
-) -> Played:
+) -> Replayed:
     """Let `policy` decide every row, in order; its decisions on the rows after the first `window`.
 
     The warm-up runs on both sites for every policy, so that all policies are scored on the same rows.
@@ -150,7 +150,7 @@ def replay_policy(
             if row >= window:
                 to_cloud[row], both[row] = chooser.last.site == CLOUD, _ran_both(chooser.last)
     first = rows.cloud_s < rows.onboard_s
-    return Played(np.where(both, first, to_cloud)[window:], both[window:])
+    return Replayed(np.where(both, first, to_cloud)[window:], both[window:])
 
 
 def _ran_both(decision: Decision) -> bool:
@@ -244,7 +244,7 @@ def _lines(rows: Rows, policy: str, config: ReplayConfig, feedback: str) -> Iter
     scored = rows.since(config.window)
     if policy == ORACLE:
         first = scored.cloud_s < scored.onboard_s
-        played = Played(first, np.zeros_like(first))
+        played = Replayed(first, np.zeros_like(first))
     else:
         played = replay(
             rows,

@@ -38,7 +38,8 @@ class Quota:
 
     def __init__(self, pid: int) -> None:
         self.pid = pid
-        self._process = os.pidfd_open(pid)  # stays valid for this process even if its pid is used again
+        # A pidfd stays valid for this process, even if its pid is used again. None: closed.
+        self._process: int | None = os.pidfd_open(pid)
         atexit.register(self.close)
 
     def set(self, cpus: float) -> None:
@@ -58,10 +59,10 @@ class Quota:
 
     def close(self) -> None:
         """Let the process run without a quota. Safe to call twice, and after the end of the process."""
-        if self._process >= 0:
+        if self._process is not None:
             self._signal(signal.SIGCONT)
             os.close(self._process)
-            self._process = -1
+            self._process = None
             atexit.unregister(self.close)
 
     def __enter__(self) -> Self:
@@ -71,6 +72,8 @@ class Quota:
         self.close()
 
     def _signal(self, number: signal.Signals) -> None:
+        if self._process is None:
+            return
         with contextlib.suppress(ProcessLookupError):
             signal.pidfd_send_signal(self._process, number)
 
@@ -127,7 +130,7 @@ class CgroupQuota(Quota):
         (self._group / "cgroup.procs").write_text(str(pid))
 
     def close(self) -> None:
-        if self._process >= 0:
+        if self._process is not None:
             super().close()
             self._remove()
 
