@@ -98,13 +98,18 @@ def comparison_table(
     span = f", counted from task {config.from_task} on" if config.from_task else ""
     place = f"in {SIMULATION}" if config.simulate else f"on the {config.testbed} testbed"
     caption = (
-        f"Scenario {scenario.name} {place}: {config.seeds} runs of each policy"
-        f" with seeds {scenario.seed} to {scenario.seed + config.seeds - 1},"
+        f"Scenario {scenario.name} {place}: {_runs_and_seeds(scenario.seed, config.seeds)},"
         f" {scenario.workload.tasks} tasks for each robot{span}."
-        f" Below each policy are the bounds of its 95 % intervals, from blocks of neighbouring tasks."
+        " Below each policy are the bounds of its 95 % intervals, from blocks of neighbouring tasks."
     )
     about = {"scenario": scenario.name, "testbed": config.where, "seeds": config.seeds}
     return Table(caption=caption, about=about, headings=HEADINGS, lines=lines)
+
+
+def _runs_and_seeds(first: int, count: int) -> str:
+    if count == 1:
+        return f"1 run of each policy with seed {first}"
+    return f"{count} runs of each policy with seeds {first} to {first + count - 1}"
 
 
 def _lines(policy: str, runs: Sequence[Outcome], first: Sequence[Outcome]) -> list[Line]:

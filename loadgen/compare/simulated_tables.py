@@ -84,7 +84,8 @@ def _over_oracle(
 
 def _caption(config: CompareConfig) -> str:
     span = f" from task {config.from_task} on" if config.from_task else ""
+    seeds = "1 seed" if config.seeds == 1 else f"{config.seeds} seeds"
     return (
-        f"Simulation with {config.seeds} seeds: time of all tasks{span}, divided by their time on the faster"
-        " site of each (time / oracle); for each scenario, with the mean and the worst over all scenarios."
+        f"Time / oracle in simulation, {seeds}: time of all tasks{span}, divided by the time that the faster"
+        " site takes for each of them. Mean and worst are over the scenarios."
     )
