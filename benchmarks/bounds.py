@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from benchmarks.measure import Table
 from offboard.loadgen.scenario.outcome import Reference
-from offboard.loadgen.scenario.scenario import find_scenario, read_scenario
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.simulation.batch import Batch
 from offboard.robot_client import policies
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD

@@ -60,20 +60,20 @@ class DemoConfig:
 
 def _demo(argv: Sequence[str]) -> int:
     config = _config("demo", DemoConfig, argv)
-    from offboard.loadgen.play.play import play_demo
+    from offboard.loadgen.play.play_scenario import play_demo
 
     return play_demo(config.out)
 
 
 def _run(argv: Sequence[str]) -> int:
-    from offboard.loadgen.scenario.scenario import find_scenario, read_scenario, shipped
+    from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario, shipped
 
     parser = _parser("run", "SCENARIO")
     parser.add_argument("scenario", metavar="SCENARIO", help=f"TOML file, or one of {', '.join(shipped())}")
     add_flags(parser, RunConfig, PREFIX)
     flags = parser.parse_args(argv)
     config = resolve(RunConfig, flags, environ=os.environ, prefix=PREFIX)
-    from offboard.loadgen.play.play import play
+    from offboard.loadgen.play.play_scenario import play
 
     _find_modules_here()
     scenario = read_scenario(find_scenario(flags.scenario)).changed(
@@ -90,8 +90,9 @@ def _run(argv: Sequence[str]) -> int:
 
 
 def _compare(argv: Sequence[str]) -> int:
-    from offboard.loadgen.compare.compare import CompareConfig, run_compare
-    from offboard.loadgen.scenario.scenario import shipped
+    from offboard.loadgen.compare.compare import run_compare
+    from offboard.loadgen.compare.compare_settings import CompareConfig
+    from offboard.loadgen.scenario.scenario_file import shipped
 
     parser = _parser("compare", "SCENARIO ...")
     help = f"TOML files, or some of {', '.join(shipped())}"
@@ -103,7 +104,8 @@ def _compare(argv: Sequence[str]) -> int:
 
 
 def _table(argv: Sequence[str]) -> int:
-    from offboard.loadgen.table.table_two import TableConfig, run_table
+    from offboard.loadgen.table.table_settings import TableConfig
+    from offboard.loadgen.table.table_two import run_table
 
     return run_table(*_file_and_config("table", TableConfig, argv))
 
@@ -125,7 +127,7 @@ def _report(argv: Sequence[str]) -> int:
 
 
 def _dataset(argv: Sequence[str]) -> int:
-    from offboard.loadgen.play.dataset import DatasetConfig, run_dataset
+    from offboard.loadgen.play.measure_dataset import DatasetConfig, run_dataset
 
     parser = _parser("dataset", "SCENARIO")
     help = "TOML file, or a shipped scenario such as paper or congested"
@@ -137,7 +139,7 @@ def _dataset(argv: Sequence[str]) -> int:
 
 
 def _export(argv: Sequence[str]) -> int:
-    from offboard.loadgen.play.dataset import ExportConfig, run_export
+    from offboard.loadgen.table.export_dataset import ExportConfig, run_export
 
     return run_export(*_file_and_config("export", ExportConfig, argv))
 

@@ -1,6 +1,6 @@
-"""Broken parts, for checks that must not hold with them; each is named in a scenario's `fails_with`.
+"""Broken parts, with which the checks of a scenario must fail; `fails_with` of a check names one.
 
-As a program this is a planning server that answers wrongly, or keeps what it should let go.
+Run as a program, this is a planning server that gives wrong answers, or leaks memory and files.
 """
 
 import os
@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from offboard.common.tasks import Kind, kinds, load_modules
+from offboard.loadgen.scenario.event_timeline import Event
 from offboard.loadgen.scenario.scenario import Scenario
-from offboard.loadgen.scenario.timeline import Event
-from offboard.loadgen.testbed.processes import COMMANDS, LocalTestbed
+from offboard.loadgen.testbed.local_testbed import COMMANDS, LocalTestbed
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, Setup
 
 LEAK_BYTES = 300_000
@@ -22,7 +22,7 @@ _kept: list[Any] = []
 
 
 def dead_robot(scenario: Scenario) -> Scenario:
-    """The robot dies half way, and nobody starts it again."""
+    """The scenario with a robot that is killed half-way and not started again."""
     death = Event("kill", ROBOT, at_task=scenario.workload.tasks // 2)
     return replace(scenario, events=(*scenario.events, death))
 
@@ -32,7 +32,7 @@ def unchanged(scenario: Scenario) -> Scenario:
 
 
 def bed_with(cloud: str | None) -> Callable[[Path, Mapping[str, Setup]], LocalTestbed]:
-    """A local testbed with one of the servers below, or with the real one."""
+    """Makes local testbeds with one of the broken servers below, or with the real server."""
     commands = dict(COMMANDS)
     if cloud is not None:
         commands[CLOUD] = (sys.executable, "-m", "tests.breaks", cloud)
@@ -47,14 +47,14 @@ BREAKS: dict[str, tuple[Callable[[Scenario], Scenario], str | None]] = {
 
 
 def lie(answer: Any) -> Any:
-    """An answer of the right kind that is wrong."""
+    """A wrong answer of the right type."""
     if isinstance(answer, bytes):
         return answer[::-1]
     return replace(answer, cells=answer.cells[::-1].copy(), metres=answer.metres[::-1].copy())
 
 
 def leak(answer: Any) -> Any:
-    """The right answer, and memory and a file that stay."""
+    """The right answer; each call leaks memory and an open file."""
     _kept.append((bytearray(b"x" * LEAK_BYTES), os.open(os.devnull, os.O_RDONLY)))
     return answer
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from offboard.loadgen.testbed.processes import LocalTestbed
+from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.loadgen.testbed.testbed import Setup
 from offboard.robot_client.offloader import Offloader
 

@@ -1,6 +1,6 @@
-"""The testbed contract, one function a sentence; each kind of testbed is held to all of them.
+"""The testbed contract, one function for each sentence; every kind of testbed must keep all of them.
 
-Each takes a `Bench` whose testbed was made with `setups`; they share it, and leave cloud and relay running.
+They share one `Bench`, whose testbed was made with `setups`, and each leaves cloud and relay running.
 """
 
 import itertools
@@ -24,7 +24,7 @@ TASKS, MEASURE = 8, 4
 ENDLESS = 1_000_000
 DELAY_MS = 2.0
 TAIL_BYTES = 1 << 14
-WAIT_S = 30.0  # for what takes a second or less on a machine that has nothing else to do
+WAIT_S = 30.0  # for steps that take at most a second on an idle machine
 SETTLE_S = 1.0
 PLANS_S = 2.0
 SHARES, SHARE_S = 2, 0.8
@@ -34,9 +34,9 @@ CALM_CPUS = 0.3
 
 @dataclass(frozen=True)
 class Bench:
-    """A started testbed, and what only its kind can tell of a part.
+    """A started testbed, and what only its own kind can measure.
 
-    `cpu` is when it was looked at, and what it and its hogs had used till then, in seconds; `hogs` how many.
+    `cpu` gives the time of a reading, and the CPU seconds of a part and its hogs by then. `hogs` counts hogs.
     """
 
     bed: Testbed
@@ -46,7 +46,7 @@ class Bench:
 
 
 def setups(out: Path) -> dict[str, Setup]:
-    """`robot` makes a few plans; without end `robot-2` asks the cloud, and `robot-3` plans onboard."""
+    """`robot` makes a few plans; `robot-2` asks the cloud forever, `robot-3` plans onboard forever."""
     common = {"map": MAP, "resolution": 0.05, "window": 2, "timeout": 0.5, "connect": 20.0}
 
     def robot(name: str, **flags: Any) -> Setup:
@@ -62,7 +62,7 @@ def setups(out: Path) -> dict[str, Setup]:
 
 
 def the_parts_work_together(bench: Bench) -> None:
-    """A robot drives and ends well; its trace is here, ours, and whole."""
+    """A robot drives and exits with 0; its trace is complete and owned by our user."""
     before, records = drive(bench)
     assert len(records) == before + TASKS
     assert (bench.bed.out / "robot.jsonl").stat().st_uid == os.getuid()
@@ -71,7 +71,7 @@ def the_parts_work_together(bench: Bench) -> None:
 
 
 def a_part_that_has_ended_is_started_again(bench: Bench) -> None:
-    """A robot drives twice, and appends to its trace and to its log."""
+    """A robot that is started twice appends to its trace and to its log."""
     drive(bench)
     before, records = drive(bench)
     assert before >= TASKS
@@ -81,7 +81,7 @@ def a_part_that_has_ended_is_started_again(bench: Bench) -> None:
 
 
 def the_link_changes(bench: Bench) -> None:
-    """`set_link` answers and leaves the whole link; the robot's round trips take the new delay."""
+    """`set_link` returns the whole link, and the round trips of the robot take the new delay."""
     robot_asks_the_cloud(bench)
     changed = bench.bed.set_link(delay_ms=30.0)
     assert changed["up"]["delay_ms"] == changed["down"]["delay_ms"] == 30.0
@@ -92,7 +92,7 @@ def the_link_changes(bench: Bench) -> None:
 
 
 def a_killed_cloud_is_started_again(bench: Bench) -> None:
-    """SIGKILL is its exit code; the robot goes on without it, and uses it again once it is back."""
+    """The exit code is -SIGKILL; the robot plans onboard until the cloud is back, then uses it again."""
     robot_asks_the_cloud(bench)
     bench.bed.kill("cloud")
     assert bench.bed.exit_code("cloud") == -signal.SIGKILL
@@ -103,7 +103,7 @@ def a_killed_cloud_is_started_again(bench: Bench) -> None:
 
 
 def a_stopped_part_says_its_exit_code(bench: Bench) -> None:
-    """A cloud that is asked to end drains and ends with 0, a robot with that of an interruption."""
+    """A stopped cloud finishes its tasks and exits with 0; a stopped robot exits as if interrupted."""
     robot_asks_the_cloud(bench)
     bench.bed.stop("cloud")
     assert bench.bed.exit_code("cloud") == 0
@@ -113,7 +113,7 @@ def a_stopped_part_says_its_exit_code(bench: Bench) -> None:
 
 
 def a_paused_part_hangs_until_it_is_resumed(bench: Bench) -> None:
-    """The robot waits in vain for a paused cloud, which has not ended, and is answered once it goes on."""
+    """The robot plans onboard while the cloud is paused, and uses the cloud again after it is resumed."""
     robot_asks_the_cloud(bench)
     bench.bed.pause("cloud")
     wait_until(lambda: newest(bench)["used"] == "onboard")
@@ -123,7 +123,7 @@ def a_paused_part_hangs_until_it_is_resumed(bench: Bench) -> None:
 
 
 def a_paused_part_can_be_killed(bench: Bench) -> None:
-    """Also a part that hangs ends by SIGKILL."""
+    """SIGKILL also ends a paused part."""
     bench.bed.pause("cloud")
     bench.bed.kill("cloud")
     assert bench.bed.exit_code("cloud") == -signal.SIGKILL
@@ -131,9 +131,9 @@ def a_paused_part_can_be_killed(bench: Bench) -> None:
 
 
 def cpus_are_in_force(bench: Bench) -> None:
-    """A cloud with hogs uses the share of CPU that it is given, +-20 %, and no more when it is started again.
+    """A busy cloud uses its CPU quota, +-20 %, and keeps the quota when it is started again.
 
-    The shares are small, so that a busy machine has them to give.
+    The quotas are small, so that even a busy machine can provide them.
     """
     end(bench, "robot-2")
     for cpus in (0.1, 0.3):
@@ -148,12 +148,12 @@ def cpus_are_in_force(bench: Bench) -> None:
     found = share(bench, "cloud")
     assert 0.1 < found < 0.3 * (1 + SHARE_TOLERANCE), f"{found} of 0.3"
     bench.bed.set_hogs("cloud", 0)
-    assert share(bench, "cloud") < 0.1, "it has nothing to do"
+    assert share(bench, "cloud") < 0.1, "the cloud has nothing to do"
     bench.bed.set_cpus("cloud", 1.0)
 
 
 def hogs_slow_a_held_robot(bench: Bench) -> None:
-    """With three hogs in its share a robot makes less than two thirds of its plans; they end with it."""
+    """With three hogs in its quota a robot makes less than two thirds of its plans; hogs end with it."""
     start(bench, "robot-3")
     bench.bed.set_cpus("robot-3", CALM_CPUS)
     wait_until(lambda: newest(bench, "robot-3") is not None)
@@ -161,7 +161,7 @@ def hogs_slow_a_held_robot(bench: Bench) -> None:
     bench.bed.set_hogs("robot-3", 3)
     wait_until(lambda: bench.hogs("robot-3") == 3)
     hogged = plans(bench, "robot-3")
-    assert 0 < hogged < 2 / 3 * alone, f"{alone} plans alone, {hogged} beside three hogs"
+    assert 0 < hogged < 2 / 3 * alone, f"{alone} plans without hogs, {hogged} with three hogs"
     bench.bed.set_hogs("robot-3", 1)
     assert bench.hogs("robot-3") == 1
     bench.bed.kill("robot-3")
@@ -169,7 +169,7 @@ def hogs_slow_a_held_robot(bench: Bench) -> None:
 
 
 def a_cut_is_silence(bench: Bench) -> None:
-    """A cloud that is cut off answers nothing; joined again it answers on the same connection."""
+    """A cloud that is cut off does not answer; after `join` it answers on the same connection."""
     robot_asks_the_cloud(bench)
     before = connections(bench)
     bench.bed.cut("cloud")
@@ -182,7 +182,7 @@ def a_cut_is_silence(bench: Bench) -> None:
 
 
 def a_robot_and_the_relay_can_be_cut_off(bench: Bench) -> None:
-    """So with the other parts: the robot is alone until they are joined."""
+    """The robot plans onboard while it, or the relay, is cut off, and uses the cloud again afterwards."""
     for part in ("robot-2", "wan"):
         robot_asks_the_cloud(bench)
         bench.bed.cut(part)
@@ -192,22 +192,22 @@ def a_robot_and_the_relay_can_be_cut_off(bench: Bench) -> None:
 
 
 def usage_counts_memory_and_handles(bench: Bench) -> None:
-    """A relay is between 10 MB and 1 GB, and has two handles more for each robot that is connected."""
+    """A relay uses 10 MB to 1 GB, and two more handles for each connected robot."""
     for robot in ("robot-2", "robot-3"):
         end(bench, robot)
     wait_until(lambda: bench.bed.link()["connections"] == 0)
-    time.sleep(SETTLE_S)  # the connections that asked are closed by now too
+    time.sleep(SETTLE_S)  # until the connections of our own HTTP requests are closed too
     alone = bench.bed.usage("wan")
     assert 10e6 < alone.memory_bytes < 1e9, alone
     assert 4 < alone.handles < 100, alone
     robot_asks_the_cloud(bench)
     wait_until(lambda: bench.bed.link()["connections"] == 1)
     wait_until(lambda: bench.bed.usage("wan").handles == alone.handles + 2)
-    assert bench.bed.usage("cloud").memory_bytes > alone.memory_bytes, "it holds numba and a map"
+    assert bench.bed.usage("cloud").memory_bytes > alone.memory_bytes, "the cloud holds numba and a map"
 
 
 def a_reset_resets(bench: Bench) -> None:
-    """The robot's connection is reset, and the robot connects anew."""
+    """After a reset, the robot connects again and is answered by the cloud."""
     robot_asks_the_cloud(bench)
     before = connections(bench)
     bench.bed.reset()
@@ -232,7 +232,7 @@ CONTRACT: tuple[Callable[[Bench], None], ...] = (
 
 
 def drive(bench: Bench) -> tuple[int, list[dict[str, Any]]]:
-    """Have `robot` make its plans; how many its trace held before, and all that it holds now."""
+    """Let `robot` make its plans; the number of records in its trace before, and all records after."""
     trace = bench.bed.out / "robot.jsonl"
     before = len(list(read(trace))) if trace.exists() else 0
     start(bench, "robot")
@@ -242,7 +242,7 @@ def drive(bench: Bench) -> tuple[int, list[dict[str, Any]]]:
 
 
 def robot_asks_the_cloud(bench: Bench) -> None:
-    """`robot-2` is running, in moderation, and has just been answered by the cloud."""
+    """Start `robot-2` with a small quota, and wait until the cloud has answered one of its tasks."""
     start(bench, "robot-2")
     bench.bed.set_cpus("robot-2", CALM_CPUS)
     before = newest(bench)
@@ -250,7 +250,7 @@ def robot_asks_the_cloud(bench: Bench) -> None:
 
 
 def start(bench: Bench, part: str) -> None:
-    """Start a part unless it runs."""
+    """Start a part if it is not running."""
     if part not in bench.started or bench.bed.exit_code(part) is not None:
         bench.bed.start(part)
         bench.started.add(part)
@@ -262,7 +262,7 @@ def end(bench: Bench, part: str) -> None:
 
 
 def newest(bench: Bench, robot: str = "robot-2") -> Any:
-    """The newest whole record of a robot's trace; None before there is one."""
+    """The newest whole record of a robot's trace; None if there is none yet."""
     trace = bench.bed.out / f"{robot}.jsonl"
     if not trace.exists():
         return None
@@ -273,19 +273,19 @@ def newest(bench: Bench, robot: str = "robot-2") -> Any:
 
 
 def cloud_s(record: dict[str, Any]) -> float:
-    """How long the cloud took for it; 0 where it did not answer."""
+    """The time of the cloud in a record; 0 if the cloud did not answer."""
     return sum(one["seconds"] for one in record["executions"] if one["site"] == "cloud" and one["ok"])
 
 
 def plans(bench: Bench, robot: str) -> int:
-    """How many it makes in PLANS_S."""
+    """The number of plans that a robot makes in PLANS_S."""
     before = newest(bench, robot)["i"]
     time.sleep(PLANS_S)
     return int(newest(bench, robot)["i"] - before)
 
 
 def share(bench: Bench, part: str) -> float:
-    """CPUs that the part and its hogs use: the most of SHARES times SHARE_S."""
+    """The CPUs that a part and its hogs use: the largest of SHARES readings over SHARE_S each."""
     looks = [bench.cpu(part)]
     for _ in range(SHARES):
         time.sleep(SHARE_S)
@@ -294,12 +294,12 @@ def share(bench: Bench, part: str) -> float:
 
 
 def connections(bench: Bench) -> int:
-    """How many the relay has accepted so far."""
+    """The number of connections that the relay has accepted so far."""
     return int(bench.bed.link()["accepted"])
 
 
 def wait_until(fact: Callable[[], Any]) -> None:
     end_s = time.monotonic() + WAIT_S
     while not fact():
-        assert time.monotonic() < end_s, "not within the wait"
+        assert time.monotonic() < end_s, f"not true within {WAIT_S:g} s"
         time.sleep(0.05)

@@ -1,1 +1,1 @@
-"""Many runs: the same scenario with several policies and seeds."""
+"""Comparing policies: many runs, real or simulated, and one table for each scenario."""

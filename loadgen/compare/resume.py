@@ -1,6 +1,6 @@
-"""A comparison that goes on where it was stopped: the runs that were played before are not played again.
+"""Resumes a comparison: a run that was already played to its end is not played again.
 
-What a run is, and how it is judged, is the business of `play`; what it depends on that of `digest`.
+`run_digest` says what a run depends on; `play_scenario` plays and judges it.
 """
 
 import json
@@ -11,24 +11,26 @@ from pathlib import Path
 from typing import Any
 
 from offboard.common.errors import DataError, OffloadError
-from offboard.loadgen.play.digest import digests
-from offboard.loadgen.play.play import SUMMARY, Played, figures, judge, play
+from offboard.loadgen.play.play_scenario import Played, figures, judge, play
+from offboard.loadgen.play.run_digest import digests
+from offboard.loadgen.play.run_files import SUMMARY
 from offboard.loadgen.scenario.scenario import Scenario
 
-PLAYS_MAX = 5  # of one run in a row, whatever the host takes of them
+PLAYS_MAX = 5  # attempts to play one run while the host takes too much CPU time
 DIFFERENCES = {
-    "testbed": "it was on another testbed",
-    "scenario_sha256": "its scenario or settings were others",
-    "software_sha256": "its software was another",
+    "testbed": "it was played on another testbed",
+    "scenario_sha256": "its scenario or settings were different",
+    "software_sha256": "its software was different",
 }
 
 
 def play_once(scenario: Scenario, out: Path, testbed: str, stolen_max: float | None = None) -> Played:
-    """The run in `out` where it is this one and came to its end, else played now; stderr says which.
+    """The finished run in `out` if it is the same run, else a new one; stderr says which.
 
-    A run of which the host took more than `stolen_max` percent is played again, the last of PLAYS_MAX kept.
+    A run is played again if the host took more than `stolen_max` percent of its CPU time. After PLAYS_MAX
+    plays the last one is kept.
     """
-    before = played_before(scenario, out, testbed, _say, stolen_max)
+    before = played_before(scenario, out, testbed, say=_say, stolen_max=stolen_max)
     if before is not None:
         return before
     plays = 0
@@ -40,17 +42,22 @@ def play_once(scenario: Scenario, out: Path, testbed: str, stolen_max: float | N
             _check_undisturbed(played, stolen_max)
         except DataError as error:
             if plays == PLAYS_MAX:
-                _say(f"kept in {out} after {plays} plays: {error}")
+                _say(f"kept the run in {out} after {plays} plays: {error}")
                 return played
-            _say(f"played again in {out}: {error}")
+            _say(f"playing the run in {out} again: {error}")
         else:
             return played
 
 
 def played_before(
-    scenario: Scenario, out: Path, testbed: str, say: Callable[[str], None], stolen_max: float | None = None
+    scenario: Scenario,
+    out: Path,
+    testbed: str,
+    *,
+    say: Callable[[str], None],
+    stolen_max: float | None = None,
 ) -> Played | None:
-    """This run as it was left in `out`, judged anew from its files; None where it must be played."""
+    """The finished run in `out`, judged again from its files; None if it must be played."""
     if not out.exists():
         return None
     try:
@@ -64,38 +71,41 @@ def played_before(
         )
         played.check_robots()
         _check_undisturbed(played, stolen_max)
-        _check_whole(played, about["figures"])
+        _check_complete(played, about["figures"])
     except OffloadError as error:
-        say(f"played again in {out}: {error}")
+        say(f"playing the run in {out} again: {error}")
         return None
-    say(f"taken from before: {out}")
+    say(f"using the finished run in {out}")
     return played
 
 
 def _read_summary(path: Path) -> dict[str, Any]:
-    """It is written last: a run without one was stopped."""
+    """The summary of a run. It is written last, so that a run without one was stopped before its end."""
     try:
         about = json.loads(path.read_text())
     except FileNotFoundError:
-        raise DataError("it did not come to its end") from None
+        raise DataError("it was not played to its end") from None
     except ValueError as error:
         raise DataError(f"{path.name} cannot be read: {error}") from None
     return about if isinstance(about, dict) else {}
 
 
 def _check_undisturbed(played: Played, stolen_max: float | None) -> None:
-    """DataError where the host took more percent than that; where nobody knows, it took nothing."""
+    """DataError if the host took more than `stolen_max` percent of the CPU time.
+
+    An unknown share is allowed.
+    """
     stolen = played.stolen_percent
     if stolen is not None and stolen_max is not None and stolen > stolen_max:
-        raise DataError(f"the host took {stolen:.0f} % of the CPU time that it asked for")
+        raise DataError(f"the host took {stolen:.0f} % of the CPU time that the run asked for")
 
 
-def _check_whole(played: Played, figures_before: Mapping[str, Any]) -> None:
-    """DataError where the files do not say what the summary does: some of them are gone, or others."""
+def _check_complete(played: Played, figures_before: Mapping[str, Any]) -> None:
+    """DataError if the figures from the files differ from the summary: then files are missing or changed."""
     now = figures(played.outcome, played.scenario)
     for name, value in figures_before.items():
         if name in now and now[name] != value:
-            raise DataError(f"{name} is {now[name]} by its files, and {value} in {SUMMARY}")
+            raise DataError(f"{name} is {now[name]} in its files, but {value} in {SUMMARY}")
 
 
 def _say(text: str) -> None:

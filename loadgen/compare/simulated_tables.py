@@ -1,21 +1,25 @@
-"""`loadgen compare --simulate`: a table a scenario, and of several scenarios one over all of them first."""
+"""`loadgen compare --simulate`: simulates all runs and gives one table for each scenario.
+
+With several scenarios, a summary table over all of them comes first.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import make_dataclass
 from typing import Any
 
-from offboard.loadgen.compare.compare import CompareConfig, split_strategy, table
+from offboard.loadgen.compare.compare_settings import CompareConfig, split_strategy
+from offboard.loadgen.compare.comparison_table import comparison_table
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.simulation.batch import Batch
 from offboard.loadgen.simulation.world import check_simulated
-from offboard.loadgen.table.render import Heading, Table, render
+from offboard.loadgen.table.table_formats import Heading, Table, render
 
 ABOUT = "time over oracle of each policy"
 DIGITS = 3
 
 
 def simulated(scenarios: Sequence[Scenario], config: CompareConfig) -> str:
-    """All tables as text."""
+    """All tables, as text in the chosen format."""
     for scenario in scenarios:
         check_simulated(scenario)
     with Batch(config.jobs) as batch:
@@ -23,15 +27,15 @@ def simulated(scenarios: Sequence[Scenario], config: CompareConfig) -> str:
     if len(tables) == 1:
         return render(tables, config.format)
     summary = summary_table(_over_oracle(scenarios, tables, config.policies), _caption(config))
-    if config.format == "csv":  # its lines are of another shape
+    if config.format == "csv":  # the summary has other columns
         return render([summary], config.format) + "\n" + render(tables, config.format)
     return render([summary, *tables], config.format)
 
 
 def summary_table(figures: Mapping[str, Mapping[str, float | None]], caption: str) -> Table:
-    """A line a policy; `figures` hold by policy, and then by scenario, its time over oracle.
+    """One line for each policy. `figures` holds time over oracle by policy, then by scenario.
 
-    `mean` and `worst` are those of the scenarios that have one.
+    `mean` and `worst` are taken over the scenarios where the figure is defined.
     """
     scenarios = list(next(iter(figures.values())))
     columns = {name: f"on_{name.replace('-', '_')}" for name in scenarios}
@@ -63,13 +67,13 @@ def _table(scenario: Scenario, config: CompareConfig, batch: Batch) -> Table:
     played = batch.play(seeds, strategies)
     compared = scenario.compared()
     runs = {name: [run.of(compared).between(config.from_task) for run in played[name]] for name in played}
-    return table(scenario, config, runs, batch.map)
+    return comparison_table(scenario, config, runs, batch.map)
 
 
 def _over_oracle(
     scenarios: Sequence[Scenario], tables: Sequence[Table], policies: Sequence[str]
 ) -> dict[str, dict[str, float | None]]:
-    """By policy and scenario."""
+    """Time over oracle by policy, then by scenario."""
     found: dict[str, dict[str, float | None]] = {policy: {} for policy in policies}
     for scenario, one in zip(scenarios, tables, strict=True):
         for line in one.lines:
@@ -80,7 +84,8 @@ def _over_oracle(
 
 def _caption(config: CompareConfig) -> str:
     span = f" from task {config.from_task} on" if config.from_task else ""
+    seeds = "1 seed" if config.seeds == 1 else f"{config.seeds} seeds"
     return (
-        f"In simulation, {config.seeds} seeds: time of all tasks{span} over that of the better site for each,"
-        " by scenario, and the mean and the worst of these."
+        f"Time / oracle in simulation, {seeds}: time of all tasks{span}, divided by the time that the faster"
+        " site takes for each of them. Mean and worst are over the scenarios."
     )

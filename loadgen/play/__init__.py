@@ -1,1 +1,1 @@
-"""One run: plays a scenario, checks the answers, writes the summary."""
+"""One run with real processes: plays a scenario, verifies the answers and writes the summary."""

@@ -7,10 +7,10 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from offboard.loadgen.table.bootstrap import Blocks
-from offboard.loadgen.table.rows import Column, Rows
-from offboard.loadgen.table.score import Score, Scored, Sides
-from offboard.loadgen.table.table_two import Evaluation
+from offboard.loadgen.table.confidence_intervals import Blocks
+from offboard.loadgen.table.measured_rows import Column, Rows
+from offboard.loadgen.table.predictor_evaluation import Evaluation
+from offboard.loadgen.table.table_two_figures import Score, Scored, Sides
 
 POINTS_MAX = 1000  # drawn of one series; more make the page heavy and show nothing new
 SHARE_TASKS = 20  # over which the share of the cloud is taken; half of a short run, a part of a long one

@@ -24,11 +24,11 @@ from offboard.loadgen.report.chart_styles import (
     policy_look,
     predictor_look,
 )
-from offboard.loadgen.table import paper_table as paper
+from offboard.loadgen.table import published_table_two as paper
+from offboard.loadgen.table.measured_rows import Column
 from offboard.loadgen.table.replay import ORACLE, RECORDED
-from offboard.loadgen.table.rows import Column
-from offboard.loadgen.table.score import Score
-from offboard.loadgen.table.table_two import FULL_WINDOW, PAPER_WINDOWS
+from offboard.loadgen.table.table_settings import FULL_WINDOW, PAPER_WINDOWS
+from offboard.loadgen.table.table_two_figures import Score
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 try:

@@ -9,12 +9,13 @@ from offboard.loadgen.report import chart_data as series
 from offboard.loadgen.report.chart_data import Accuracies, Decisions, Times
 from offboard.loadgen.table import replay
 from offboard.loadgen.table import table_two as evaluate
-from offboard.loadgen.table.notes import read_noted
-from offboard.loadgen.table.render import Table
+from offboard.loadgen.table.measured_rows import Column, read_lived
+from offboard.loadgen.table.measurement_notes import read_noted
+from offboard.loadgen.table.predictor_evaluation import Evaluation
 from offboard.loadgen.table.replay import ORACLE, RECORDED, ReplayConfig
-from offboard.loadgen.table.rows import Column, read_lived
-from offboard.loadgen.table.score import Score, Sides
-from offboard.loadgen.table.table_two import Evaluation, TableConfig
+from offboard.loadgen.table.table_formats import Table
+from offboard.loadgen.table.table_settings import TableConfig
+from offboard.loadgen.table.table_two_figures import Score, Sides
 
 
 class Findings:

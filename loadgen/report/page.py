@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from html import escape
 
 from offboard.loadgen.report.svg import inline
-from offboard.loadgen.table.render import Table, cells
+from offboard.loadgen.table.table_formats import Table, cells
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
 TERMS = {

@@ -11,14 +11,14 @@ from typing import Any
 
 from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError, DataError
-from offboard.loadgen.play.player import TRACE
+from offboard.loadgen.play.run_files import TRACE
 from offboard.loadgen.report.chart_data import POINTS_MAX, Times
 from offboard.loadgen.report.findings import Findings
 from offboard.loadgen.report.page import Panel, page
-from offboard.loadgen.table import paper_table as paper
+from offboard.loadgen.table import published_table_two as paper
+from offboard.loadgen.table.measured_rows import write_whole
 from offboard.loadgen.table.replay import ORACLE, RECORDED, ReplayConfig
-from offboard.loadgen.table.rows import write_whole
-from offboard.loadgen.table.table_two import ALL, BOTH, CHOSEN, FULL, TableConfig
+from offboard.loadgen.table.table_settings import ALL, BOTH, CHOSEN, FULL, TableConfig
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.predictors.window import WINDOW, WINDOW_MAX
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD

@@ -1,1 +1,1 @@
-"""A run as data: scenario, timeline, checks, and what came of it."""
+"""A run as data: the scenario with its events and checks, and the outcome of a run that was played."""

@@ -1,6 +1,7 @@
-"""Tasks of one number for scenarios: real CPU work whose answer tells whether it was done.
+"""Hash tasks for scenarios: real CPU work that depends on one number, with an answer that can be verified.
 
-Server: `--tasks offboard.loadgen.scenario.hash_tasks`. Robot: `--task` with the same and `:NAME`.
+The server loads them with `--tasks offboard.loadgen.scenario.hash_tasks`.
+The robot takes one with `--task offboard.loadgen.scenario.hash_tasks:NAME`.
 """
 
 import hashlib
@@ -12,25 +13,28 @@ from offboard.common.wanted import check_wanted
 from offboard.loadgen.testbed.testbed import PART
 
 ROUNDS_MAX = 10_000_000
-RARE = 25  # on a computer one in so many sizes ...
-MUCH = 20  # ... takes so many times the work
+RARE = 25  # on each computer, one in this many sizes ...
+MUCH = 20  # ... takes this many times as long
 
 
 @task("hash_rounds", size=float)
 def hash_rounds(rounds: int) -> bytes:
-    """So many rounds of PBKDF2-HMAC-SHA256 (RFC 8018): time is linear in the size."""
+    """PBKDF2-HMAC-SHA256 (RFC 8018) with this many rounds: the time is linear in the size."""
     return _hashed(rounds)
 
 
 @task("hash_pairs", size=float)
 def hash_pairs(count: int) -> bytes:
-    """A round for every thousand pairs of so many things: time grows with the square of the size."""
+    """One round for every thousand pairs of `count` things: the time grows with the square of the size."""
     return _hashed(count * count // 1000)
 
 
 @task("hash_rarely_long", size=float)
 def hash_rarely_long(rounds: int) -> bytes:
-    """As `hash_rounds`, but takes MUCH times as long for one in RARE sizes, others on each computer."""
+    """Like `hash_rounds`, but 1 in RARE sizes takes MUCH times as long.
+
+    Each computer has its own slow sizes.
+    """
     for _ in range(rounds_on(os.environ.get(PART, ""), rounds) // max(rounds, 1) - 1):
         check_wanted()
         _hashed(rounds)
@@ -38,13 +42,13 @@ def hash_rarely_long(rounds: int) -> bytes:
 
 
 def rounds_on(part: str, rounds: int) -> int:
-    """What `hash_rarely_long` takes on a part of a testbed: a tail that nothing foretells."""
+    """The rounds that `hash_rarely_long` computes on this part of a testbed; the tail is unpredictable."""
     rare = zlib.crc32(f"{part}/{rounds}".encode()) % RARE == 0
     return rounds * MUCH if rare else rounds
 
 
 def _hashed(rounds: int) -> bytes:
-    """Runs without the interpreter's lock."""
+    """Runs without Python's interpreter lock."""
     if rounds > ROUNDS_MAX:
         raise ValueError(f"{rounds} rounds are over {ROUNDS_MAX}")
     return hashlib.pbkdf2_hmac("sha256", b"offboard", b"scenario", max(rounds, 1))

@@ -1,6 +1,7 @@
-"""How well the intervals of a trace's predictions held: each execution's time against those of its site.
+"""Prediction intervals of a trace: how often an execution's time lay within the interval of its site.
 
-A run that was given up after the upper end of its interval missed it; one given up before tells nothing.
+An execution that was given up counts as a miss if it had already run past the upper end of its interval.
+If it was given up earlier, its true time is unknown and it does not count.
 """
 
 import math
@@ -11,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from offboard.loadgen.table.rows import Column
+from offboard.loadgen.table.measured_rows import Column
 
 Late = Mapping[tuple[str, str], float]
 
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """The interval of one execution on a site: its width, and whether the time was in it.
+    """The prediction interval of one execution, and whether the measured time lay within it (`held`).
 
-    `error_s` is the time less the predicted one; infinite where the run was given up.
+    `error_s` is the measured time minus the prediction; infinite if the execution was given up.
     """
 
     site: str
@@ -31,13 +32,16 @@ class Interval:
 
 
 def late_seconds(records: Iterable[Mapping[str, Any]]) -> Late:
-    """By task and site what executions took that ended well after their task's record was written."""
+    """(task id, site) -> seconds, for executions that succeeded after their task's record was written."""
     late = chain.from_iterable(record.get("late", ()) for record in records)
     return {(one["id"], one["site"]): one["seconds"] for one in late if one["ok"]}
 
 
 def intervals_of(record: Mapping[str, Any], late: Late) -> tuple[Interval, ...]:
-    """Of the executions of one record, where their site had one and the time tells."""
+    """The intervals of one record's executions.
+
+    Leaves out executions without an interval or a usable time.
+    """
     found = []
     for one in record.get("executions", ()):
         outlook = record["sites"].get(one["site"], {})
@@ -48,13 +52,24 @@ def intervals_of(record: Mapping[str, Any], late: Late) -> tuple[Interval, ...]:
         if seconds is None and one["censored"] and one["seconds"] > high_s:
             seconds = math.inf
         if seconds is not None:
-            predicted_s, held = outlook["predicted_s"], low_s <= seconds <= high_s
-            found.append(Interval(one["site"], predicted_s, high_s - low_s, seconds - predicted_s, held))
+            predicted_s = outlook["predicted_s"]
+            found.append(
+                Interval(
+                    site=one["site"],
+                    predicted_s=predicted_s,
+                    width_s=high_s - low_s,
+                    error_s=seconds - predicted_s,
+                    held=low_s <= seconds <= high_s,
+                )
+            )
     return tuple(found)
 
 
 def interval_columns(tasks: Sequence[Sequence[Interval]]) -> dict[str, Column]:
-    """A row a task, with a place for each of its intervals; NaN where there is none. Sites are numbered."""
+    """One row for each task and one column for each of its intervals; NaN fills the rest.
+
+    Sites are numbered.
+    """
     shape = len(tasks), max(map(len, tasks), default=0)
     numbers = {site: n for n, site in enumerate(sorted({one.site for task in tasks for one in task}))}
     columns = {
@@ -71,8 +86,13 @@ def interval_columns(tasks: Sequence[Sequence[Interval]]) -> dict[str, Column]:
 
 
 def interval_figures(columns: Mapping[str, Column], picks: Any) -> dict[str, Column]:
-    """Of each resample of tasks: share of times within their interval, median of the widths over the
-    predicted times, and over the width of the constant interval of the same site that holds as many."""
+    """Three figures for each resample of tasks (one row of `picks`).
+
+    - `coverage_percent`: share of the times that lay within their interval
+    - `relative_width`: median of width / predicted time
+    - `width_over_constant`: median of width / width of the best constant interval of the same site, which is
+      the shortest interval around all its predictions that holds the same number of times
+    """
     held, widths = (columns[name][picks].reshape(len(picks), -1) for name in ("held", "relative_width"))
     count = (~np.isnan(held)).sum(axis=-1)
     inside = np.nansum(held, axis=-1)
@@ -86,7 +106,7 @@ def interval_figures(columns: Mapping[str, Column], picks: Any) -> dict[str, Col
 
 
 def _over_constant(columns: Mapping[str, Column], picks: Any) -> Column:
-    """Each width over that of the shortest interval around all predictions of its site that holds as many."""
+    """Each width divided by the width of the best constant interval of its site."""
     site, width_s, error_s, held = (
         columns[name][picks].reshape(len(picks), -1) for name in ("site", "width_s", "error_s", "held")
     )
@@ -101,7 +121,7 @@ def _over_constant(columns: Mapping[str, Column], picks: Any) -> Column:
 
 
 def _shortest(ordered: Column, held: int) -> float:
-    """The width of the shortest interval that holds so many; NaN for none."""
+    """The width of the shortest interval that holds `held` values; NaN if there is none."""
     finite = ordered[np.isfinite(ordered)]
     if not 0 < held <= len(finite):
         return np.nan
@@ -109,7 +129,7 @@ def _shortest(ordered: Column, held: int) -> float:
 
 
 def _median(values: Column, count: Any) -> Column:
-    """Along the last axis, over the `count` that are there; NaN where none is."""
+    """The median of the last axis over the first `count` sorted values; NaN if `count` is 0."""
     if not values.shape[-1]:
         return np.full(len(values), np.nan)
     ordered, rows = np.sort(values, axis=-1), np.arange(len(values))  # NaN comes last

@@ -1,4 +1,7 @@
-"""Random faults for a scenario: which comes when is drawn from the seed, so that a run can be had again."""
+"""Random faults for a scenario, drawn from its seed, so that the same seed gives the same faults.
+
+They become events of the timeline; `play` applies them like any other event.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -8,20 +11,20 @@ from typing import Any
 from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError
 from offboard.loadgen.relay.link.link import Link
-from offboard.loadgen.scenario.timeline import EVENTS_MAX, Event
+from offboard.loadgen.scenario.event_timeline import EVENTS_MAX, Event
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN
 
-# The events of one that begins and ends at these seconds, on a link that is otherwise like this.
+# Gives the events of a fault from its begin and its end in seconds, and from the link without the fault.
 Fault = Callable[[float, float, Link], Iterator[Event]]
 
 
 @dataclass(frozen=True)
 class Chaos:
-    """`[chaos]`: one fault in every `every_s` seconds, at any moment of them, for `last_s`."""
+    """`[chaos]`: one fault in every period of `every_s` seconds, at a random moment of it."""
 
-    every_s: float = setting(20.0, "seconds in which one fault begins", minimum=0.1)
-    last_s: float = setting(3.0, "seconds that it lasts", minimum=0.0)
-    faults: tuple[str, ...] = setting((), "those to draw from; without any all of them")
+    every_s: float = setting(20.0, "length of a period with one fault, in seconds", minimum=0.1)
+    last_s: float = setting(3.0, "how long a fault lasts, in seconds", minimum=0.0)
+    faults: tuple[str, ...] = setting((), "faults to draw from; empty: all faults")
 
     def __post_init__(self) -> None:
         check(self)
@@ -32,7 +35,10 @@ class Chaos:
                 raise ConfigError(f"chaos.faults: {name!r} is not one of {', '.join(FAULTS)}")
 
     def events(self, seed: int, duration_s: float, link: Link) -> tuple[Event, ...]:
-        """The events of a run of so many seconds on `link`; none begins that could not end in it."""
+        """The events of a run that takes `duration_s` seconds on `link`.
+
+        Every fault ends before the run does.
+        """
         random, count = Random(seed), int(duration_s // self.every_s)
         if 2 * count > EVENTS_MAX:
             raise ConfigError(f"chaos.every_s: {2 * count} events, at most {EVENTS_MAX} are allowed")
@@ -45,7 +51,7 @@ class Chaos:
 
 
 def _condition(name: str, value: Any) -> Fault:
-    """A condition of the link in both directions, and then what each had before."""
+    """A fault that sets a condition of the link in both directions, then restores both."""
 
     def events(begin_s: float, end_s: float, link: Link) -> Iterator[Event]:
         yield Event("link", {name: value}, at_s=begin_s)

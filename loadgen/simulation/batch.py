@@ -9,7 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from typing import Any, Self
 
-from offboard.loadgen.play.player import ROBOT_SEED_STEP
+from offboard.loadgen.play.run_files import ROBOT_SEED_STEP
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.scenario import Scenario, Workload
 from offboard.loadgen.simulation.model.simulated_tasks import OTHERS_TASKS_MAX, Tasks, find_tasks

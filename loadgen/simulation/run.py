@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from offboard.loadgen.scenario.event_timeline import Timeline
 from offboard.loadgen.scenario.interval_coverage import intervals_of, late_seconds
 from offboard.loadgen.scenario.outcome import Answered, Outcome, Reference
 from offboard.loadgen.scenario.scenario import Scenario
-from offboard.loadgen.scenario.timeline import Timeline
 from offboard.loadgen.simulation.model.lockstep import LockstepClock
 from offboard.loadgen.simulation.model.simulated_tasks import Tasks
 from offboard.loadgen.simulation.world import World

@@ -5,11 +5,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from offboard.common.errors import ConfigError
-from offboard.loadgen.play.player import ROBOT_SEED_STEP
+from offboard.loadgen.play.run_files import ROBOT_SEED_STEP
 from offboard.loadgen.relay.link.link import Link
 from offboard.loadgen.relay.link.link_settings import LinkFlags
+from offboard.loadgen.scenario.event_timeline import Event, absent_at_first
 from offboard.loadgen.scenario.scenario import Scenario
-from offboard.loadgen.scenario.timeline import Event, absent_at_first
 from offboard.loadgen.simulation import oracle as foresight
 from offboard.loadgen.simulation.cloud import SimulatedCloud
 from offboard.loadgen.simulation.model.clock import VirtualClock

@@ -1,1 +1,1 @@
-"""Tables from measured times: Table II, replay, and their intervals."""
+"""Tables from measured times: Table II, replayed policies, and their confidence intervals."""

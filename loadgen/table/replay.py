@@ -1,10 +1,10 @@
-"""`loadgen replay`: what each policy would have made of the same tasks, by the robot's own `Offloader`.
+"""`loadgen replay`: runs each policy on the same measured tasks, with the `Offloader` of the robot.
 
-Only the runners differ from a live run: they answer at once with the times that were measured.
+Only the runners differ from a live run: they answer at once, with the time that was measured.
 """
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,15 +14,16 @@ import numpy as np
 
 from offboard.common.config import check, setting
 from offboard.common.tasks import Kind, Task, task
-from offboard.loadgen.table import bootstrap, score
-from offboard.loadgen.table.notes import read_noted
-from offboard.loadgen.table.render import Heading, Table, render
-from offboard.loadgen.table.rows import Column, Rows, read_lived
-from offboard.loadgen.table.score import Scored, Sides
-from offboard.loadgen.table.table_two import BOTH, FULL, Asked
+from offboard.loadgen.table import confidence_intervals, table_two_figures
+from offboard.loadgen.table.measured_rows import Column, Rows, read_lived
+from offboard.loadgen.table.measurement_notes import read_noted
+from offboard.loadgen.table.table_formats import Heading, Table, render
+from offboard.loadgen.table.table_settings import BOTH, FULL, MeasuredTimesConfig
+from offboard.loadgen.table.table_two_figures import Scored, Sides
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Decision, Forecast, Policy
+from offboard.robot_client.predictors import Predictor
 from offboard.robot_client.predictors.window import WINDOW, WINDOW_MAX
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
 
@@ -31,16 +32,23 @@ RECORDED = "as recorded"
 
 
 @dataclass(frozen=True)
-class ReplayConfig(Asked):
-    """Which policies to replay, and what they predict with."""
+class ReplayConfig(MeasuredTimesConfig):
+    """Which policies to replay, and with which predictor."""
 
     policies: tuple[str, ...] = setting(
         (*policies.names(), policies.DEFAULT), f"policies to replay: {policies.HELP}", metavar="NAME,NAME,.."
     )
     predictor: str | None = setting(
-        None, f"for all of them, instead of each one's own: {predictors.HELP}", metavar="NAME"
+        None,
+        f"predictor for all policies, instead of the one that each policy brings: {predictors.HELP}",
+        metavar="NAME",
     )
-    window: int = setting(WINDOW, "rows of warm-up, not scored", minimum=2, maximum=WINDOW_MAX)
+    window: int = setting(
+        WINDOW,
+        "window length N; the first N rows are warm-up and are not scored",
+        minimum=2,
+        maximum=WINDOW_MAX,
+    )
 
     def __post_init__(self) -> None:
         check(self)
@@ -52,9 +60,9 @@ class ReplayConfig(Asked):
 
 @dataclass(frozen=True, slots=True)
 class PolicyScore:
-    """One line: how one policy did on the `scored` tasks. None: undefined, or not to be had from the file.
+    """One line of the table: one policy on the `scored` tasks. None: undefined, or not known from the file.
 
-    Where a policy ran a task on both sites its time is that of the first answer.
+    If a policy ran a task on both sites, its time is that of the first answer.
     """
 
     policy: str
@@ -84,13 +92,13 @@ HEADINGS: dict[str, Heading] = {
     "regret_mean_s": Heading("regret s/task", "regret/task", 5),
     "accuracy_percent": Heading("accuracy %", r"acc. \%", 2),
     "cloud_percent": Heading("cloud %", r"cloud \%", 2),
-    "both_percent": Heading("both %", r"both \%", 2),
+    "both_percent": Heading("on both sites %", r"on both sites \%", 2),
 }
 
 
 @dataclass(frozen=True, slots=True)
-class Played:
-    """What a policy did with each scored row: the site whose answer came first, and whether both ran."""
+class Replayed:
+    """What a policy did with the scored rows: whether the cloud answered first, whether both sites ran."""
 
     to_cloud: Sides
     both: Sides
@@ -103,33 +111,46 @@ def run_replay(path: Path, config: ReplayConfig) -> int:
 
 
 def tables(path: Path, config: ReplayConfig) -> list[Table]:
-    """One table a feedback mode; the first line of a trace's is the run that it records."""
+    """One table for each feedback mode. The first line of a trace's table is the recorded run itself."""
     rows, lived = read_noted(path, config.kind, least=0), read_lived(path, config.kind)
     recorded = [_recorded(lived.waited_s, lived.to_cloud)] if len(lived.waited_s) else []
-    return [_table(path, rows, config, mode, recorded) for mode in config.modes()]
+    return [_table(path, rows, config, feedback=mode, recorded=recorded) for mode in config.modes()]
 
 
 def replay(
     rows: Rows, policy: str, *, predictor: str | None, window: int, feedback: str, seed: int = 1
-) -> Played:
-    """Offer every row to `policy`, in order; what it did with those after the first `window`.
-
-    The warm-up runs on both sites whatever the policy, so that all are scored on the same rows.
-    """
-    chooser = _Chooser(policies.make(policy, seed), every=feedback == FULL)
+) -> Replayed:
+    """Replay the policy with this name; without a `predictor` it uses its own."""
     name = policies.predictor_of(policy) if predictor is None else predictor
+    return replay_policy(
+        rows,
+        policies.make(policy, seed),
+        predictor=lambda: predictors.make(name, window, seed),
+        window=window,
+        feedback=feedback,
+    )
+
+
+def replay_policy(
+    rows: Rows, policy: Policy, *, predictor: Callable[[], Predictor], window: int, feedback: str
+) -> Replayed:
+    """Let `policy` decide every row, in order; its decisions on the rows after the first `window`.
+
+    The warm-up runs on both sites for every policy, so that all policies are scored on the same rows.
+    """
+    chooser = _Chooser(policy, every=feedback == FULL)
     to_cloud, both = np.zeros((2, len(rows)), dtype=bool)
     with Offloader(
         [_Replaying(ONBOARD, rows.onboard_s), _Replaying(CLOUD, rows.cloud_s)],
         policy=chooser,
-        predictor=lambda: predictors.make(name, window, seed),
+        predictor=predictor,
     ) as offload:
         for row, size in enumerate(rows.size.tolist()):
             offload(_replayed, size, row, where=BOTH if row < window else None)
             if row >= window:
                 to_cloud[row], both[row] = chooser.last.site == CLOUD, _ran_both(chooser.last)
     first = rows.cloud_s < rows.onboard_s
-    return Played(np.where(both, first, to_cloud)[window:], both[window:])
+    return Replayed(np.where(both, first, to_cloud)[window:], both[window:])
 
 
 def _ran_both(decision: Decision) -> bool:
@@ -138,7 +159,10 @@ def _ran_both(decision: Decision) -> bool:
 
 
 class _Chooser:
-    """A policy, its last choice, and with `every` the other site run beside the chosen one: both learn."""
+    """Wraps a policy, and keeps its last decision.
+
+    With `every`, each task runs on both sites, so that both learn.
+    """
 
     last: Decision
 
@@ -152,7 +176,7 @@ class _Chooser:
 
 
 class _Replaying:
-    """A runner that takes as long as it did."""
+    """A runner that returns the measured times."""
 
     def __init__(self, site: str, seconds: Column) -> None:
         self.site = site
@@ -185,7 +209,9 @@ def _replayed(size: float, row: int) -> None:  # noqa: ARG001
     raise AssertionError("a replayed task is looked up, not run")
 
 
-def _table(path: Path, rows: Rows, config: ReplayConfig, feedback: str, recorded: list[PolicyScore]) -> Table:
+def _table(
+    path: Path, rows: Rows, config: ReplayConfig, *, feedback: str, recorded: list[PolicyScore]
+) -> Table:
     lines = [*recorded]
     for name in (*config.policies, ORACLE):
         lines.extend(_lines(rows, name, config, feedback))
@@ -209,16 +235,16 @@ def _table(path: Path, rows: Rows, config: ReplayConfig, feedback: str, recorded
 
 
 def _lines(rows: Rows, policy: str, config: ReplayConfig, feedback: str) -> Iterator[PolicyScore]:
-    """The figures of one policy, and the ends of their intervals where those are asked for."""
+    """The figures of one policy, and with --bootstrap the ends of their intervals."""
     line = PolicyScore(policy)
     if len(rows) <= config.window:
-        both = f"{len(rows) or 'no'} tasks ran on both sites, the warm-up takes {config.window}"
-        yield replace(line, note=f"cannot be told: {both}")
+        both = f"{len(rows) or 'no'} tasks ran on both sites, but the warm-up needs {config.window}"
+        yield replace(line, note=f"cannot be replayed: {both}")
         return
     scored = rows.since(config.window)
     if policy == ORACLE:
         first = scored.cloud_s < scored.onboard_s
-        played = Played(first, np.zeros_like(first))
+        played = Replayed(first, np.zeros_like(first))
     else:
         played = replay(
             rows,
@@ -229,31 +255,31 @@ def _lines(rows: Rows, policy: str, config: ReplayConfig, feedback: str) -> Iter
             seed=config.seed,
         )
     sent = Scored(scored.onboard_s, scored.cloud_s, played.to_cloud)
-    yield replace(line, scored=len(scored), **score.plain(_figures(sent, played.both)))
+    yield replace(line, scored=len(scored), **table_two_figures.plain(_figures(sent, played.both)))
     if config.bootstrap:
         ends = config.blocks(len(scored)).intervals(
             lambda picks: _figures(sent.picked(picks), played.both[picks])
         )
-        for bound, end in zip(bootstrap.BOUNDS, ends, strict=True):
+        for bound, end in zip(confidence_intervals.BOUNDS, ends, strict=True):
             yield replace(line, bound=bound, scored=len(scored), **end)
 
 
 def _figures(sent: Scored, both: Sides) -> dict[str, Any]:
     spent_s = np.where(sent.to_cloud, sent.cloud_s, sent.onboard_s)
-    rule = score.rule_figures(sent)
+    rule = table_two_figures.rule_figures(sent)
     kept = ("time_over_oracle", "regret_s", "regret_mean_s", "accuracy_percent", "cloud_percent")
     return _times(spent_s) | {name: rule[name] for name in kept} | {"both_percent": 100 * both.mean(-1)}
 
 
 def _recorded(waited_s: Column, to_cloud: Sides) -> PolicyScore:
-    """The tasks that the robot ran on the site it chose: the other site's time is not known."""
+    """The line of the recorded run. The times of the sites that were not chosen are unknown."""
     found = _times(waited_s) | {"cloud_percent": 100 * to_cloud.mean()}
-    return PolicyScore(RECORDED, scored=len(waited_s), **score.plain(found))
+    return PolicyScore(RECORDED, scored=len(waited_s), **table_two_figures.plain(found))
 
 
 def _times(seconds: Column) -> dict[str, Any]:
     return {
         "mean_s": seconds.mean(-1),
-        "p95_s": score.quantile(seconds, 95),
-        "p99_s": score.quantile(seconds, 99),
+        "p95_s": table_two_figures.quantile(seconds, 95),
+        "p99_s": table_two_figures.quantile(seconds, 99),
     }

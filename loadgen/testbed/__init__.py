@@ -1,1 +1,1 @@
-"""What a run is played on: child processes on loopback, or containers."""
+"""What a run is played on: local processes, or Docker containers."""

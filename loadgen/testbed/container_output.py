@@ -1,4 +1,7 @@
-"""What a container says, kept or shown while it runs; where it comes from is the business of `containers`."""
+"""The output of a container, written to a log or to our stdout while the container runs.
+
+`docker_testbed` attaches to the container.
+"""
 
 import codecs
 import contextlib
@@ -7,13 +10,16 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-from offboard.loadgen.testbed.part import TAIL_BYTES, TAIL_LINES
+from offboard.loadgen.testbed.part_process import TAIL_BYTES, TAIL_LINES
 
-END_S = 5.0  # from the end of a container to the last of its output
+END_S = 5.0  # longest wait for the last output of a container that has ended
 
 
 class Output(threading.Thread):
-    """Reads `chunks` to their end: to our stdout, or to `log`, which begins anew unless `again`."""
+    """Copies `chunks` until they end: to the file `log`, or to our stdout if `log` is None.
+
+    `again` appends to an existing log instead of replacing it.
+    """
 
     def __init__(self, name: str, chunks: Iterator[bytes], log: Path | None, *, again: bool = False) -> None:
         super().__init__(name=f"output of {name}", daemon=True)
@@ -28,7 +34,7 @@ class Output(threading.Thread):
         text = codecs.getincrementaldecoder("utf-8")("replace")
         for chunk in self._chunks:
             self._last = (self._last + chunk)[-TAIL_BYTES:]
-            with contextlib.suppress(OSError, ValueError):  # a full disk, a closed stdout: read on
+            with contextlib.suppress(OSError, ValueError):  # after a full disk or a closed stdout, read on
                 if self.log is None:
                     sys.stdout.write(text.decode(chunk))
                     sys.stdout.flush()
@@ -37,10 +43,10 @@ class Output(threading.Thread):
                         file.write(chunk)
 
     def finish(self) -> None:
-        """Wait for the rest of a container that has ended, for a bounded time."""
+        """Wait for the last output of a container that has ended, at most END_S."""
         self.join(END_S)
 
     def tail(self) -> str:
-        """The last lines."""
+        """The last lines of the output."""
         lines = self._last.decode(errors="replace").splitlines()
         return "\n".join(lines[-TAIL_LINES:]) or "(it logged nothing)"

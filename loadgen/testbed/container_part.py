@@ -1,11 +1,11 @@
-"""What a part is inside of its container: image, command, networks, files and processes.
+"""A part inside its container: image, command, networks, files and processes, as pure functions and data.
 
-Pure: who makes the containers is `containers`.
+`docker_testbed` makes the containers.
 """
 
 import os
 import signal
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,9 @@ from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, Usage
 
 NEAR, FAR = "near", "far"
 RESULTS, INPUTS, COMPILED = Path("/out"), Path("/in"), Path("/var/cache/offboard")
-# For each line, pages in memory and open handles of session 1, which is the part and its workers: what is
-# executed in the container beside them has sessions of its own, and process 1 is Docker's init. It starts no
-# process, as that would cost the part's CPU quota.
+# A shell script. For each line that it reads, it prints the memory pages and the open handles of session 1,
+# which are those of the part and its workers: process 1 is Docker's init, and every `docker exec` has a
+# session of its own. The script starts no process, because that would use up the CPU quota of the part.
 MEASURE = """
 while read -r _; do
   pages=0 handles=0
@@ -37,7 +37,10 @@ done
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """What all parts of a kind have alike; `http` is the port of their HTTP side, and `ready` its path."""
+    """What all parts of one kind share.
+
+    `http` is the port of their HTTP API, `ready` the path that says it is up.
+    """
 
     image: str
     command: tuple[str, ...]
@@ -46,8 +49,8 @@ class Kind:
     ready: str = ""
 
 
-# Without keys: the networks are made for one run, have no way out, and end with it; a run measures the
-# link and not the encryption, as on the local testbed. The HTTP sides are published on 127.0.0.1 alone.
+# No keys are used: the networks exist for one run only and have no way out, and a run measures the link and
+# not the encryption, as on the local testbed. The HTTP APIs are published on 127.0.0.1 only.
 KINDS: Mapping[str, Kind] = {
     CLOUD: Kind(
         "offboard-cloud",
@@ -72,7 +75,7 @@ def kind_of(part: str) -> Kind:
 
 
 def as_seen(part: str, flags: Mapping[str, Any], out: Path) -> tuple[dict[str, Any], dict[Path, Path]]:
-    """The flags as the part shall see them, and where it finds which folder of ours."""
+    """The flags with paths inside the container, and the mounts: our folder -> folder in the container."""
     seen: dict[str, Any] = {}
     folders: dict[Path, Path] = {}
     out = out.resolve()
@@ -91,28 +94,22 @@ def as_seen(part: str, flags: Mapping[str, Any], out: Path) -> tuple[dict[str, A
 
 
 def quota(cpus: float) -> dict[str, int]:
-    """How Docker holds a container to so many CPUs over 10 ms, or longer where the kernel takes no less."""
+    """Docker's options for a CPU quota, with a period of 10 ms, or longer if the kernel needs it."""
     check_cpus(cpus)
     period_us = round(1e6 * max(CGROUP_PERIOD_S, CGROUP_QUOTA_S_MIN / cpus))
     return {"cpu_period": period_us, "cpu_quota": round(cpus * period_us)}
 
 
-def hog(number: int) -> Sequence[str]:
-    """A command that keeps a CPU busy until `end_hog` of this number is executed."""
-    return ("sh", "-c", ': > "$0"; while [ -e "$0" ]; do :; done', f"/tmp/hog-{number}")
-
-
-def end_hog(number: int) -> Sequence[str]:
-    return ("rm", "-f", f"/tmp/hog-{number}")
-
-
-def measured(said: bytes) -> Usage:
-    """What MEASURE printed."""
-    pages, handles = map(int, said.split())
+def measured(output: bytes) -> Usage:
+    """The usage in one line of output of MEASURE."""
+    pages, handles = map(int, output.split())
     return Usage(memory_bytes=pages * os.sysconf("SC_PAGE_SIZE"), handles=handles)
 
 
 def as_popen(code: int) -> int:
-    """Minus the signal of 128 + signal, but for the two codes that our commands end with by themselves."""
+    """The exit code as `Popen` reports it: 128 + signal becomes -signal.
+
+    Our commands themselves exit with 130 and 141, so these two stay.
+    """
     own = (INTERRUPTED_EXIT, BROKEN_PIPE_EXIT)
     return 128 - code if code not in own and code - 128 in set(signal.Signals) else code

@@ -1,4 +1,7 @@
-"""Holds a process to a share of CPU: a cgroup where one may be made, else stopping and continuing it."""
+"""CPU quotas for processes: limits one with a cgroup if we may make one, else by stopping and continuing it.
+
+Docker limits its containers itself (`container_part.quota`).
+"""
 
 import atexit
 import contextlib
@@ -7,6 +10,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
@@ -14,18 +18,18 @@ from offboard.common.errors import ConfigError
 
 CPUS_MIN = 0.05
 CPUS_MAX = 64.0
-CGROUP_PERIOD_S = 0.010  # at the kernel's own 100 ms a quota is a staircase of 75 ms stops
-CGROUP_QUOTA_S_MIN = 0.001  # the kernel takes no less
+CGROUP_PERIOD_S = 0.010  # the kernel's default of 100 ms stops the process for 75 ms at a time
+CGROUP_QUOTA_S_MIN = 0.001  # the kernel refuses less
 SIGNAL_PERIOD_S = 0.020
-SIGNAL_STEP_S = 0.0005  # the controller looks no more often than this
-PERIODS_MADE_UP = 3  # a controller that was late makes up for at most so many periods
+SIGNAL_STEP_S = 0.0005  # shortest time between two looks of the controller
+PERIODS_MADE_UP = 3  # a late controller makes up for at most this many periods
 CLOSE_WAIT_S = 1.0
 
 
 class Quota:
-    """What holds one process; close it to let the process go.
+    """The CPU quota of one process; `close` releases the process.
 
-    `cpus` and `period_s` are what is in force, read back where the kernel keeps them.
+    `cpus` and `period_s` are the values in force, read back from the kernel if the kernel keeps them.
     """
 
     kind: str
@@ -34,15 +38,16 @@ class Quota:
 
     def __init__(self, pid: int) -> None:
         self.pid = pid
-        self._process = os.pidfd_open(pid)  # names this process for good: its number may be used again
+        # A pidfd stays valid for this process, even if its pid is used again. None: closed.
+        self._process: int | None = os.pidfd_open(pid)
         atexit.register(self.close)
 
     def set(self, cpus: float) -> None:
-        """Hold it to so many CPUs from now on."""
+        """Change the quota to this number of CPUs."""
         raise NotImplementedError
 
     def add(self, pid: int) -> None:
-        """Let another process share the quota, until this is closed."""
+        """Let another process share the quota, until `close`."""
         raise NotImplementedError
 
     def pause(self) -> None:
@@ -53,11 +58,11 @@ class Quota:
         self._signal(signal.SIGCONT)
 
     def close(self) -> None:
-        """Let the process run free. Safe to call twice, and after its end."""
-        if self._process >= 0:
+        """Let the process run without a quota. Safe to call twice, and after the end of the process."""
+        if self._process is not None:
             self._signal(signal.SIGCONT)
             os.close(self._process)
-            self._process = -1
+            self._process = None
             atexit.unregister(self.close)
 
     def __enter__(self) -> Self:
@@ -67,17 +72,19 @@ class Quota:
         self.close()
 
     def _signal(self, number: signal.Signals) -> None:
+        if self._process is None:
+            return
         with contextlib.suppress(ProcessLookupError):
             signal.pidfd_send_signal(self._process, number)
 
 
 def hold(pid: int, cpus: float) -> Quota:
-    """Hold the process, all its threads together, to `cpus` CPUs from now on."""
+    """Limit the process, with all its threads together, to `cpus` CPUs from now on."""
     check_cpus(cpus)
-    for version, home, parent in _places(pid):
+    for place in _places(pid):
         try:
-            return CgroupQuota(pid, cpus, version, home, parent)
-        except OSError:  # not ours to write, or no CPU controller here: try the next
+            return CgroupQuota(pid, cpus, place)
+        except OSError:  # we may not write here, or there is no CPU controller: try the next place
             continue
     return SignalQuota(pid, cpus)
 
@@ -87,15 +94,24 @@ def check_cpus(cpus: float) -> None:
         raise ConfigError(f"CPU quota {cpus} is not a number from {CPUS_MIN} to {CPUS_MAX:g}")
 
 
-class CgroupQuota(Quota):
-    """The kernel's own quota, in a group made under `parent`; the process goes back `home` at close."""
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a cgroup may be made: its version, the process's current group, the parent of the new group."""
 
-    def __init__(self, pid: int, cpus: float, version: int, home: Path, parent: Path) -> None:
-        self.kind = f"cgroup v{version}"
-        self._version = version
-        self._home = home
-        self._group = parent / f"offboard-{os.getpid()}-{pid}"
-        _remove_left_behind(parent)
+    version: int
+    home: Path
+    parent: Path
+
+
+class CgroupQuota(Quota):
+    """A quota by the kernel, in a new group at `place`; `close` moves the process back to its own group."""
+
+    def __init__(self, pid: int, cpus: float, place: Place) -> None:
+        self.kind = f"cgroup v{place.version}"
+        self._version = place.version
+        self._home = place.home
+        self._group = place.parent / f"offboard-{os.getpid()}-{pid}"
+        _remove_left_behind(place.parent)
         self._group.mkdir()
         try:
             self.set(cpus)
@@ -114,7 +130,7 @@ class CgroupQuota(Quota):
         (self._group / "cgroup.procs").write_text(str(pid))
 
     def close(self) -> None:
-        if self._process >= 0:
+        if self._process is not None:
             super().close()
             self._remove()
 
@@ -122,7 +138,7 @@ class CgroupQuota(Quota):
         period_us = round(1e6 * max(CGROUP_PERIOD_S, CGROUP_QUOTA_S_MIN / cpus))
         quota_us = round(cpus * period_us)
         if version == 2:
-            (self._group / "cpu.max").open("r+").close()  # absent where the controller is not delegated
+            (self._group / "cpu.max").open("r+").close()  # fails if the controller is not delegated to us
             (self._group / "cpu.max").write_text(f"{quota_us} {period_us}")
         else:
             (self._group / "cpu.cfs_period_us").write_text(str(period_us))
@@ -137,7 +153,7 @@ class CgroupQuota(Quota):
         return quota_us / period_us, period_us / 1e6
 
     def _remove(self) -> None:
-        """Move the processes back and remove the group; a dead one may take a moment to leave it."""
+        """Move the processes back and remove the group; a dead process may stay in it for a moment."""
         end = time.monotonic() + CLOSE_WAIT_S
         while self._group.exists() and time.monotonic() < end:
             with contextlib.suppress(OSError):
@@ -150,10 +166,11 @@ class CgroupQuota(Quota):
 
 
 class SignalQuota(Quota):
-    """A thread that stops the process when its CPU time of a period is used up, until the next one.
+    """A quota by a thread, which stops the process until the next period once it has used its CPU time.
 
-    CPU time beyond its share is taken off the next periods, a share not used is lost, as in the kernel.
-    Should this process be killed, the held one may stay stopped: whoever holds it sees that it dies too.
+    As in the kernel, CPU time beyond the share is taken off the next periods, and an unused share is lost.
+    If this process is killed, the limited process may stay stopped, so it must be started in such a way that
+    it dies too (`part_process`).
     """
 
     kind = "stop-continue"
@@ -162,8 +179,8 @@ class SignalQuota(Quota):
     def __init__(self, pid: int, cpus: float) -> None:
         super().__init__(pid)
         self.cpus = cpus
-        self._used_s = {pid: 0.0}  # CPU time of every process that shares the quota, as last seen
-        self._sharing: list[int] = []  # what names the others for good
+        self._used_s = {pid: 0.0}  # last known CPU time of every process that shares the quota
+        self._sharing: list[int] = []  # pidfds of the added processes
         self._lock = threading.Lock()
         self._spent = False
         self._paused = False
@@ -200,7 +217,7 @@ class SignalQuota(Quota):
             credit_s, used_s, filled_s = 0.0, self._used(), time.monotonic()
             while not self._closing.is_set():
                 now_s = time.monotonic()
-                elapsed_s = min(now_s - filled_s, PERIODS_MADE_UP * SIGNAL_PERIOD_S)  # more than one if late
+                elapsed_s = min(now_s - filled_s, PERIODS_MADE_UP * SIGNAL_PERIOD_S)
                 credit_s, filled_s = min(credit_s, 0.0) + self.cpus * elapsed_s, now_s
                 self._set(spent=credit_s <= 0)
                 while (
@@ -213,17 +230,17 @@ class SignalQuota(Quota):
                         self._set(spent=True)
 
     def _used(self) -> float:
-        """CPU seconds of all that share the quota; OSError once the held process is gone."""
+        """CPU seconds of all processes that share the quota; OSError once the limited process is gone."""
         for pid in tuple(self._used_s):
             try:
-                self._used_s[pid] = time.clock_gettime((~pid << 3) | 2)  # the number of its CPU clock
+                self._used_s[pid] = time.clock_gettime((~pid << 3) | 2)  # the id of its CPU clock
             except OSError:
                 if pid == self.pid:
                     raise
         return sum(self._used_s.values())
 
     def _set(self, spent: bool | None = None, paused: bool | None = None) -> None:
-        """Change why the process is stopped, and stop or continue it where that makes a difference."""
+        """Change the reasons to stop the process, and stop or continue it if that makes a difference."""
         with self._lock:
             stopped = self._spent or self._paused
             self._spent = self._spent if spent is None else spent
@@ -238,10 +255,10 @@ class SignalQuota(Quota):
                 signal.pidfd_send_signal(process, number)
 
 
-def _places(pid: int) -> Iterator[tuple[int, Path, Path]]:
-    """Where a group might be made, likeliest first: cgroup version, the process's own group, the parent.
+def _places(pid: int) -> Iterator[Place]:
+    """The places where a group may be made, the most likely ones first.
 
-    Version 2 wants no processes in a group that has children, so there the groups above are tried too.
+    Version 2 allows no processes in a group that has children, so there the groups above are tried too.
     """
     mounts = [line.split()[1:4] for line in Path("/proc/self/mounts").read_text().splitlines()]
     for line in Path(f"/proc/{pid}/cgroup").read_text().splitlines():
@@ -249,15 +266,15 @@ def _places(pid: int) -> Iterator[tuple[int, Path, Path]]:
         for mount, filesystem, options in mounts:
             home = Path(mount + path)
             if filesystem == "cgroup" and "cpu" in controllers.split(",") and "cpu" in options.split(","):
-                yield 1, home, home
+                yield Place(1, home, home)
             elif filesystem == "cgroup2" and controllers == "":
-                yield from (
-                    (2, home, parent) for parent in (home, *home.parents) if parent.is_relative_to(mount)
-                )
+                for parent in (home, *home.parents):
+                    if parent.is_relative_to(mount):
+                        yield Place(2, home, parent)
 
 
 def _remove_left_behind(parent: Path) -> None:
-    """Remove empty groups whose maker was killed."""
+    """Remove empty groups that a killed process left behind."""
     for group in parent.glob("offboard-*"):
         if not Path("/proc", group.name.split("-")[1]).exists():
             with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""The images of the Docker testbed, built by Compose: docker-compose.yml is their one description."""
+"""The images of the Docker testbed: builds them with Docker Compose, as docker-compose.yml describes them."""
 
 import subprocess
 from pathlib import Path
@@ -14,23 +14,23 @@ BUILD_S = 1800.0
 
 
 def check_compose() -> None:
-    """ConfigError in one line where images cannot be built here."""
+    """ConfigError if images cannot be built here."""
     if not FILE.is_file():
-        raise ConfigError(f"--testbed: docker needs {FILE} of a checkout in the current folder")
+        raise ConfigError(f"--testbed: docker: {FILE} not found; run this in a checkout of Offboard")
     try:
         asked = subprocess.run(VERSION, capture_output=True, text=True, timeout=ASK_S, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise ConfigError(f"--testbed: docker cannot be asked: {error}") from error
+        raise ConfigError(f"--testbed: docker cannot be run: {error}") from error
     if asked.returncode != 0:
-        said = (asked.stderr.strip() or "nothing").splitlines()[-1]
-        raise ConfigError(f"--testbed: docker does not answer to `{' '.join(VERSION)}`: {said}")
+        message = (asked.stderr.strip() or "no message").splitlines()[-1]
+        raise ConfigError(f"--testbed: docker: `{' '.join(VERSION)}` failed: {message}")
 
 
 def build_images() -> None:
-    """Build what has changed."""
+    """Build the images; Docker skips what has not changed."""
     try:
         code = subprocess.run(BUILD, timeout=BUILD_S, check=False).returncode
     except subprocess.TimeoutExpired as error:
-        raise OffloadError(f"{' '.join(BUILD)}: not done after {BUILD_S:g} s") from error
+        raise OffloadError(f"`{' '.join(BUILD)}` has not ended after {BUILD_S:g} s") from error
     if code != 0:
-        raise OffloadError(f"{' '.join(BUILD)}: exit code {code}")
+        raise OffloadError(f"`{' '.join(BUILD)}` failed with exit code {code}")

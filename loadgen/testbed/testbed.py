@@ -1,6 +1,6 @@
-"""What a scenario is played on: the cloud, the relay and the robots, each a *part* with a name.
+"""The contract of a testbed, which starts, changes and ends the *parts* of a run: cloud, relay and robots.
 
-`processes` and `containers` fit this contract; what happens to the parts, and when, is the player's business.
+`local_testbed` and `docker_testbed` implement it. The player decides what happens to the parts, and when.
 """
 
 from collections.abc import Mapping
@@ -9,18 +9,19 @@ from pathlib import Path
 from typing import Any, Protocol, Self
 
 CLOUD, WAN, ROBOT = "cloud", "wan", "robot"
-PART = "OFFBOARD_PART"  # in the environment of each part: its name
+PART = "OFFBOARD_PART"  # environment variable of each part that holds its name
 
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """How a part is started: flags of its command by name, and the CPUs that it is held to.
+    """How a part is started.
 
-    `command` is the sub-command that the flags belong to: `drive` or `call` of a robot.
-
-    Where it listens, and whom it calls, is the testbed's. A Path among the flags is a file that the testbed
-    lets the part see: to write where it is under the run's folder, else to read, with its folder. The output
-    of a `shown` part goes where ours does, that of others to logs/NAME.log.
+    `command` is the sub-command: `drive` or `call` of a robot, else empty.
+    `flags` are its flags, by name. The testbed adds the addresses. A Path among the flags is
+    made visible to the part: writable if it is in the folder of the run, else read-only, with its whole
+    folder.
+    `cpus` is the CPU quota; None: no quota.
+    The output of a `shown` part goes to our own output, the output of other parts to logs/NAME.log.
     """
 
     flags: Mapping[str, Any] = field(default_factory=dict)
@@ -31,16 +32,16 @@ class Setup:
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """What a part holds, its worker processes included: bytes in memory, and open files and sockets."""
+    """Resident memory, and open files and sockets, of a part and its worker processes."""
 
     memory_bytes: int
     handles: int
 
 
 class Testbed(Protocol):
-    """A context manager: whatever happens, nothing of it is left when the block is.
+    """A context manager: when the block ends, for whatever reason, nothing of the testbed is left.
 
-    `part` is a name among the setups it was made with: cloud, wan, robot, robot-2, ...
+    `part` is the name of one of its setups: cloud, wan, robot, robot-2, ...
     """
 
     out: Path
@@ -50,47 +51,53 @@ class Testbed(Protocol):
     def __exit__(self, *_: object) -> None: ...
 
     def start(self, *parts: str) -> None:
-        """Start these, or cloud and relay, again if they have ended; cloud and relay are ready on return."""
+        """Start these parts, or cloud and relay; a part that has ended is started again.
+
+        On return, cloud and relay are ready.
+        """
 
     def exit_code(self, part: str) -> int | None:
-        """Of a part that was started; None while it runs, minus the signal that ended it."""
+        """The exit code of a part that was started: None while it runs, -signal if a signal ended it."""
 
     def kill(self, part: str) -> None:
-        """End it as a crash would: SIGKILL, no chance to say anything."""
+        """End a part by SIGKILL, as a crash would."""
 
     def stop(self, part: str) -> None:
-        """Ask it to end, and make it end where it does not within a bounded time."""
+        """Ask a part to end; kill it if it does not end within a bounded time."""
 
     def pause(self, part: str) -> None:
-        """Stop it where it is, as a hang would, until `resume`."""
+        """Freeze a part, as a hang would, until `resume`."""
 
     def resume(self, part: str) -> None: ...
 
     def set_cpus(self, part: str, cpus: float) -> None:
-        """Hold a running part to so many CPUs from now on, also once it is started again."""
+        """Change the CPU quota of a running part. The quota stays when the part is started again."""
 
     def held(self, part: str) -> str | None:
-        """In words, what holds a running part to its CPUs; None where nothing does."""
+        """A description of the CPU quota of a running part, for people; None: no quota."""
 
     def set_hogs(self, part: str, count: int) -> None:
-        """So many processes from now on that compete with a running part for its CPUs; they end with it."""
+        """Set how many busy processes compete with a running part for its CPU quota.
+
+        They end with the part.
+        """
 
     def set_link(self, **changes: Any) -> dict[str, Any]:
-        """Change the link's conditions, as PUT /link of the relay takes them; the whole link on return."""
+        """Change conditions of the link, named as in PUT /link of the relay; returns the whole link."""
 
     def link(self) -> dict[str, Any]:
-        """The link as it is, with counts of connections and bytes."""
+        """The link as it is now, with its counts of connections and bytes."""
 
     def reset(self) -> None:
         """Reset every connection through the relay."""
 
     def cut(self, part: str) -> None:
-        """Cut its network: what is sent to it or by it is lost without a word, until `join`."""
+        """Cut the network of a part: what it sends, and what is sent to it, is silently lost until `join`."""
 
     def join(self, part: str) -> None: ...
 
     def usage(self, part: str) -> Usage:
-        """What a running part holds now."""
+        """The memory and handles of a running part."""
 
 
-Testbed.__test__ = False  # type: ignore[attr-defined]  # not a test, whatever pytest thinks of the name
+Testbed.__test__ = False  # type: ignore[attr-defined]  # keeps pytest from collecting it as a test

@@ -13,7 +13,7 @@ from playwright.sync_api import Browser, ConsoleMessage, Page, sync_playwright
 
 from offboard.loadgen.report.report import ReportConfig, run_report
 from tests.browser import chromium
-from tests.unit.test_evaluate import THOUSAND, csv_of
+from tests.table_loops import THOUSAND, csv_of
 from tests.unit.test_replay import trace_of
 
 

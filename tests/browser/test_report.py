@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page
 
-from offboard.loadgen.table.table_two import PAPER_WINDOWS
+from offboard.loadgen.table.table_settings import PAPER_WINDOWS
 from tests.browser.conftest import Opened
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(120)]

@@ -1,4 +1,4 @@
-"""Faults and scenarios in containers need the engine that the compose tests need."""
+"""Chaos tests in containers need the same Docker engine as the compose tests."""
 
 from tests.compose.conftest import engine
 

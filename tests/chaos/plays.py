@@ -1,8 +1,8 @@
-"""How much is played: some in `make test`, all of it in `make chaos`, which sets CHAOS=1."""
+"""How many scenarios and faults are played: some in `make test`, all in `make chaos`, which sets CHAOS=1."""
 
 import os
 
-from offboard.loadgen.scenario.scenario import find_scenario, read_scenario, shipped
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario, shipped
 
 ALL = os.environ.get("CHAOS") == "1"
 SCENARIOS = [name for name in shipped() if read_scenario(find_scenario(name)).checks]
@@ -10,11 +10,11 @@ SHORT = [name for name in SCENARIOS if name != "soak"]
 FAULT_TIMES = {"local": 20, "docker": 3} if ALL else {"local": 1, "docker": 1}
 FEW_FAULTS = {
     "local": ("truncation", "relay killed", "robot killed"),
-    "docker": (),  # tests/compose cuts networks and kills parts
+    "docker": (),  # tests/compose already cuts networks and kills parts
 }
-WRONG = SHORT if ALL else ["calm"]  # scenarios that are played with wrong policies
-BROKEN = ["dead-robot", "lying-cloud"] if ALL else ["dead-robot"]  # parts
+WRONG = SHORT if ALL else ["calm"]  # scenarios that are played with policies that must fail
+BROKEN = ["dead-robot", "lying-cloud"] if ALL else ["dead-robot"]  # broken parts that are played
 IN_CONTAINERS = SHORT if ALL else ["cloud-busy"]
-ON_LOOPBACK = SHORT if ALL else []  # with wrong policies they are played there anyway
+ON_LOOPBACK = SHORT if ALL else []  # WRONG already plays some there
 SOAK_TASKS = 400  # 20 seconds
 LEAK_TASKS = 600

@@ -1,6 +1,6 @@
-"""The fault list, played on both testbeds: nothing is lost, nothing is wrong, nothing hangs, nothing stays.
+"""The list of faults, played on both testbeds: no answer is lost, wrong or very late, and nothing is left.
 
-`make test` plays some of them once, `make chaos` 20 times on loopback and 3 times in containers.
+`make test` plays some of them once. `make chaos` plays all, 20 times on loopback and 3 times in containers.
 """
 
 import contextlib
@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 
 from offboard.common.errors import OffloadError
-from offboard.loadgen.play import play as player
-from offboard.loadgen.play.play import Played, play
-from offboard.loadgen.play.player import EVENTS, TRACE
+from offboard.loadgen.play import play_scenario
+from offboard.loadgen.play.play_scenario import Played, play
+from offboard.loadgen.play.run_files import EVENTS, TRACE
+from offboard.loadgen.scenario.event_timeline import Event
 from offboard.loadgen.scenario.scenario import CloudPart, RobotPart, Scenario, Workload
-from offboard.loadgen.scenario.timeline import Event
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, Setup, Testbed
 from offboard.robot_client.records import trace
 from tests.chaos.plays import ALL, FAULT_TIMES, FEW_FAULTS
@@ -26,13 +26,13 @@ from tests.compose.conftest import made_by_docker
 MAP = Path(__file__).parents[2] / "maps" / "depot.yaml"
 RATE = 20.0
 TIMEOUT_S = 0.5
-HUNG_S = 15.0  # the longest honest wait is the timeout and, after it, a queue of onboard plans
+HUNG_S = 15.0  # longer than the timeout and the queue of onboard plans after it
 FULL_DISK = "/dev/full"
 
 
 @dataclass(frozen=True)
 class Fault:
-    """What begins and ends it, how long it lasts, and the seconds from one to the next."""
+    """The events that begin and end a fault, how long it lasts, and the seconds from one to the next."""
 
     begin: tuple[str, object]
     end: tuple[str, object] | None = None
@@ -61,7 +61,7 @@ FAULTS = {
     "robot killed": Fault(("kill", ROBOT), ("start", ROBOT), every_s=7.0),
     "network cut": Fault(("cut", CLOUD), ("join", CLOUD)),
 }
-UNSEEN = ("robot killed",)  # no task need fall back
+UNSEEN = ("robot killed",)  # with this fault, no task needs to fall back to onboard
 
 
 LOCAL = pytest.param("local", marks=pytest.mark.integration)
@@ -71,9 +71,9 @@ pytestmark = pytest.mark.timeout(600)
 
 @pytest.fixture(autouse=True)
 def nothing_left(request: pytest.FixtureRequest) -> Iterator[None]:
-    """No process, container, network, socket or file of the testbed is there when the test is over.
+    """After the test, no process, container, network, socket or open file of the testbed is left.
 
-    What a killed one had left before may be gone by then: a testbed clears it away.
+    Things that an earlier killed testbed left behind may disappear, because a testbed removes them.
     """
     testbed = request.getfixturevalue("testbed")
     if testbed == "docker":
@@ -82,7 +82,7 @@ def nothing_left(request: pytest.FixtureRequest) -> Iterator[None]:
     before, files = set(left()), open_files()
     yield
     assert set(left()) <= before
-    assert open_files() <= files + 1, "a socket or file of the testbed is open"
+    assert open_files() <= files + 1, "a socket or file of the testbed is still open"
 
 
 def open_files() -> int:
@@ -90,7 +90,7 @@ def open_files() -> int:
 
 
 def processes() -> list[str]:
-    """Command lines of the parts that this process started."""
+    """The command lines of the parts that this process started."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
@@ -101,7 +101,7 @@ def processes() -> list[str]:
 
 
 def scenario(fault: Fault | None, times: int) -> Scenario:
-    """Plans on a real map at a steady rate, sent to the cloud, and the fault so many times."""
+    """Plans on a real map, sent to the cloud at a steady rate, and the fault `times` times."""
     seconds = 3.0 if fault is None else 2.0 + times * fault.every_s
     workload = Workload(
         map=MAP, resolution=0.05, tasks=int(RATE * seconds), arrivals="poisson", rate=RATE, jump=True
@@ -112,8 +112,8 @@ def scenario(fault: Fault | None, times: int) -> Scenario:
 
 
 def check(played: Played) -> None:
-    """Every task was answered once, rightly, and in bounded time."""
-    figures = player.figures(played.outcome, played.scenario)
+    """Every task was answered exactly once, correctly, and in time."""
+    figures = play_scenario.figures(played.outcome, played.scenario)
     assert (figures["lost"], figures["wrong"], figures["failed"]) == (0, 0, 0), [
         one.wrong or one.error for one in played.outcome.answered if one.wrong or one.error
     ]
@@ -132,7 +132,7 @@ def check(played: Played) -> None:
     ],
 )
 def test_a_fault_costs_no_task(testbed: str, name: str, tmp_path: Path) -> None:
-    """All answered, every path right, the trace whole; and the fault was felt."""
+    """Every task is answered correctly, the trace is complete, and some tasks fell back to onboard."""
     times = FAULT_TIMES[testbed]
     played = play(scenario(FAULTS[name], times), tmp_path, testbed, quiet=True)
     check(played)
@@ -143,7 +143,7 @@ def test_a_fault_costs_no_task(testbed: str, name: str, tmp_path: Path) -> None:
     ids = {record["id"] for record in records}
     assert len(ids) == len(records)
     relays = 1 + (times if name == "relay killed" else 0)
-    assert len(list(tmp_path.glob("link*.jsonl"))) == relays, "the truth of a killed relay is kept"
+    assert len(list(tmp_path.glob("link*.jsonl"))) == relays, "the link record of a killed relay is kept"
     fell_back = sum(record["used"] != CLOUD for record in records)
     print(f"{name} x {times} on {testbed}: {len(records)} tasks, {fell_back} answered onboard")
     assert fell_back or name in UNSEEN
@@ -153,15 +153,15 @@ def test_a_fault_costs_no_task(testbed: str, name: str, tmp_path: Path) -> None:
 def test_a_full_disk_costs_the_trace_and_no_task(
     testbed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The trace cannot be written: the robot says so and ends with 1, all tasks are answered."""
-    make: Callable[[Path, Mapping[str, Setup]], Testbed] = player.TESTBEDS[testbed]
+    """If the trace cannot be written, all tasks are answered, and the robot says so and exits with 1."""
+    make: Callable[[Path, Mapping[str, Setup]], Testbed] = play_scenario.TESTBEDS[testbed]
 
     def full(out: Path, setups: Mapping[str, Setup]) -> Testbed:
         robot = setups[ROBOT]
         flags = {**robot.flags, "trace": FULL_DISK}
         return make(out, {**setups, ROBOT: replace(robot, flags=flags)})
 
-    monkeypatch.setitem(player.TESTBEDS, testbed, full)
+    monkeypatch.setitem(play_scenario.TESTBEDS, testbed, full)
     played = play(scenario(None, 1), tmp_path, testbed, quiet=True)
     check(played)
     with pytest.raises(OffloadError, match="robot ended with exit code 1"):

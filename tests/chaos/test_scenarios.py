@@ -1,4 +1,4 @@
-"""Scenarios played for real: their checks are computed, and the same seed asks the same of the same link."""
+"""Scenarios played with real processes: their checks are computed, and a seed always gives the same run."""
 
 import json
 from dataclasses import replace
@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from offboard.loadgen.play import play as player
-from offboard.loadgen.play.play import play
-from offboard.loadgen.play.player import EVENTS, TRACE
-from offboard.loadgen.scenario.outcome import read_lines
-from offboard.loadgen.scenario.scenario import find_scenario, read_scenario
-from offboard.loadgen.scenario.timeline import Event
+from offboard.loadgen.play import play_scenario
+from offboard.loadgen.play.play_scenario import play
+from offboard.loadgen.play.run_files import EVENTS, TRACE
+from offboard.loadgen.scenario.event_timeline import Event
+from offboard.loadgen.scenario.outcome_files import read_lines
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.robot_client.records import trace
 from tests.chaos.plays import IN_CONTAINERS, ON_LOOPBACK, SOAK_TASKS
 
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.timeout(600)
 def test_a_scenario_is_played_and_judged(
     request: pytest.FixtureRequest, tmp_path: Path, testbed: str, name: str
 ) -> None:
-    """By the published rule: every check has a figure, nothing is lost and nothing wrong."""
+    """With the published rule, every check has a value, and no answer is lost or wrong."""
     if testbed == "docker":
         request.getfixturevalue("engine")
     scenario = read_scenario(find_scenario(name))
@@ -38,18 +38,18 @@ def test_a_scenario_is_played_and_judged(
     print(*played.verdicts, sep="\n")
     assert len(played.verdicts) == len(scenario.checks)
     assert all(verdict.value is not None for verdict in played.verdicts)
-    figures = player.figures(played.outcome, scenario)
+    figures = play_scenario.figures(played.outcome, scenario)
     assert (figures["lost"], figures["wrong"]) == (0, 0)
     happened = read_lines(tmp_path / EVENTS)
     assert len(happened) == len(scenario.timeline())
     assert all(event["happened_s"] is not None for event in happened)
-    summary = json.loads((tmp_path / player.SUMMARY).read_text())
+    summary = json.loads((tmp_path / play_scenario.SUMMARY).read_text())
     assert [check["holds"] for check in summary["checks"]] == [one.holds for one in played.verdicts]
 
 
 @pytest.mark.integration
-def test_one_seed_is_one_run(tmp_path: Path) -> None:
-    """Twice the same scenario and seed: the same tasks, sizes, events and draws of the link."""
+def test_the_same_seed_gives_the_same_run(tmp_path: Path) -> None:
+    """Two runs with the same seed have the same tasks, sizes, events, and random delays of the link."""
     scenario = read_scenario(find_scenario("lossy")).changed(tasks=24, policy="cloud")
     runs = []
     for name in ("a", "b"):
@@ -69,9 +69,9 @@ def test_one_seed_is_one_run(tmp_path: Path) -> None:
 
 
 def drawn(truth: Path) -> dict[Any, tuple[float, float]]:
-    """Jitter and stall of each segment, by connection, direction and number.
+    """The jitter and the stall of each segment, by connection, direction and number.
 
-    How many chunks a segment comes in is a matter of the moment; the first of them has its stall.
+    The number of chunks of a segment depends on the moment; its first chunk has the stall.
     """
     found: dict[Any, tuple[float, float]] = {}
     for line in read_lines(truth):
@@ -82,8 +82,8 @@ def drawn(truth: Path) -> dict[Any, tuple[float, float]]:
 
 
 @pytest.mark.integration
-def test_a_while_of_faults_costs_nothing(tmp_path: Path) -> None:
-    """The soak, shortened: twenty tasks a second and random faults; none lost, none wrong, nothing grows."""
+def test_random_faults_cost_no_task(tmp_path: Path) -> None:
+    """In a shortened soak, with twenty tasks per second and random faults, every check holds."""
     played = play(read_scenario(find_scenario("soak")).changed(tasks=SOAK_TASKS), tmp_path, quiet=True)
     played.check_robots()
     print(*played.verdicts, sep="\n")
@@ -91,8 +91,8 @@ def test_a_while_of_faults_costs_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.integration
-def test_an_event_in_vain_is_skipped_and_says_why(tmp_path: Path) -> None:
-    """What cannot happen to a part as it is does not end the run."""
+def test_an_impossible_event_is_skipped_with_a_reason(tmp_path: Path) -> None:
+    """An event that is impossible for the state of its part is skipped, and the run goes on."""
     events = (
         Event("start", "cloud", at_task=2),
         Event("resume", "cloud", at_task=4),
@@ -104,7 +104,7 @@ def test_an_event_in_vain_is_skipped_and_says_why(tmp_path: Path) -> None:
     )
     scenario = read_scenario(find_scenario("calm")).changed(tasks=30)
     played = play(replace(scenario, events=events, checks=()), tmp_path, quiet=True)
-    assert player.figures(played.outcome, scenario)["lost"] == 0
+    assert play_scenario.figures(played.outcome, scenario)["lost"] == 0
     happened = read_lines(tmp_path / EVENTS)
     assert [event.get("skipped") for event in happened] == [
         "cloud was running",

@@ -1,4 +1,4 @@
-"""The compose project of the tests: built once, started once, taken away at the end."""
+"""The Compose project of the tests: built once, started once, removed at the end."""
 
 import json
 import os
@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from offboard.loadgen.testbed.containers import RUN
+from offboard.loadgen.testbed.docker_engine import RUN
 
 ROOT = Path(__file__).parents[2]
 PROJECT = "offboard-test"
@@ -27,7 +27,7 @@ COMMAND_S = 600
 
 
 class Compose:
-    """`docker compose` on the project of the tests."""
+    """Runs `docker compose` on the project of the tests."""
 
     url = f"http://127.0.0.1:{HTTP_PORT}"
     wan_url = f"http://127.0.0.1:{WAN_HTTP_PORT}"
@@ -49,7 +49,7 @@ class Compose:
 
     @contextmanager
     def running(self, service: str, module: str) -> Iterator[tuple[str, Callable[[], Any]]]:
-        """A container that answers a line of JSON for each line; its name, and the call that asks."""
+        """A container that answers each line with a line of JSON; its name, and a function that asks."""
         name = f"{PROJECT}-{service}-asked"
         process = subprocess.Popen(
             [*self.command, *self.files, "run", "--rm", "-T", "--no-deps", "--name", name, service, module],
@@ -75,7 +75,7 @@ class Compose:
             process.stdout.close()
 
     def exit_code(self, service: str) -> int:
-        """Wait until a service has ended."""
+        """Wait until a service has ended; its exit code."""
         container = self("ps", "-aq", service).strip()
         return int(docker("wait", container))
 
@@ -87,7 +87,7 @@ def docker(*args: str) -> str:
 
 
 def made_by_docker(run: str | None = None) -> list[str]:
-    """Containers and networks of a testbed's run, or of any."""
+    """The containers and networks of one testbed run, or of all runs."""
     mine = ("--filter", f"label={RUN}" if run is None else f"label={RUN}={run}", "--format")
     return [
         *docker("ps", "--all", *mine, "{{.Names}}").split(),
@@ -96,7 +96,7 @@ def made_by_docker(run: str | None = None) -> list[str]:
 
 
 def engine_problem() -> str | None:
-    """Why there is no Docker engine with Compose v2 here, or None."""
+    """Why there is no Docker engine with Compose v2; None if there is one."""
     for command in (["docker", "info"], ["docker", "compose", "version"]):
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=30)
@@ -109,7 +109,7 @@ def engine_problem() -> str | None:
 
 @pytest.fixture(scope="session")
 def engine() -> None:
-    """A Docker engine that answers; without one the test is skipped, in CI it fails."""
+    """A Docker engine that answers. Without one the test is skipped; in CI it fails."""
     problem = engine_problem()
     if problem and os.environ.get("CI") == "true":
         pytest.fail(f"CI has no Docker engine: {problem}")
@@ -118,8 +118,8 @@ def engine() -> None:
 
 
 @pytest.fixture(scope="module")
-def up(engine: None) -> Iterator[Compose]:  # noqa: ARG001 - it skips
-    """The project, up; the robot may still be at work."""
+def up(engine: None) -> Iterator[Compose]:  # noqa: ARG001 - skips without an engine
+    """The started project; its robot may still be driving."""
     compose = Compose()
     compose("down", "--volumes", "--remove-orphans")
     compose("build")

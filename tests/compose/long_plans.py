@@ -1,4 +1,4 @@
-"""Runs in a container: for each line on stdin one long plan onboard; prints quota and times as JSON."""
+"""Runs in a container: makes one long plan for each line on stdin, and prints quota and times as JSON."""
 
 import json
 import sys
@@ -8,12 +8,12 @@ from pathlib import Path
 from offboard.common.planning.maps import read_map, resampled
 from offboard.common.planning.planner import Point, Pose, plan_path
 
-SETTLE_S = 0.3  # whoever changed the quota is done with the CPU
+SETTLE_S = 0.3  # until the program that changed the quota needs no more CPU
 V2, V1 = Path("/sys/fs/cgroup/cpu.max"), Path("/sys/fs/cgroup/cpu")
 
 
 def quota() -> list[int]:
-    """Microseconds of CPU, and of the period, that this container may take; -1 is no limit."""
+    """The CPU quota of this container and its period, in microseconds; a quota of -1 means no limit."""
     if V2.exists():
         taken, period = V2.read_text().split()
         return [-1 if taken == "max" else int(taken), int(period)]
@@ -21,7 +21,7 @@ def quota() -> list[int]:
 
 
 grid = resampled(read_map(Path("/maps/willow-full-0.05.yaml")), 0.0125)
-# Nearly every cell that can be reached is nearer than this goal.
+# A far goal: the search visits nearly every cell that can be reached.
 start, goal = Pose(29.18, 3.32), Point(47.03, 40.78)
 assert plan_path(grid, None, start, goal, 0.15).status == "NONE"
 for _ in sys.stdin:

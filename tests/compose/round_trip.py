@@ -1,4 +1,4 @@
-"""Runs in a container: times empty tasks to the cloud; prints the seconds of each as JSON."""
+"""Runs in a container: sends empty tasks to the cloud, and prints the seconds of each as JSON."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""The testbed in real containers."""
+"""`docker compose up`: the three processes in real containers."""
 
 import json
 import statistics
@@ -14,7 +14,7 @@ from tests.compose.conftest import Compose, docker
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
 
 DELAY_S = 0.030  # round trip of the relay
-RELAY_S_MAX = 0.003  # what everything else may add to an empty task
+RELAY_S_MAX = 0.003  # the most that everything else may add to an empty task
 ROBOT_CPUS = 0.2
 PERIOD_US = 10_000
 PAIRS = 12
@@ -34,8 +34,8 @@ def token_of(up: Compose) -> str:
     return up("exec", "-T", "cloud", "cat", "/token/token").strip()
 
 
-def test_the_robot_finishes_and_its_table_is_printed(up: Compose, tmp_path: Path) -> None:
-    """`docker compose up` ends with the robot's summary and table, both exit 0; the trace is readable."""
+def test_the_robot_finishes_and_the_table_is_printed(up: Compose, tmp_path: Path) -> None:
+    """The robot and the table exit with 0, both print their results, and the trace is complete."""
     assert up.exit_code("robot") == 0, up("logs", "robot")
     assert up.exit_code("table") == 0, up("logs", "table")
     assert "80 tasks answered" in up("logs", "robot")
@@ -47,8 +47,8 @@ def test_the_robot_finishes_and_its_table_is_printed(up: Compose, tmp_path: Path
     assert sum(record["decision"]["both"] for record in records) == 60
 
 
-def test_the_server_stays_up_for_curl(up: Compose) -> None:
-    """/health, /ready, /metrics and /tasks answer on the host after the robot has ended, with the token."""
+def test_the_server_stays_up_after_the_robot(up: Compose) -> None:
+    """After the robot has ended, the HTTP API answers on the host; most of it needs the token."""
     up.exit_code("robot")
     token = token_of(up)
     assert json.loads(get(f"{up.url}/health")[1]) == {"healthy": True, "insecure": False}
@@ -59,8 +59,8 @@ def test_the_server_stays_up_for_curl(up: Compose) -> None:
     assert "plan_path" in [one["name"] for one in json.loads(get(f"{up.url}/tasks", token)[1])]
 
 
-def test_the_robot_has_no_way_to_the_cloud_but_the_relay(up: Compose) -> None:
-    """From the robot's network the cloud has no name and its address cannot be reached."""
+def test_the_robot_can_reach_the_cloud_only_through_the_relay(up: Compose) -> None:
+    """From the network of the robot, the cloud has no name, and its address cannot be reached."""
     containers = {service: up("ps", "-aq", service).strip() for service in ("cloud", "wan")}
     networks = {
         service: json.loads(docker("inspect", "-f", "{{json .NetworkSettings.Networks}}", container))
@@ -83,7 +83,7 @@ def test_the_robot_has_no_way_to_the_cloud_but_the_relay(up: Compose) -> None:
 
 
 def test_an_empty_task_takes_the_links_round_trip(up: Compose) -> None:
-    """Without a quota on the robot the median empty task takes 30 ms and at most 3 ms more."""
+    """Without a CPU quota on the robot, the median empty task takes 30 to 33 ms."""
     up.exit_code("robot")
     free = json.loads(up("run", "--rm", "--no-deps", "probe"))
     held = json.loads(up("run", "--rm", "--no-deps", "held-probe"))
@@ -93,10 +93,10 @@ def test_an_empty_task_takes_the_links_round_trip(up: Compose) -> None:
 
 
 def test_the_quota_slows_long_plans_by_its_share(up: Compose) -> None:
-    """A long plan takes its CPU time over the share of CPU, -15 % in the median, +15 % at best.
+    """A long plan takes its CPU time divided by the quota: at least -15 % in the median, +15 % at best.
 
-    Each pair runs in one process, with the quota off and on by turns. What else the machine does makes the
-    CPU time itself longer, by cold caches, and waits come on top: they are no matter of the quota.
+    Each pair runs in one process, first without and then with the quota. Other load on the machine makes the
+    CPU time longer (cold caches) and adds waits; neither depends on the quota.
     """
     up.exit_code("robot")
     held_us = int(ROBOT_CPUS * PERIOD_US)
@@ -117,13 +117,13 @@ def test_the_quota_slows_long_plans_by_its_share(up: Compose) -> None:
     print(
         f"long plan: {free_ms:.1f} ms free; {held_ms:.1f} at {ROBOT_CPUS} CPU, {usual:.2f} times its CPU time"
     )
-    assert min(free) < 1 / ROBOT_CPUS / 2, "without the quota nothing holds it"
+    assert min(free) < 1 / ROBOT_CPUS / 2, "without a quota, nothing slows the plan"
     assert usual > (1 - SHARE_TOLERANCE) / ROBOT_CPUS
-    assert min(held) < (1 + SHARE_TOLERANCE) / ROBOT_CPUS, "what else the machine does only adds to it"
+    assert min(held) < (1 + SHARE_TOLERANCE) / ROBOT_CPUS, "other load can only make it longer"
 
 
 def test_the_cloud_has_its_own_quota(up: Compose) -> None:
-    """The server's container is held to one CPU over 10 ms."""
+    """The container of the server has a quota of one CPU over 10 ms."""
     container = up("ps", "-q", "cloud").strip()
     limits = json.loads(docker("inspect", "-f", "{{json .HostConfig}}", container))
     assert (limits["CpuQuota"], limits["CpuPeriod"], limits["NanoCpus"]) == (10_000, 10_000, 0)
@@ -132,15 +132,15 @@ def test_the_cloud_has_its_own_quota(up: Compose) -> None:
 
 
 def test_the_relay_can_be_read_and_changed_from_the_host(up: Compose) -> None:
-    """GET /link says what the link does, to whoever has the token."""
+    """GET /link with the token returns the conditions of the link; without the token it is refused."""
     link = json.loads(get(f"{up.wan_url}/link", token_of(up))[1])
     assert link["up"]["delay_ms"] == link["down"]["delay_ms"] == 15.0
     assert get(f"{up.wan_url}/link")[0] == 401
 
 
 @pytest.mark.parametrize("service", ["keys", "cloud", "wan", "robot", "table"])
-def test_containers_can_do_little(up: Compose, service: str) -> None:
-    """No root, no capability, no new privilege, nothing to write to, memory and processes bounded."""
+def test_containers_have_few_rights(up: Compose, service: str) -> None:
+    """A container has no root user, no capabilities, a read-only disk, and limits on memory and processes."""
     (found,) = json.loads(docker("inspect", up("ps", "-aq", service).strip()))
     host = found["HostConfig"]
     assert found["Config"]["User"] == "offboard"
@@ -151,23 +151,23 @@ def test_containers_can_do_little(up: Compose, service: str) -> None:
 
 
 @pytest.mark.parametrize("image", ["offboard-cloud", "offboard-robot", "offboard-bench"])
-def test_images_have_no_compiler(up: Compose, image: str) -> None:  # noqa: ARG001 - it builds them
-    """Who gets into a container finds nothing to build with."""
+def test_images_have_no_compiler(up: Compose, image: str) -> None:  # noqa: ARG001 - builds the images
+    """An attacker in a container finds no compiler."""
     tools = "cc gcc g++ c++ clang tcc make ld as"
     look = f"for tool in {tools}; do command -v $tool || true; done"
     assert docker("run", "--rm", "--network", "none", "--entrypoint", "sh", image, "-c", look).split() == []
 
 
-def test_the_robot_pins_the_server_and_has_no_key_of_it(up: Compose) -> None:
-    """The robot's keys are its own and the server's public one; it runs by CURVE."""
+def test_the_robot_knows_only_the_public_key_of_the_server(up: Compose) -> None:
+    """The robot has its own key pair and the public key of the server, and the server knows the robot."""
     list_keys = "from pathlib import Path; print(*sorted(path.name for path in Path('/keys').iterdir()))"
     names = up("run", "--rm", "--no-deps", "--entrypoint", "python3", "probe", "-c", list_keys).split()
     assert names == ["robot.key", "robot.key_secret", "server.key"]
     assert "robots known: robot" in up("logs", "cloud")
 
 
-def test_unit_tests_pass_in_the_image(engine: None) -> None:  # noqa: ARG001 - it skips
-    """The unit tests pass on the image's Python, as the image's user."""
+def test_unit_tests_pass_in_the_image(engine: None) -> None:  # noqa: ARG001 - skips without an engine
+    """The unit tests pass with the Python of the image, as its user."""
     docker("build", "--target", "test", "--tag", "offboard-unit", ".")
     version = docker("run", "--rm", "--entrypoint", "python3", "offboard-unit", "--version")
     output = docker("run", "--rm", "offboard-unit")

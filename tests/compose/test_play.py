@@ -1,4 +1,4 @@
-"""Scenarios played in containers by `loadgen`."""
+"""`loadgen dataset` and `loadgen run` with containers."""
 
 import json
 import os
@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from offboard.loadgen.table.rows import read
-from offboard.loadgen.testbed.containers import PREFIX
+from offboard.loadgen.table.measured_rows import read
+from offboard.loadgen.testbed.docker_engine import PREFIX
 from tests.compose.conftest import ROOT, docker, made_by_docker
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600), pytest.mark.usefixtures("engine")]
@@ -24,13 +24,13 @@ def loadgen(*args: str | Path) -> list[str]:
 
 
 def robot_runs(host: int) -> bool:
-    """Whether that of this `loadgen` process does."""
+    """Whether the robot container of this `loadgen` process is running."""
     names = docker("ps", "--format", "{{.Names}}").split()
     return any(name.startswith(f"{PREFIX}-{host}-") and name.endswith("-robot") for name in names)
 
 
 def test_a_dataset_is_measured_in_containers(tmp_path: Path) -> None:
-    """Every row has both times, its JSON tells of the containers, and nothing of them is left."""
+    """Every row has both times, the JSON file names the Docker version, and no container is left."""
     before = set(made_by_docker())
     done = subprocess.run(
         loadgen(
@@ -51,7 +51,7 @@ def test_a_dataset_is_measured_in_containers(tmp_path: Path) -> None:
 
 
 def test_an_interrupted_run_leaves_no_container(tmp_path: Path) -> None:
-    """Ctrl-C while the robot drives: exit 130, and containers and networks are gone."""
+    """After Ctrl-C while the robot drives: exit code 130, and containers and networks are gone."""
     before = set(made_by_docker())
     log = tmp_path / "log"
     with log.open("w") as output:

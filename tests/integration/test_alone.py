@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from offboard.loadgen.table.disturbance import measure
-from offboard.loadgen.testbed.processes import LocalTestbed
+from offboard.loadgen.table.site_disturbance import measure
+from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import PINNED
 from offboard.robot_client.records.trace import read

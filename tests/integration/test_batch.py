@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from offboard.loadgen.testbed.processes import COMMANDS, LocalTestbed
+from offboard.loadgen.testbed.local_testbed import COMMANDS, LocalTestbed
 from offboard.loadgen.testbed.testbed import Setup
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(150)]

@@ -1,4 +1,4 @@
-"""`loadgen compare` on real processes: it is killed half way, and goes on from there."""
+"""`loadgen compare` with real processes: a killed comparison is resumed."""
 
 import os
 import subprocess
@@ -56,19 +56,19 @@ def compare(
 
 
 def kill_in_the_second_run(folder: Path) -> None:
-    """SIGKILL once it has answered some of its tasks, and not all."""
+    """Run the comparison and kill it once some tasks of its second run are answered."""
     command = [*COMMAND, "--policies", ",".join(POLICIES)]
     answers, until = folder / "runs" / "small" / "1-onboard" / "answers.jsonl", time.monotonic() + WAIT_S
     with subprocess.Popen(command, cwd=folder, env=ENVIRONMENT, stderr=subprocess.DEVNULL) as process:
         while not answers.exists() or len(answers.read_bytes().splitlines()) < TASKS // 8:
-            assert time.monotonic() < until, "the second run has not begun"
+            assert time.monotonic() < until, "the second run did not begin"
             time.sleep(0.01)
         process.kill()
     assert len(answers.read_bytes().splitlines()) < TASKS
 
 
-def test_a_comparison_goes_on_where_it_was_killed(tmp_path: Path) -> None:
-    """What had ended is taken as it is, what was half done is played again, and the table is of all."""
+def test_a_killed_comparison_is_resumed(tmp_path: Path) -> None:
+    """Finished runs are used, the interrupted one is played again, and the table contains all runs."""
     (tmp_path / "small.toml").write_text(SCENARIO)
     kill_in_the_second_run(tmp_path)
     first = tmp_path / "runs" / "small" / "1-paper"
@@ -77,24 +77,24 @@ def test_a_comparison_goes_on_where_it_was_killed(tmp_path: Path) -> None:
     folder = Path("runs") / "small"
     assert again.stderr.splitlines() == [
         "small, seed 1, policy paper",
-        f"taken from before: {folder / '1-paper'}",
+        f"using the finished run in {folder / '1-paper'}",
         "small, seed 1, policy onboard",
-        f"played again in {folder / '1-onboard'}: it did not come to its end",
+        f"playing the run in {folder / '1-onboard'} again: it was not played to its end",
         "small, seed 1, policy cloud",
     ]
     assert {path: path.stat().st_mtime_ns for path in first.iterdir()} == before
     once_more = compare(tmp_path)
-    assert once_more.stderr.count("taken from before") == len(POLICIES)
+    assert once_more.stderr.count("using the finished run") == len(POLICIES)
     assert once_more.stdout == again.stdout
     heading, *lines = (line.split(",") for line in once_more.stdout.splitlines())
     measured = [dict(zip(heading, line, strict=True)) for line in lines]
     found = {one["policy"]: one for one in measured if not one["bound"]}
     assert [int(one["tasks"]) for one in found.values()] == [TASKS] * len(POLICIES)
-    assert found["cloud"]["recovery"] == "0.0"  # it sends all there, silent or not
+    assert found["cloud"]["recovery"] == "0.0"  # this policy sends every task there, outage or not
     assert found["onboard"]["recovery"] == ""
     assert 0 < float(found["cloud"]["coverage_percent"]) <= 100
     reference = tmp_path / folder / "1-onboard" / "trace.reference.jsonl"
     assert reference.exists()
     quick = compare(tmp_path, "--reference", "0", policies=("onboard",))
-    assert "its scenario or settings were others" in quick.stderr
+    assert "its scenario or settings were different" in quick.stderr
     assert not reference.exists()

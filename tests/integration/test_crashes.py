@@ -19,7 +19,7 @@ from offboard.cloud_server import worker_pool as worker_processes
 from offboard.cloud_server.executors import Outcome, Processes
 from offboard.common.errors import CloudTimeout, TaskFailed
 from offboard.common.wire.messages import decode, encode
-from offboard.loadgen.testbed.processes import LocalTestbed
+from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.sites.runner import CLOUD
 from tests import crashes

@@ -1,4 +1,4 @@
-"""`loadgen dataset` on real processes."""
+"""`loadgen dataset` with real processes."""
 
 import json
 import subprocess
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from offboard.loadgen.table.rows import read
+from offboard.loadgen.table.measured_rows import read
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
 
@@ -27,7 +27,7 @@ def loadgen(*args: str, cwd: Path = ROOT) -> str:
 
 
 def test_a_dataset_says_how_it_was_measured(tmp_path: Path) -> None:
-    """Rows, and beside them the settings, the machine, and the disturbance, which the table prints."""
+    """Its JSON file holds settings, machine and disturbance, and `loadgen table` prints its notes."""
     out = loadgen(
         *("dataset", "paper", "--testbed", "local", "--rows", "12", "--alone", "3", "--seed", "9"),
         *("--out", str(tmp_path), "--run", str(tmp_path / "run")),
@@ -40,7 +40,7 @@ def test_a_dataset_says_how_it_was_measured(tmp_path: Path) -> None:
     assert about["command"].startswith("loadgen dataset paper --testbed local")
     onboard = about["disturbance"]["sites"]["onboard"]
     assert onboard["seconds"]["pairs"] == 3
-    assert 0.1 < onboard["cpu_share"] < 1.1, onboard  # planning, not sleeping; short plans escape the quota
+    assert 0.1 < onboard["cpu_share"] < 1.1, onboard  # a plan computes; a short one ends within its quota
     table = loadgen("table", "paper.csv", "--windows", "5", cwd=tmp_path)
     assert "robot 0.2 CPU" in table
-    assert "onboard, beside cloud: " in table
+    assert "onboard, total time: " in table

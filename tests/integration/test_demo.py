@@ -1,4 +1,4 @@
-"""The main job on the local testbed, shortened: a real map, three processes, a held robot."""
+"""`loadgen run demo`, shortened: a real map, three processes, and a robot with a CPU quota."""
 
 import os
 import signal
@@ -24,7 +24,7 @@ def loadgen(*args: str | Path) -> list[str]:
 
 
 def marked_processes() -> dict[int, str]:
-    """Process id and command line of all that runs with this test's mark in its environment."""
+    """Process ids and command lines of all processes with the mark of this test in their environment."""
     left = {}
     for process in Path("/proc").glob("[0-9]*"):
         try:
@@ -38,7 +38,7 @@ def marked_processes() -> dict[int, str]:
 
 @contextmanager
 def running_demo(out: Path) -> Iterator[subprocess.Popen[str]]:
-    """`loadgen run demo`, once its first tasks are answered."""
+    """`loadgen run demo`, from when its first tasks are answered."""
     name, value = MARK.split("=")
     host = subprocess.Popen(
         loadgen("run", "demo", "--out", out),
@@ -64,8 +64,8 @@ def running_demo(out: Path) -> Iterator[subprocess.Popen[str]]:
         host.stderr.close()
 
 
-def test_a_scenario_is_played_to_its_end(tmp_path: Path) -> None:
-    """`loadgen run`: every plan answered on both sites, the map there before, the quota in force, exit 0."""
+def test_a_scenario_can_be_played_to_its_end(tmp_path: Path) -> None:
+    """Both sites answer every plan, the map is uploaded before the first task, and the quota is in force."""
     done = subprocess.run(
         loadgen("run", "demo", "--tasks", "24", "--measure", "both", "--out", tmp_path),
         capture_output=True,
@@ -83,8 +83,8 @@ def test_a_scenario_is_played_to_its_end(tmp_path: Path) -> None:
     assert all(one["bytes_out"] < 100_000 for record in records for one in record["executions"])
 
 
-def test_the_same_seed_plays_the_same_tasks(tmp_path: Path) -> None:
-    """Two runs of one seed ask for plans of the same sizes, whatever their times were."""
+def test_the_same_seed_gives_the_same_tasks(tmp_path: Path) -> None:
+    """Two runs with the same seed ask for plans of the same sizes."""
     sizes = []
     for name in ("a", "b"):
         out = tmp_path / name
@@ -98,7 +98,7 @@ def test_the_same_seed_plays_the_same_tasks(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_leaves_nothing_behind(tmp_path: Path, number: signal.Signals) -> None:
-    """Ctrl-C or SIGTERM half-way: exit code 130 or 143, no process left, every line of the trace whole."""
+    """After Ctrl-C or SIGTERM: exit code 130 or 143, no process is left, every line of the trace is whole."""
     with running_demo(tmp_path) as host:
         host.send_signal(number)
         assert host.wait(30) == 128 + number
@@ -106,8 +106,8 @@ def test_an_interrupted_run_leaves_nothing_behind(tmp_path: Path, number: signal
     assert len(list(read(tmp_path / "trace.jsonl"))) >= 5
 
 
-def test_a_killed_robot_is_a_failed_run(tmp_path: Path) -> None:
-    """Kill -9 of the robot: exit code 1 with one line that says so, no process left."""
+def test_a_killed_robot_fails_the_run(tmp_path: Path) -> None:
+    """After kill -9 of the robot: exit code 1, one line that says why, and no process is left."""
     with running_demo(tmp_path) as host:
         (robot,) = (pid for pid, command in marked_processes().items() if "robot_client" in command)
         os.kill(robot, signal.SIGKILL)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from offboard.common.errors import CloudTimeout
-from offboard.loadgen.testbed.processes import LocalTestbed
+from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.loadgen.testbed.testbed import Setup
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.records.trace import Record

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from offboard.loadgen.testbed.processes import LocalTestbed
+from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.robot_client.policies import PINNED
 from offboard.robot_client.records import trace
 from offboard.robot_client.simulated import answers, references

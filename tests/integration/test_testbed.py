@@ -1,4 +1,4 @@
-"""The local testbed is held to the testbed contract of `tests.testbeds`, with the real parts."""
+"""The local testbed keeps the testbed contract of `tests.testbeds`, with the real parts."""
 
 import contextlib
 import os
@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from offboard.common.errors import ConfigError
-from offboard.loadgen.testbed.containers import DockerTestbed
-from offboard.loadgen.testbed.processes import HOG, LocalTestbed
+from offboard.loadgen.testbed.docker_testbed import DockerTestbed
+from offboard.loadgen.testbed.local_testbed import HOG, LocalTestbed
 from offboard.loadgen.testbed.testbed import Setup
 from tests.testbeds import CONTRACT, Bench, setups
 
@@ -19,13 +19,13 @@ pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    """Cloud and relay, started; robots that can be."""
+    """A testbed with cloud and relay started, and robots that can be started."""
     out = tmp_path_factory.mktemp("local")
     with LocalTestbed(out, setups(out)) as bed:
         bed.start()
 
         def cpu(part: str) -> tuple[float, float]:
-            processes = [bed.child(part), *bed._hogs.get(part, [])]
+            processes = [bed.child(part), *bed.hogs(part)]
             used_s = sum(time.clock_gettime((~one.process.pid << 3) | 2) for one in processes)
             return time.monotonic(), used_s
 
@@ -34,7 +34,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 
 
 def hogs() -> list[int]:
-    """Live hogs of this process; zombies have no command."""
+    """The process ids of live hogs of this process; zombies have no command line."""
     found = []
     for process in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
@@ -46,12 +46,12 @@ def hogs() -> list[int]:
 
 @pytest.mark.parametrize("sentence", CONTRACT, ids=lambda sentence: sentence.__name__)
 def test_the_local_testbed_keeps_the_contract(bench: Bench, sentence: Callable[[Bench], None]) -> None:
-    """Each sentence of the contract, on processes."""
+    """Each sentence of the contract holds with local processes."""
     sentence(bench)
 
 
-def test_an_unknown_flag_is_the_parts_own_line(tmp_path: Path) -> None:
-    """A part that does not know a flag says so, as ConfigError."""
+def test_an_unknown_flag_is_reported_in_the_words_of_the_part(tmp_path: Path) -> None:
+    """A part that does not know a flag ends, and its message becomes a ConfigError."""
     with (
         LocalTestbed(tmp_path, {"wan": Setup({"dely_ms": 1.0})}) as bed,
         pytest.raises(
@@ -61,13 +61,11 @@ def test_an_unknown_flag_is_the_parts_own_line(tmp_path: Path) -> None:
         bed.start("wan")
 
 
-def test_without_an_engine_the_docker_testbed_is_wrong_usage(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Where no engine answers, one line says so."""
+def test_the_docker_testbed_needs_an_engine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If no Docker engine answers, a ConfigError of one line says so."""
     monkeypatch.setenv("DOCKER_HOST", "tcp://127.0.0.1:1")
     with (
-        pytest.raises(ConfigError, match=r"^--testbed: docker: no engine answers: .*$"),
+        pytest.raises(ConfigError, match=r"^--testbed: docker: the engine does not answer: .*$"),
         DockerTestbed(tmp_path),
     ):
         pass

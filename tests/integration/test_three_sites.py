@@ -8,7 +8,7 @@ from random import Random
 
 import pytest
 
-from offboard.loadgen.testbed.processes import LocalTestbed
+from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.loadgen.testbed.testbed import Setup
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import DEFAULT

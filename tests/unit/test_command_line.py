@@ -13,12 +13,13 @@ from offboard.common.config import REQUIRED, flag_of, setting, settings_of
 from offboard.common.errors import ConfigError, DataError, OffloadError
 from offboard.common.security.keys import KeysConfig
 from offboard.loadgen.__main__ import DemoConfig, RunConfig
-from offboard.loadgen.compare.compare import CompareConfig
-from offboard.loadgen.play.dataset import DatasetConfig, ExportConfig
+from offboard.loadgen.compare.compare_settings import CompareConfig
+from offboard.loadgen.play.measure_dataset import DatasetConfig
 from offboard.loadgen.relay.wan import WanConfig
 from offboard.loadgen.report.report import ReportConfig
+from offboard.loadgen.table.export_dataset import ExportConfig
 from offboard.loadgen.table.replay import ReplayConfig
-from offboard.loadgen.table.table_two import TableConfig
+from offboard.loadgen.table.table_settings import TableConfig
 from offboard.robot_client.simulated.config import CallConfig, DriveConfig
 
 SHOWN_MAX = 16  # flags in --help, --help itself included

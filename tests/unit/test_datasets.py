@@ -5,24 +5,26 @@ from pathlib import Path
 
 import pytest
 
-from offboard.loadgen.table.rows import read
-from offboard.loadgen.table.table_two import PAPER_WINDOWS, Evaluation, TableConfig, table_text
-from tests.unit.test_evaluate import expected_table, lines_of, replay, rows_of
+from offboard.loadgen.table.measured_rows import read
+from offboard.loadgen.table.predictor_evaluation import Evaluation
+from offboard.loadgen.table.table_settings import PAPER_WINDOWS, TableConfig
+from offboard.loadgen.table.table_two import table_text
+from tests.table_loops import expected_table, lines_of, replay, rows_of
 
 FOLDER = Path(__file__).parents[2] / "loadgen" / "datasets"
 RESULTS = (FOLDER.parents[1] / "docs" / "results.md").read_text(encoding="utf-8")
 NAMES = ("congested", "paper")
 
 
-def test_every_dataset_is_known_here() -> None:
-    """Each has its file of how it was measured."""
+def test_every_dataset_has_its_json_file() -> None:
+    """Each CSV has a JSON file that says how it was measured, and this test knows all of them."""
     assert sorted(path.stem for path in FOLDER.glob("*.csv")) == list(NAMES)
     assert sorted(path.stem for path in FOLDER.glob("*.json")) == list(NAMES)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_dataset_holds_a_thousand_measured_rows(name: str) -> None:
-    """Its JSON says how many, from which commit and settings, and how the sites disturb each other."""
+def test_a_dataset_holds_a_thousand_measured_rows(name: str) -> None:
+    """Its JSON file names the number of rows, the commit, the settings and the disturbance."""
     rows, about = read(FOLDER / f"{name}.csv"), json.loads((FOLDER / f"{name}.json").read_text())
     assert len(rows) == about["rows"] == 1000
     assert about["testbed"] == "docker"
@@ -33,8 +35,8 @@ def test_dataset_holds_a_thousand_measured_rows(name: str) -> None:
 
 @pytest.mark.parametrize("feedback", ["chosen", "full"])
 @pytest.mark.parametrize("name", NAMES)
-def test_least_squares_equal_plain_loops(name: str, feedback: str) -> None:
-    """On measured rows too every printed figure is that of an independent computation."""
+def test_every_printed_figure_equals_plain_loops(name: str, feedback: str) -> None:
+    """On measured rows, too, every printed figure equals an independent computation."""
     text = (FOLDER / f"{name}.csv").read_text()
     found = lines_of(table_text(FOLDER / f"{name}.csv", TableConfig(feedback=feedback)))
     assert found == expected_table(rows_of(text), PAPER_WINDOWS, feedback)
@@ -42,8 +44,8 @@ def test_least_squares_equal_plain_loops(name: str, feedback: str) -> None:
 
 @pytest.mark.parametrize("feedback", ["chosen", "full"])
 @pytest.mark.parametrize("name", NAMES)
-def test_predictions_equal_plain_loops(name: str, feedback: str) -> None:
-    """Every single prediction, for short and long windows and the split, to 1e-9 s."""
+def test_every_prediction_equals_plain_loops(name: str, feedback: str) -> None:
+    """Every prediction is right to 1e-9 s, for short and long windows and for full."""
     lines, rows = rows_of((FOLDER / f"{name}.csv").read_text()), read(FOLDER / f"{name}.csv")
     evaluation = Evaluation(rows, TableConfig())
     for window in ("5", "50", "500", "full"):
@@ -58,7 +60,7 @@ def test_predictions_equal_plain_loops(name: str, feedback: str) -> None:
 @pytest.mark.parametrize("feedback", ["chosen", "full"])
 @pytest.mark.parametrize("name", NAMES)
 def test_the_page_prints_what_the_command_prints(name: str, feedback: str) -> None:
-    """Each figure of the page's tables is the one under the same heading of the command's."""
+    """Each figure in the tables of the page equals the command's figure under the same heading."""
     printed = table_text(FOLDER / f"{name}.csv", TableConfig(feedback=feedback)).splitlines()
     headings, lines = cells(printed[-15]), [cells(line) for line in printed[-13:]]
     section = RESULTS.split(f"### {name}.csv, feedback {feedback}\n")[1].split("\n#")[0]

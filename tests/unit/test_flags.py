@@ -11,7 +11,7 @@ from offboard.common.errors import ConfigError, DataError
 from offboard.loadgen.relay.http_control import Change
 from offboard.loadgen.relay.link.link import Link, LinkConditions
 from offboard.loadgen.relay.link.link_settings import LinkFlags, as_flags
-from offboard.loadgen.scenario.scenario import read_scenario
+from offboard.loadgen.scenario.scenario_file import read_scenario
 
 NAMES = {field.name for field in fields(LinkConditions)}
 SCENARIO = """

@@ -84,7 +84,7 @@ OWNERS = {
         "cloud_server/http_api.py",
         "loadgen/relay/http_control.py",
     },
-    "docker": {"loadgen/testbed/containers.py"},
+    "docker": {"loadgen/testbed/docker_engine.py"},
     "numba": {"common/planning/compiled.py"},
     "PIL": {"common/planning/maps.py"},
     "yaml": {"common/planning/maps.py"},

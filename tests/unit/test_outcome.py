@@ -1,13 +1,16 @@
-"""Figures of a played scenario, worked out by hand, and the verdicts over them."""
+"""Figures and checks of an outcome, and the table of a comparison, worked out by hand."""
 
 from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 
-from offboard.loadgen.compare.compare import CompareConfig, table, turned
-from offboard.loadgen.scenario.check import Check
-from offboard.loadgen.scenario.outcome import FIGURES, Answered, Outcome, Reading, Reference
+from offboard.loadgen.compare.compare import rotated
+from offboard.loadgen.compare.compare_settings import CompareConfig
+from offboard.loadgen.compare.comparison_table import comparison_table
+from offboard.loadgen.scenario.outcome import Answered, Outcome, Reading, Reference
+from offboard.loadgen.scenario.outcome_figures import FIGURES
+from offboard.loadgen.scenario.pass_fail_check import Check
 from offboard.loadgen.scenario.scenario import Scenario, Workload
 
 
@@ -19,7 +22,7 @@ def answered(i: int, response_s: float, chosen: str = "cloud", **more: object) -
 
 @pytest.fixture
 def run() -> Outcome:
-    """Ten tasks asked, task 9 lost: 0.1 to 0.9 s, the first two on both sites, the even ones onboard."""
+    """Ten tasks of 0.1 to 0.9 s: task 9 is lost, the first two ran on both sites, even ones onboard."""
     tasks = [
         answered(
             i,
@@ -51,20 +54,20 @@ def run() -> Outcome:
         ("p95_ms", 900),
         ("p99_ms", 900),
         ("late_percent", 100 * 2 / 9),
-        ("cloud_percent", 100 * 3 / 7),  # of the seven that went to one site
+        ("cloud_percent", 100 * 3 / 7),  # of the seven tasks that were sent to one site
         ("twice_percent", 100 * 2 / 9),
-        ("accuracy_percent", 50),  # tasks 3 and 5; 7 has one time, 8 ran on both
+        ("accuracy_percent", 50),  # of tasks 3 and 5; task 7 has only one time, task 8 ran on both sites
         ("time_over_oracle", (0.1 + 0.3 + (0.5 + 0.1) + 0.1) / (0.1 + 0.1 + 0.1 + 0.1)),
         ("regret_ms", 1e3 * (0.0 + 0.2 + 0.5 + 0.0) / 4),
     ],
 )
-def test_a_figure_is_what_it_says(run: Outcome, figure: str, expected: float) -> None:
-    """By hand, from ten tasks."""
+def test_every_figure_is_right(run: Outcome, figure: str, expected: float) -> None:
+    """Each figure equals the one computed by hand from the ten tasks."""
     assert FIGURES[figure].compute(run) == pytest.approx(expected)
 
 
-def test_a_part_of_a_run_counts_its_own_tasks(run: Outcome) -> None:
-    """Between two tasks only those are asked for, answered and referenced."""
+def test_a_range_of_a_run_counts_only_its_own_tasks(run: Outcome) -> None:
+    """A range contains only its own asked, answered and reference tasks."""
     part = run.between(4, 8)
     assert FIGURES["lost"].compute(part) == 0
     assert [one.i for one in part.answered] == [4, 5, 6, 7]
@@ -72,8 +75,8 @@ def test_a_part_of_a_run_counts_its_own_tasks(run: Outcome) -> None:
     assert FIGURES["lost"].compute(run.between(8)) == 1
 
 
-def test_robots_that_are_not_looked_at_count_nowhere(run: Outcome) -> None:
-    """Neither their tasks nor what was asked of them."""
+def test_the_tasks_of_other_robots_do_not_count(run: Outcome) -> None:
+    """`of` leaves out what other robots asked for and what they were answered."""
     other = replace(answered(0, 2.7), robot="robot-2")
     both = replace(run, asked={**run.asked, "robot-2": 5}, answered=[*run.answered, other])
     assert both.of(("robot",)) == run
@@ -81,17 +84,17 @@ def test_robots_that_are_not_looked_at_count_nowhere(run: Outcome) -> None:
 
 
 @pytest.mark.parametrize("figure", ["mean_ms", "cloud_percent", "time_over_oracle", "memory_growth_percent"])
-def test_a_figure_of_nothing_is_undefined(figure: str) -> None:
-    """Without tasks, references or readings there is none, and a check on it does not hold."""
+def test_a_figure_without_data_is_undefined(figure: str) -> None:
+    """Without tasks, references or readings a figure is undefined, and a check of it fails."""
     nothing = Outcome({"robot": 0}, [])
     assert FIGURES[figure].compute(nothing) is None
     verdict = Check(figure=figure, at_most=1e9).judge(nothing)
     assert not verdict.holds
-    assert str(verdict).endswith("no task tells")
+    assert str(verdict).endswith("undefined for these tasks")
 
 
-def test_growth_is_that_of_the_part_that_grew_most() -> None:
-    """Medians of the first and the last third of the last two thirds: a peak is no growth."""
+def test_growth_is_the_growth_of_the_part_that_grew_most() -> None:
+    """Growth compares the medians of the first and the last third of the readings, so a peak is no growth."""
     flat = [Reading(t, "wan", 100, 10) for t in range(30)]
     grown = [Reading(t, "cloud", 100 + t, 10 + (t == 25)) for t in range(30)]
     run = Outcome({"robot": 0}, [], readings=flat + grown)
@@ -104,26 +107,26 @@ def test_growth_is_that_of_the_part_that_grew_most() -> None:
     ("check", "said"),
     [
         (Check(figure="lost", at_most=1), "holds  lost at most 1 tasks: 1"),
-        (Check(figure="lost", at_most=0), "FAILS  lost at most 0 tasks: 1, 1 too much"),
+        (Check(figure="lost", at_most=0), "FAILS  lost at most 0 tasks: 1, 1 above the limit"),
         (
             Check(figure="cloud_percent", at_least=80, from_task=2, to_task=6, note="known"),
-            "FAILS  cloud_percent at least 80 % from task 2 before task 6: 50, 30 too little (known)",
+            "FAILS  cloud_percent at least 80 % from task 2 before task 6: 50, 30 below the limit (known)",
         ),
     ],
 )
-def test_a_verdict_says_by_how_much(run: Outcome, check: Check, said: str) -> None:
-    """What was looked at, what it is, and how far it is from what is allowed."""
+def test_a_verdict_says_by_how_much_it_fails(run: Outcome, check: Check, said: str) -> None:
+    """A verdict names the check, the value, and the distance to the limit."""
     assert str(check.judge(run)) == said
 
 
 def test_each_policy_comes_first_equally_often() -> None:
-    """Whatever the machine does besides meets all alike."""
-    assert [turned("abc", n) for n in range(4)] == [list("abc"), list("bca"), list("cab"), list("abc")]
+    """The order of the policies rotates by one from seed to seed."""
+    assert [rotated("abc", n) for n in range(4)] == [list("abc"), list("bca"), list("cab"), list("abc")]
 
 
 @pytest.fixture
 def outcome() -> Callable[[float], Outcome]:
-    """Forty tasks in the cloud that take so long, give or take, every fourth of them referenced."""
+    """Forty cloud tasks that take `seconds` to 1.2 times as long; every fourth is a reference task."""
 
     def make(seconds: float) -> Outcome:
         tasks = [answered(i, seconds * (1 + 0.1 * (i % 3))) for i in range(40)]
@@ -135,11 +138,13 @@ def outcome() -> Callable[[float], Outcome]:
     return make
 
 
-def test_a_comparison_pairs_the_same_tasks(outcome: Callable[[float], Outcome]) -> None:
-    """Twice the time on every task is a ratio of 2 with an interval of nothing; regret is as by hand."""
+def test_a_comparison_pairs_equal_tasks(outcome: Callable[[float], Outcome]) -> None:
+    """If every task takes twice as long, the ratio is exactly 2; regret equals the one by hand."""
     config = CompareConfig(policies=("paper", "cloud"), seeds=2)
     runs = {"paper": [outcome(0.1)] * 2, "cloud": [outcome(0.2)] * 2}
-    compared = table(Scenario("small", 1, Workload(task="m:f", sizes=("constant:1",))), config, runs)
+    compared = comparison_table(
+        Scenario("small", 1, Workload(task="m:f", sizes=("constant:1",))), config, runs
+    )
     paper, *_, cloud, low, high = compared.lines
     assert (paper.policy, paper.tasks, paper.over_first) == ("paper", 80, 1.0)
     assert cloud.over_first == pytest.approx(2.0)
@@ -150,12 +155,12 @@ def test_a_comparison_pairs_the_same_tasks(outcome: Callable[[float], Outcome]) 
     assert (cloud.late_percent, cloud.lost, cloud.cloud_percent) == (0.0, 0, 100.0)
 
 
-def test_a_lost_task_is_counted_and_not_paired(outcome: Callable[[float], Outcome]) -> None:
-    """A policy that lost tasks is compared on those that it answered."""
+def test_a_lost_task_is_counted_but_not_compared(outcome: Callable[[float], Outcome]) -> None:
+    """A policy that lost tasks is compared on its answered tasks only."""
     config = CompareConfig(policies=("paper", "cloud"), seeds=1)
     whole, part = outcome(0.1), outcome(0.2)
     part = Outcome(part.asked, part.answered[5:], part.references, deadline_s=part.deadline_s)
-    compared = table(
+    compared = comparison_table(
         Scenario("small", 1, Workload(task="m:f", sizes=("constant:1",))),
         config,
         {"paper": [whole], "cloud": [part]},

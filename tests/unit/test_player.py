@@ -1,4 +1,4 @@
-"""What a run is given: flags that the parts take, a clean folder, and scenarios that fit together."""
+"""The start of a run: flags that the parts accept, a clean folder, and the files of each robot."""
 
 import tomllib
 from dataclasses import fields
@@ -9,10 +9,12 @@ import pytest
 
 from offboard.cloud_server.config import ServerConfig
 from offboard.common.command_line import load
-from offboard.loadgen.play.player import Files, Lines, make_room, setups
+from offboard.loadgen.play.part_setups import setups
+from offboard.loadgen.play.run_files import LineCounter, RobotFiles, clear_folder
 from offboard.loadgen.relay.link.link_settings import as_flags
 from offboard.loadgen.relay.wan import WanConfig
-from offboard.loadgen.scenario.scenario import Scenario, Workload, find_scenario, read_scenario, shipped
+from offboard.loadgen.scenario.scenario import Scenario, Workload
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario, shipped
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN
 from offboard.robot_client.records.trace import alone_path, reference_path
 from offboard.robot_client.simulated.config import CallConfig, DriveConfig
@@ -25,8 +27,8 @@ def scenario(**workload: Any) -> Scenario:
 
 
 @pytest.mark.parametrize("name", shipped())
-def test_the_parts_take_what_the_scenario_says(name: str, tmp_path: Path) -> None:
-    """Every flag of every part is one that its command knows, and carries the scenario's value."""
+def test_the_parts_accept_every_flag_of_a_scenario(name: str, tmp_path: Path) -> None:
+    """Every part accepts all of its flags, and they carry the values of the scenario."""
     read = read_scenario(find_scenario(name))
     made = setups(read, tmp_path)
     configs = {
@@ -52,49 +54,49 @@ def test_the_parts_take_what_the_scenario_says(name: str, tmp_path: Path) -> Non
     assert len(configs) == 2 + read.workload.robots
 
 
-def test_every_key_of_the_shipped_scenarios_is_one_of_the_field() -> None:
-    """What a scenario holds is what `Scenario` and its parts have: nothing is read and forgotten."""
+def test_every_key_of_a_shipped_scenario_is_read() -> None:
+    """Every key in a shipped scenario is a field of `Scenario`, so that none is silently ignored."""
     known = {"event", "check", *(field.name for field in fields(Scenario))}
     for name in shipped():
         assert tomllib.loads(find_scenario(name).read_text()).keys() <= known
 
 
-def test_robots_plan_as_the_scenario_says(tmp_path: Path) -> None:
-    """Every one by the planner of the workload."""
+def test_every_robot_gets_the_planner_of_the_scenario(tmp_path: Path) -> None:
+    """Every robot searches with the planner of the workload."""
     made = setups(scenario(robots=2, planner="jps"), tmp_path)
     assert [setup.flags["planner"] for part, setup in made.items() if part.startswith(ROBOT)] == ["jps"] * 2
 
 
-def test_robots_differ_and_the_first_has_plain_names(tmp_path: Path) -> None:
-    """Each robot has files and a seed of its own."""
-    files = list(Files.of(scenario(robots=3), tmp_path))
+def test_every_robot_has_its_own_files_and_seed(tmp_path: Path) -> None:
+    """Robots have different files and seeds; the file names of the first robot have no number."""
+    files = list(RobotFiles.of(scenario(robots=3), tmp_path))
     assert [one.trace.name for one in files] == ["trace.jsonl", "trace-2.jsonl", "trace-3.jsonl"]
     assert [one.answers.name for one in files] == ["answers.jsonl", "answers-2.jsonl", "answers-3.jsonl"]
     assert files[0].seed == 7
     assert len({one.seed for one in files}) == 3
 
 
-def test_nothing_of_an_earlier_run_is_left(tmp_path: Path) -> None:
-    """All that a run writes goes, also what the next one will not write; what else is there stays."""
+def test_the_files_of_an_earlier_run_are_removed(tmp_path: Path) -> None:
+    """All files that a run may write are removed, and other files stay."""
     out = tmp_path / "new" / "out"
-    make_room(out)
+    clear_folder(out)
     trace = out / "trace.jsonl"
     for path in (trace, alone_path(trace), reference_path(trace), out / "answers-2.jsonl", out / "table.md"):
         path.write_text("old")
-    make_room(out)
+    clear_folder(out)
     assert [path.name for path in out.iterdir()] == ["table.md"]
 
 
 @pytest.mark.parametrize(("tasks", "alone"), [(None, 20), (50, 20), (6, 6)])
-def test_fewer_tasks_mean_fewer_plans_alone(tasks: int | None, alone: int) -> None:
-    """A shortened scenario stays one that a robot takes."""
+def test_fewer_tasks_limit_the_extra_plans(tasks: int | None, alone: int) -> None:
+    """A shortened scenario has at most as many extra plans (`alone`) as tasks; a robot refuses more."""
     changed = scenario(tasks=40, alone=20).changed(seed=None, tasks=tasks, measure_all=False)
     assert changed.workload.alone == alone
 
 
-def test_lines_are_counted_as_they_come(tmp_path: Path) -> None:
-    """Whole lines count, half a one when it is finished, and a file that is not there has none."""
-    lines = Lines(tmp_path / "a")
+def test_only_whole_lines_are_counted(tmp_path: Path) -> None:
+    """A half-written line counts once it is finished; an absent file has no lines."""
+    lines = LineCounter(tmp_path / "a")
     assert lines.count() == 0
     with (tmp_path / "a").open("w", buffering=1) as file:
         file.write("one\ntwo\nthr")

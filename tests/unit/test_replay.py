@@ -1,29 +1,30 @@
-"""`loadgen replay` against the table, the twelve rows of docs/evaluation.md, and traces that know less."""
+"""`loadgen replay`, compared with `loadgen table`, the twelve rows of docs/evaluation.md, and live traces."""
 
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from offboard.common.errors import ConfigError, DataError
-from offboard.loadgen.table import table_two as evaluate
-from offboard.loadgen.table.replay import ReplayConfig, replay, run_replay
-from offboard.loadgen.table.rows import read
-from offboard.loadgen.table.table_two import TableConfig
-from offboard.robot_client import policies
-from offboard.robot_client.policies import Decision, Forecast, Outlook, rules
+from offboard.loadgen.table import table_two
+from offboard.loadgen.table.measured_rows import read
+from offboard.loadgen.table.replay import ReplayConfig, replay_policy, run_replay
+from offboard.loadgen.table.table_settings import TableConfig
+from offboard.robot_client import policies, predictors
+from offboard.robot_client.policies import Decision, Forecast, Outlook
 from offboard.robot_client.records.trace import Record, Trace
 from offboard.robot_client.sites.runner import Execution
-from tests.unit.test_evaluate import THOUSAND, TWELVE, csv_of
+from tests.table_loops import THOUSAND, TWELVE, csv_of
 
 Replayed = Callable[..., list[dict[str, Any]]]
 
 
 @pytest.fixture
 def replayed(capsys: pytest.CaptureFixture[str]) -> Replayed:
-    """Runs the command; the lines of its first table."""
+    """Runs the command and returns the lines of its first table."""
 
     def run(path: Path, **settings: Any) -> list[dict[str, Any]]:
         assert run_replay(path, ReplayConfig(format="json", **settings)) == 0
@@ -40,7 +41,7 @@ def dataset(folder: Path, text: str) -> Path:
 
 
 def trace_of(folder: Path, *records: tuple[str, str, dict[str, float], float]) -> Path:
-    """A trace of (policy, chosen site, seconds by site, waited_s)."""
+    """A trace with one record for each (policy, chosen site, seconds by site, waited_s)."""
     path = folder / "trace.jsonl"
     written = Trace(path)
     for i, (policy, site, seconds, waited_s) in enumerate(records):
@@ -54,17 +55,17 @@ def trace_of(folder: Path, *records: tuple[str, str, dict[str, float], float]) -
 
 @pytest.mark.parametrize("feedback", ["chosen", "full"])
 def test_paper_policy_equals_the_table(tmp_path: Path, replayed: Replayed, feedback: str) -> None:
-    """The robot's own code on replaying runners decides as line N of the table, in both feedback modes."""
+    """The robot's own code gives the same figures as line N of the table, in both feedback modes."""
     path = dataset(tmp_path, csv_of(THOUSAND))
     (paper, *_) = replayed(path, policies=("paper",), window=30, feedback=feedback)
-    (table,) = evaluate.tables(path, read(path), TableConfig(windows=("30",), feedback=feedback))
+    (table,) = table_two.tables(path, read(path), TableConfig(windows=("30",), feedback=feedback))
     line = table.lines[0]
     for name in ("scored", "accuracy_percent", "cloud_percent", "time_over_oracle", "regret_s"):
         assert paper[name] == getattr(line, name), name
 
 
-def test_twelve_rows_by_hand(tmp_path: Path, replayed: Replayed) -> None:
-    """The times of docs/evaluation.md: 45 s by the rule, 51 onboard, 35 in the cloud, 33 for the oracle."""
+def test_the_twelve_rows_equal_those_by_hand(tmp_path: Path, replayed: Replayed) -> None:
+    """As in docs/evaluation.md: 45 s by the published rule, 51 s onboard, 35 s in the cloud, 33 s at best."""
     lines = replayed(dataset(tmp_path, TWELVE), window=3, policies=("paper", "onboard", "cloud"))
     assert [(line["policy"], line["scored"]) for line in lines] == [
         *(("paper", 9), ("onboard", 9), ("cloud", 9), ("oracle", 9))
@@ -76,25 +77,22 @@ def test_twelve_rows_by_hand(tmp_path: Path, replayed: Replayed) -> None:
     assert [line["cloud_percent"] for line in lines[1:3]] == [0, 100]
 
 
-def test_a_task_on_both_sites_takes_as_long_as_the_first_answer(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A policy that runs everything twice gets the faster site's answer, and its double work is seen."""
+def test_a_task_on_both_sites_takes_as_long_as_the_first_answer(tmp_path: Path) -> None:
+    """A policy that runs every task on both sites gets the faster site's time, and the table shows it."""
 
     class Twice:
-        def decide(self, forecast: Forecast) -> Decision:  # noqa: ARG002 - whatever it is
+        def decide(self, forecast: Forecast) -> Decision:  # noqa: ARG002
             return Decision("onboard", True, "", "twice")
 
-    monkeypatch.setitem(policies._RULES, "twice", policies._Rule())
-    monkeypatch.setitem(rules.RULES, "twice", lambda _: Twice())
     rows = read(dataset(tmp_path, TWELVE))
-    played = replay(rows, "twice", predictor="least-squares", window=3, feedback="chosen")
+    predictor = partial(predictors.make, "least-squares", 3, 1)
+    played = replay_policy(rows, Twice(), predictor=predictor, window=3, feedback="chosen")
     assert played.both.all()
     assert played.to_cloud.tolist() == (rows.cloud_s < rows.onboard_s)[3:].tolist()
 
 
-def test_only_chosen_sides_leave_the_rest_open(tmp_path: Path, replayed: Replayed) -> None:
-    """A live trace says what was waited and where tasks went; nothing of other policies or the oracle."""
+def test_a_live_trace_gives_only_the_line_of_the_recorded_run(tmp_path: Path, replayed: Replayed) -> None:
+    """A live trace has no times for other policies and the oracle, and their lines say so."""
     times = [0.1, 0.2, 0.3, 0.4]
     path = trace_of(
         tmp_path,
@@ -111,12 +109,12 @@ def test_only_chosen_sides_leave_the_rest_open(tmp_path: Path, replayed: Replaye
     undefined = ("time_over_oracle", "regret_s", "accuracy_percent")
     assert all(recorded[name] is None for name in undefined)
     for line in others:
-        assert line["note"] == "cannot be told: no tasks ran on both sites, the warm-up takes 50"
+        assert line["note"] == "cannot be replayed: no tasks ran on both sites, but the warm-up needs 50"
         assert line["mean_s"] is None
 
 
-def test_measured_and_pinned_tasks_are_not_the_policys(tmp_path: Path, replayed: Replayed) -> None:
-    """What ran on both sites, and what the caller placed, is not in the line of the recorded run."""
+def test_the_recorded_line_leaves_out_measured_and_pinned_tasks(tmp_path: Path, replayed: Replayed) -> None:
+    """Tasks that ran on both sites, or that the caller placed, are not in the line of the recorded run."""
     both = {"onboard": 0.2, "cloud": 0.1}
     path = trace_of(
         tmp_path,
@@ -129,8 +127,8 @@ def test_measured_and_pinned_tasks_are_not_the_policys(tmp_path: Path, replayed:
     assert (paper["scored"], paper["mean_s"]) == (2, 0.1)
 
 
-def test_kinds_are_not_mixed(tmp_path: Path, replayed: Replayed) -> None:
-    """A live trace of two kinds asks which; tasks of the other are not counted."""
+def test_kinds_of_tasks_are_not_mixed(tmp_path: Path, replayed: Replayed) -> None:
+    """A trace with two kinds needs --kind, and tasks of the other kind are left out."""
     path = trace_of(tmp_path, *[("paper", "cloud", {"cloud": 0.1}, 0.1)] * 2)
     text = path.read_text()
     path.write_text(text + text.replace('"kind":"plan"', '"kind":"look"'))
@@ -141,8 +139,8 @@ def test_kinds_are_not_mixed(tmp_path: Path, replayed: Replayed) -> None:
     assert replayed(path, kind="look")[0]["scored"] == 2
 
 
-def test_intervals_hold_the_estimate(tmp_path: Path, replayed: Replayed) -> None:
-    """With --bootstrap each policy has three lines: the figure lies between its two ends."""
+def test_each_interval_contains_its_figure(tmp_path: Path, replayed: Replayed) -> None:
+    """With --bootstrap each policy has three lines, and the figure lies between its two bounds."""
     path = dataset(tmp_path, csv_of(THOUSAND[:300]))
     lines = replayed(path, policies=("paper",), bootstrap=True)
     found, low, high = lines[:3]
@@ -155,16 +153,17 @@ def test_intervals_hold_the_estimate(tmp_path: Path, replayed: Replayed) -> None
 def test_every_format_names_policy_and_feedback(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], format: str
 ) -> None:
-    """A table without figures is printed too; its lines say why."""
+    """A table without figures is printed too, and its lines say why there are none."""
     run_replay(dataset(tmp_path, TWELVE), ReplayConfig(format=format, feedback="both"))
     out = capsys.readouterr().out
-    assert out.count("12 tasks ran on both sites, the warm-up takes 50") == 2 * (len(policies.names()) + 2)
+    said = "12 tasks ran on both sites, but the warm-up needs 50"
+    assert out.count(said) == 2 * (len(policies.names()) + 2)
     assert "chosen" in out
     assert "full" in out
 
 
-def test_mistakes_are_named(tmp_path: Path) -> None:
-    """An unknown policy or predictor, and a file that is not there."""
+def test_an_unknown_name_or_file_is_refused(tmp_path: Path) -> None:
+    """An unknown policy or predictor, and a missing file, are errors that name it."""
     with pytest.raises(ConfigError, match="--policies: 'papr' is not one of paper, onboard, cloud"):
         ReplayConfig(policies=("papr",))
     with pytest.raises(ConfigError, match="--predictor: 'x' is not one of least-squares"):

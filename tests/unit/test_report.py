@@ -19,12 +19,13 @@ from offboard.loadgen.report import charts
 from offboard.loadgen.report.findings import Findings
 from offboard.loadgen.report.report import ReportConfig, all_charts, facts, find_source, run_report
 from offboard.loadgen.report.svg import inline
-from offboard.loadgen.table import paper_table as paper
-from offboard.loadgen.table.render import render
-from offboard.loadgen.table.rows import Rows, read
-from offboard.loadgen.table.table_two import Evaluation, TableConfig
+from offboard.loadgen.table import published_table_two as paper
+from offboard.loadgen.table.measured_rows import Rows, read
+from offboard.loadgen.table.predictor_evaluation import Evaluation
+from offboard.loadgen.table.table_formats import render
+from offboard.loadgen.table.table_settings import TableConfig
 from offboard.robot_client import policies
-from tests.unit.test_evaluate import PAGE, THOUSAND, Line, csv_of
+from tests.table_loops import PAGE, THOUSAND, Line, csv_of
 from tests.unit.test_replay import trace_of
 
 ROOT = Path(__file__).parents[2]
@@ -413,7 +414,7 @@ def test_what_is_no_run_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[s
     for name, said in (
         ("none", "none: neither a run's folder nor a trace or CSV file"),
         ("other", "other: no trace.jsonl in this folder; `loadgen run` and `loadgen demo` write one"),
-        ("empty", "no task ran well on both sites"),
+        ("empty", "no task was answered by both sites"),
     ):
         assert main(["report", str(tmp_path / name)]) == 2
         error = capsys.readouterr().err

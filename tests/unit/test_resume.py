@@ -1,4 +1,4 @@
-"""Which runs of an earlier comparison are taken, and which are played again."""
+"""Resuming a comparison: which finished runs are used, and which runs are played again."""
 
 import json
 from collections.abc import Callable
@@ -8,11 +8,13 @@ from pathlib import Path
 import pytest
 
 from offboard.loadgen.compare.resume import played_before
-from offboard.loadgen.play.digest import digests, of_scenario, of_software
-from offboard.loadgen.play.play import SUMMARY, judge, write_summary
-from offboard.loadgen.scenario.check import Check
+from offboard.loadgen.play.play_scenario import judge, write_summary
+from offboard.loadgen.play.run_digest import digests, of_scenario, of_software
+from offboard.loadgen.play.run_files import SUMMARY
 from offboard.loadgen.scenario.hash_tasks import hash_rounds
-from offboard.loadgen.scenario.scenario import RobotPart, Scenario, Workload, find_scenario, read_scenario
+from offboard.loadgen.scenario.pass_fail_check import Check
+from offboard.loadgen.scenario.scenario import RobotPart, Scenario, Workload
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.robot_client.simulated.answers import of_value
 
 TASKS = 3
@@ -35,7 +37,7 @@ def answer(i: int) -> str:
 
 @pytest.fixture
 def finished(tmp_path: Path) -> Path:
-    """The folder of a run that came to its end, by the code that writes one."""
+    """The folder of a finished run, written by the code that writes one."""
     (tmp_path / "answers.jsonl").write_text("".join(map(answer, range(TASKS))))
     about = {"testbed": "local", **digests(SCENARIO)}
     played = replace(judge(SCENARIO, tmp_path, {"robot": 0}), stolen_percent=12.0)
@@ -43,29 +45,33 @@ def finished(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def taken(scenario: Scenario, out: Path, testbed: str = "local") -> tuple[bool, list[str]]:
+def used(scenario: Scenario, out: Path, testbed: str = "local") -> tuple[bool, list[str]]:
     said: list[str] = []
-    return played_before(scenario, out, testbed, said.append) is not None, said
+    return played_before(scenario, out, testbed, say=said.append) is not None, said
 
 
-def test_a_finished_run_is_taken_and_judged_from_its_files(finished: Path) -> None:
-    """All its tasks are there, verified, and it is said where they come from."""
+def test_a_finished_run_is_used_and_judged_from_its_files(finished: Path) -> None:
+    """All its tasks are read and verified, and a line says where they come from."""
     said: list[str] = []
-    played = played_before(SCENARIO, finished, "local", said.append)
+    played = played_before(SCENARIO, finished, "local", say=said.append)
     assert played is not None
     assert [one.response_s for one in played.outcome.answered] == [0.5] * TASKS
     assert [one.wrong for one in played.outcome.answered] == [None] * TASKS
-    assert said == [f"taken from before: {finished}"]
+    assert said == [f"using the finished run in {finished}"]
 
 
 def test_a_run_that_the_host_disturbed_is_played_again(finished: Path) -> None:
-    """It took 12 %: with 12 allowed the run is taken, and says so again; with 11 not, and that is said."""
+    """If the host took 12 % of the CPU time, the run is used with a limit of 12 %, but not with 11 %."""
     said: list[str] = []
-    played = played_before(SCENARIO, finished, "local", said.append, stolen_max=12.0)
+    played = played_before(SCENARIO, finished, "local", say=said.append, stolen_max=12.0)
     assert played is not None
     assert played.stolen_percent == 12.0
-    assert played_before(SCENARIO, finished, "local", said.append, stolen_max=11.0) is None
-    assert said[1] == f"played again in {finished}: the host took 12 % of the CPU time that it asked for"
+    assert played_before(SCENARIO, finished, "local", say=said.append, stolen_max=11.0) is None
+    again, why = (
+        f"playing the run in {finished} again",
+        "the host took 12 % of the CPU time that the run asked for",
+    )
+    assert said[1] == f"{again}: {why}"
 
 
 @pytest.mark.parametrize(
@@ -81,11 +87,11 @@ def test_a_run_that_the_host_disturbed_is_played_again(finished: Path) -> None:
         (SCENARIO, "docker"),
     ],
 )
-def test_another_run_is_played(finished: Path, scenario: Scenario, testbed: str) -> None:
-    """Another seed, workload, policy, predictor, part, link or testbed is another run, and that is said."""
-    found, said = taken(scenario, finished, testbed)
+def test_a_different_run_is_played_again(finished: Path, scenario: Scenario, testbed: str) -> None:
+    """Another seed, workload, policy, predictor, part, link or testbed is another run; a line says why."""
+    found, said = used(scenario, finished, testbed)
     assert not found
-    why = "another testbed" if testbed == "docker" else "scenario or settings were others"
+    why = "another testbed" if testbed == "docker" else "scenario or settings were different"
     assert why in said[0]
 
 
@@ -111,36 +117,34 @@ def _change(**fields: object) -> Callable[[Path], None]:
 @pytest.mark.parametrize(
     ("spoil", "why"),
     [
-        (_stop, "it did not come to its end"),
+        (_stop, "it was not played to its end"),
         (_tear, "summary.json cannot be read"),
-        (_lose_answers, "lost is 2 by its files, and 0 in summary.json"),
-        (_change(software_sha256="0" * 64), "its software was another"),
+        (_lose_answers, "lost is 2 in its files, but 0 in summary.json"),
+        (_change(software_sha256="0" * 64), "its software was different"),
         (_change(exit_codes={"robot": 1}), "robot ended with exit code 1"),
     ],
 )
-def test_a_run_that_is_not_whole_is_played_again(
-    finished: Path, spoil: Callable[[Path], None], why: str
-) -> None:
-    """Stopped half way, torn, with files gone, by other software, or ended badly: it says which."""
+def test_an_incomplete_run_is_played_again(finished: Path, spoil: Callable[[Path], None], why: str) -> None:
+    """A stopped, damaged or failed run, or a run of other software, is played again; a line says why."""
     spoil(finished)
-    found, said = taken(SCENARIO, finished)
+    found, said = used(SCENARIO, finished)
     assert not found
     assert why in said[0]
 
 
-def test_where_nothing_was_played_nothing_is_said(tmp_path: Path) -> None:
-    """The first time is not another time."""
-    assert taken(SCENARIO, tmp_path / "new") == (False, [])
+def test_a_new_run_is_played_without_a_message(tmp_path: Path) -> None:
+    """If the folder does not exist, the run is simply played."""
+    assert used(SCENARIO, tmp_path / "new") == (False, [])
 
 
-def test_what_is_only_said_or_checked_makes_no_other_run() -> None:
-    """A text, or a check, changes nothing of what was played."""
+def test_texts_and_checks_do_not_make_a_run_different() -> None:
+    """A changed text or check does not change what was played."""
     same = replace(SCENARIO, about="Other words.", checks=(Check(figure="lost", at_most=0),))
     assert of_scenario(same) == of_scenario(SCENARIO)
 
 
-def test_files_count_by_their_content_wherever_they_are(tmp_path: Path) -> None:
-    """A map that was moved is the same, one with another cell is not; so with sizes and delays."""
+def test_files_count_by_their_content(tmp_path: Path) -> None:
+    """A moved map is the same run, a map with a changed cell is not; the same holds for files of delays."""
     outage = read_scenario(find_scenario("outage"))
     place = outage.workload.map
     assert place is not None
@@ -160,16 +164,16 @@ def test_files_count_by_their_content_wherever_they_are(tmp_path: Path) -> None:
     assert of_scenario(sampled) != before
 
 
-def test_the_software_is_that_of_the_parts_and_of_the_task() -> None:
-    """The module of a task counts where it is asked for; one that is not there is the parts' to refuse."""
+def test_the_software_includes_the_module_of_the_task() -> None:
+    """The module of the scenario's task counts; a missing module is left to the parts, which refuse it."""
     planner = read_scenario(find_scenario("outage"))
     assert of_software(planner) != of_software(SCENARIO)
     absent = replace(SCENARIO, workload=Workload(task="no_such_module:task", sizes=("constant:1",)))
     assert of_software(absent) == of_software(planner)
 
 
-def test_without_references_a_scenario_has_no_checks_of_them() -> None:
-    """--reference 0 leaves out what could not be computed, and keeps the rest."""
+def test_without_references_the_checks_that_need_them_are_removed() -> None:
+    """--reference 0 removes the checks that need reference runs, and keeps the others."""
     outage, calm = (read_scenario(find_scenario(name)) for name in ("outage", "calm"))
     assert any(one.figure == "time_over_oracle" for one in calm.checks)
     quick = calm.changed(reference=0)

@@ -8,8 +8,10 @@ from pathlib import Path
 import pytest
 
 from offboard.common.errors import ConfigError
-from offboard.loadgen.scenario.outcome import FIGURES, Outcome
-from offboard.loadgen.scenario.scenario import Scenario, find_scenario, read_scenario, shipped
+from offboard.loadgen.scenario.outcome import Outcome
+from offboard.loadgen.scenario.outcome_figures import FIGURES
+from offboard.loadgen.scenario.scenario import Scenario
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario, shipped
 from offboard.loadgen.simulation.batch import Batch
 from offboard.loadgen.simulation.model.costs import DECIDING_CPU_S, HASH, START_S
 from offboard.loadgen.simulation.model.simulated_tasks import Tasks, find_tasks

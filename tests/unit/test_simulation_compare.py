@@ -9,7 +9,7 @@ import pytest
 
 from offboard.loadgen.__main__ import main
 from offboard.loadgen.compare.simulated_tables import summary_table
-from offboard.loadgen.table.render import FORMATS, Table, render
+from offboard.loadgen.table.table_formats import FORMATS, Table, render
 
 TABLES = (
     "compare",
@@ -82,7 +82,10 @@ def test_a_scenario_without_an_oracle_is_left_out_of_the_mean() -> None:
         (["calm", "--jobs", "2"], "--jobs: 2 needs --simulate"),
         (["calm", "--simulate", "--jobs", "0"], "--jobs: 0 is below 1"),
         (["calm", "--simulate", "--policies", "clod"], "--policies: 'clod' is not one of"),
-        (["calm", "--simulate", "--testbed", "docker"], "--testbed: docker is not allowed beside --simulate"),
+        (
+            ["calm", "--simulate", "--testbed", "docker"],
+            "--testbed: docker cannot be combined with --simulate",
+        ),
         (["soak", "--simulate"], "scenario soak cannot be simulated: link condition truncate_bytes"),
         (["clam", "--simulate"], "scenario 'clam' is neither a file nor one of"),
         (["calm", "--simulate", "--from-task", "500"], "--from-task: 500 is not among the 120 tasks"),

@@ -9,8 +9,9 @@ import pytest
 from offboard.common.errors import Overtaken
 from offboard.common.host.load import SERVER_EVERY_S
 from offboard.loadgen.relay.link.link import LinkConditions
-from offboard.loadgen.scenario.scenario import CloudPart, read_scenario
-from offboard.loadgen.scenario.timeline import Event
+from offboard.loadgen.scenario.event_timeline import Event
+from offboard.loadgen.scenario.scenario import CloudPart
+from offboard.loadgen.scenario.scenario_file import read_scenario
 from offboard.loadgen.simulation.model.clock import VirtualClock
 from offboard.loadgen.simulation.model.costs import HASH
 from offboard.loadgen.simulation.model.lockstep import LockstepClock

@@ -1,0 +1,99 @@
+"""The settings of `loadgen compare`, and the policy names that it accepts."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from offboard.common.config import check, setting
+from offboard.common.errors import ConfigError
+from offboard.loadgen.compare.resume import PLAYS_MAX
+from offboard.loadgen.play.play_scenario import TESTBEDS
+from offboard.loadgen.table.table_formats import FORMATS
+from offboard.robot_client import policies, predictors
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
+
+SEEDS_MAX = 1000
+JOBS_MAX = 256
+SIMULATION = "simulation"
+
+
+@dataclass(frozen=True)
+class CompareConfig:
+    """What is compared, and where the runs are played."""
+
+    policies: tuple[str, ...] = setting(
+        ("paper", policies.DEFAULT, ONBOARD, CLOUD),
+        f"policies to compare: {policies.HELP}; POLICY@PREDICTOR uses another predictor than its own",
+        metavar="NAME,NAME,..",
+    )
+    seeds: int = setting(
+        3,
+        "number of runs of each policy; the seeds count up from the scenario's seed",
+        minimum=1,
+        maximum=SEEDS_MAX,
+    )
+    testbed: str = setting(
+        "local", "where to play: in local processes or in Docker containers", choices=tuple(TESTBEDS)
+    )
+    out: Path = setting(
+        Path("out/compare"),
+        "folder for the runs, SCENARIO/SEED-POLICY; a finished run of the same software and settings is"
+        " not played again",
+        metavar="DIR",
+    )
+    tasks: int | None = setting(None, "number of tasks (default: as in the scenario)", minimum=1)
+    reference: int | None = setting(
+        None,
+        "run every K-th task again on each site alone (default: as in the scenario); 0: none (faster)",
+        minimum=0,
+    )
+    from_task: int = setting(0, "first task that counts, for example the first one after warm-up", minimum=0)
+    format: str = setting("md", "output format", choices=FORMATS)
+    stolen_max: float | None = setting(
+        None,
+        "play a run again if the host of this virtual machine took more than this share of its CPU time,"
+        f" up to {PLAYS_MAX} times; without it, the table reports the share",
+        minimum=0,
+        maximum=100,
+        metavar="PERCENT",
+    )
+    simulate: bool = setting(
+        False, "simulate the runs: virtual time and modelled sites, no processes are started"
+    )
+    jobs: int | None = setting(
+        None,
+        "with --simulate: number of processes (default: one for each CPU)",
+        minimum=1,
+        maximum=JOBS_MAX,
+    )
+
+    def __post_init__(self) -> None:
+        check(self)
+        for policy in self.policies:
+            split_strategy(policy)
+        if len(set(self.policies)) < len(self.policies):
+            raise ConfigError(f"--policies: {','.join(self.policies)}: a policy is named twice")
+        if self.jobs is not None and not self.simulate:
+            raise ConfigError(
+                f"--jobs: {self.jobs} needs --simulate: real runs are played one after the other"
+            )
+        if self.simulate and self.testbed != "local":
+            raise ConfigError(f"--testbed: {self.testbed} cannot be combined with --simulate")
+        if self.simulate and self.stolen_max is not None:
+            raise ConfigError(f"--stolen-max: {self.stolen_max:g} cannot be combined with --simulate")
+
+    @property
+    def where(self) -> str:
+        """The testbed that tables name."""
+        return SIMULATION if self.simulate else self.testbed
+
+
+def split_strategy(name: str) -> tuple[str, str | None]:
+    """The policy and the predictor of POLICY or POLICY@PREDICTOR.
+
+    None: the predictor that the policy brings.
+    """
+    policy, at, predictor = name.partition("@")
+    policies.check_name(policy, "--policies")
+    if at:
+        predictors.check_name(predictor, "--policies")
+    return policy, predictor if at else None

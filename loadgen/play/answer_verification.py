@@ -1,0 +1,102 @@
+"""Verifies the answers of a run: repeats each task and checks each path cell by cell against map and scan.
+
+The tasks are made again from the seed. Only the answers are taken from the run.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.common.planning.flood import covered
+from offboard.common.planning.maps import GridMap, passable
+from offboard.common.planning.planner import Plan, scan_hits
+from offboard.loadgen.scenario.outcome import Answered
+from offboard.loadgen.scenario.scenario import Workload
+from offboard.robot_client.simulated import answers
+from offboard.robot_client.simulated.work import Work, make_work
+
+COST_SHARE = 1e-6  # largest relative difference of two sums of the same steps
+
+
+def verified(answered: Sequence[Answered], workload: Workload, seed: int) -> list[Answered]:
+    """The same tasks with `wrong` filled in; unchanged if the tasks cannot be made again.
+
+    That is so if the next task depends on the previous answer (a map without `jump`).
+    """
+    if not workload.known()["jump"]:
+        return list(answered)
+    work, at = make_work(workload.robot(seed)), 0
+    found = []
+    for one in sorted(answered, key=lambda one: one.i):
+        while at < one.i:
+            work.advance(None)
+            at += 1
+        found.append(replace(one, wrong=None if one.error is not None else _wrong(work, one.answer)))
+    return found
+
+
+def _wrong(work: Work, answer: Mapping[str, Any]) -> str | None:
+    request = work.request()
+    expected = work.function(*request)
+    if isinstance(expected, Plan):
+        return wrong_plan(answer, expected, request)
+    described = work.describe(expected)
+    return None if answer == described else f"{answer}, but {described} was expected"
+
+
+def wrong_plan(answer: Mapping[str, Any], expected: Plan, request: Sequence[Any]) -> str | None:
+    """What is wrong with an answered path.
+
+    None if it is free of obstacles and as short as the expected one.
+    """
+    if answer["status"] != expected.status:
+        return f"status {answer['status']}, but {expected.status} was expected"
+    if expected.status != "NONE":
+        return None
+    grid, _scan, pose, goal, *_ = request
+    cells = answers.cells_of(answer)
+    if [tuple(cells[0]), tuple(cells[-1])] != [grid.cell(pose.x, pose.y), grid.cell(goal.x, goal.y)]:
+        return f"the path from {tuple(cells[0])} to {tuple(cells[-1])} does not join the robot and its goal"
+    blocked = _blocked(request, cells)
+    if blocked is not None:
+        return blocked
+    cost = float(np.linalg.norm(np.diff(cells, axis=0), axis=1).sum()) * grid.resolution
+    if abs(cost - answer["cost"]) > COST_SHARE * cost:
+        return f"cost {answer['cost']}, but the path is {cost} m long"
+    if abs(cost - expected.cost) > COST_SHARE * cost:
+        return f"the path is {cost} m long, but {expected.cost} m was expected"
+    return None
+
+
+def _blocked(request: Sequence[Any], cells: NDArray[np.int32]) -> str | None:
+    """The first cell that the robot must not enter: off the map, too near to a wall, or occupied in the scan.
+
+    The robot's own cell is not checked.
+    """
+    grid, scan, pose, _goal, radius_m, *_ = request
+    rows, cols = cells[1:, 0], cells[1:, 1]
+    if not ((cells >= 0) & (cells < grid.cells.shape)).all():
+        return "the path leaves the map"
+    free = _passable(grid, radius_m)[rows, cols]
+    if not free.all():
+        return f"the path crosses {tuple(cells[1:][~free][0])}, where the robot does not fit"
+    hits = scan_hits(grid, scan, pose, radius_m)
+    seen = covered(rows, cols, hits.rows, hits.cols, hits.reach)
+    if seen < len(rows):
+        return f"the path crosses {tuple(cells[1 + seen])}, which is occupied in the scan"
+    return None
+
+
+_room: dict[tuple[int, float], tuple[GridMap, NDArray[np.bool_]]] = {}
+
+
+def _passable(grid: GridMap, radius_m: float) -> NDArray[np.bool_]:
+    """Where a robot of this radius fits; cached for one map."""
+    key = (id(grid), radius_m)
+    if key not in _room:
+        _room.clear()
+        _room[key] = (grid, passable(grid, radius_m))
+    return _room[key][1]

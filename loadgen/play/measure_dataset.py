@@ -1,0 +1,134 @@
+"""`loadgen dataset`: measures the plans of a scenario on both sites and records how they were measured.
+
+NAME.csv holds the rows; NAME.json holds machine, settings, commit, disturbance and CPU use.
+"""
+
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from offboard.common import VERSION
+from offboard.common.config import check, setting
+from offboard.loadgen.play.play_scenario import TESTBEDS, play
+from offboard.loadgen.play.run_files import TRACE
+from offboard.loadgen.scenario.scenario import Scenario, Workload
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
+from offboard.loadgen.table.measured_rows import write_csv, write_whole
+from offboard.loadgen.table.measurement_notes import disturbance, read_noted
+
+ASK_S = 10
+
+
+@dataclass(frozen=True)
+class DatasetConfig:
+    """What is measured, and where the files go."""
+
+    out: Path = setting(Path("out/datasets"), "folder for NAME.csv and NAME.json", metavar="DIR")
+    run: Path = setting(
+        Path("out/dataset"), "folder for the files of the run, such as NAME/trace.jsonl", metavar="DIR"
+    )
+    testbed: str = setting(
+        "docker", "where to measure: in local processes or in Docker containers", choices=tuple(TESTBEDS)
+    )
+    rows: int = setting(1000, "number of plans; each runs on both sites", minimum=1)
+    alone: int = setting(
+        100, "number of extra plans that measure how much the two sites disturb each other", minimum=0
+    )
+    seed: int | None = setting(None, "random seed (default: the scenario's seed)", minimum=0)
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+def run_dataset(name: str, config: DatasetConfig, command: Sequence[str]) -> int:
+    """Play the scenario, then write both files. `command` is the command line, recorded in NAME.json."""
+    scenario = read_scenario(find_scenario(name))
+    scenario = scenario.changed(seed=config.seed, tasks=config.rows, measure_all=True, alone=config.alone)
+    run = config.run / scenario.name
+    started_at, commit = datetime.now(UTC), _commit()
+    play(scenario, run, config.testbed).check_robots()
+    rows, disturbed = read_noted(run / TRACE), disturbance(run / TRACE)
+    about = {
+        "name": scenario.name,
+        "measured_at": started_at.isoformat(timespec="seconds"),
+        "command": " ".join(command),
+        "commit": commit,
+        "software": VERSION,
+        "testbed": config.testbed,
+        "machine": _machine(config.testbed),
+        "scenario": _settings(scenario),
+        "rows": len(rows),
+        "left_out": rows.left_out,
+        "notes": [_conditions(scenario, config.testbed), *rows.notes],
+        "disturbance": disturbed.as_dict() if disturbed else None,
+    }
+    path = config.out / f"{scenario.name}.csv"
+    write_csv(path, rows)
+    write_whole(path.with_suffix(".json"), json.dumps(about, indent=2, ensure_ascii=False) + "\n")
+    print(f"written: {path} ({len(rows)} rows, {rows.left_out} left out) and {path.with_suffix('.json')}")
+    return 0
+
+
+def _conditions(scenario: Scenario, testbed: str) -> str:
+    """One line that says where and how the rows were measured."""
+    workload, link = scenario.workload, ", ".join(f"{key} {value}" for key, value in scenario.link.items())
+    return (
+        f"Measured on the {testbed} testbed: {_asked(workload)}, "
+        f"seed {scenario.seed}, robot {scenario.robot.cpus:g} CPU, link {link or 'direct'}."
+    )
+
+
+def _asked(workload: Workload) -> str:
+    if workload.map is None:
+        return f"task {workload.task}, sizes {','.join(workload.sizes)}"
+    cells = "" if workload.resolution is None else f" at {workload.resolution:g} m"
+    return f"{workload.map.name}{cells}"
+
+
+def _settings(scenario: Scenario) -> dict[str, Any]:
+    settings = asdict(scenario)
+    if scenario.workload.map:
+        settings["workload"]["map"] = scenario.workload.map.name
+    return settings
+
+
+def _machine(testbed: str) -> dict[str, Any]:
+    machine = {
+        "cpu": _cpu_model(),
+        "cores": os.cpu_count(),
+        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "python": platform.python_version(),
+    }
+    if testbed == "docker":
+        machine["docker"] = _output_of(("docker", "version", "--format", "{{.Server.Version}}"))
+    return machine
+
+
+def _cpu_model() -> str:
+    """The kernel's name of the CPU, or else the architecture."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(models, platform.machine())
+
+
+def _commit() -> str | None:
+    """The commit of the checkout in the current folder, marked `-dirty` if files were changed."""
+    return _output_of(("git", "describe", "--always", "--dirty", "--abbrev=12"))
+
+
+def _output_of(command: Sequence[str]) -> str | None:
+    """What a command printed; None if it failed or printed nothing."""
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=ASK_S, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() or None

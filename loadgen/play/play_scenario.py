@@ -1,0 +1,178 @@
+"""`loadgen run`: plays a scenario, then verifies the answers, judges the checks and writes the summary.
+
+`player` does what happens during the run; the testbed starts and ends the processes.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from offboard.common import VERSION
+from offboard.common.errors import OffloadError
+from offboard.loadgen.play.answer_verification import verified
+from offboard.loadgen.play.part_setups import setups
+from offboard.loadgen.play.player import Player
+from offboard.loadgen.play.run_digest import digests
+from offboard.loadgen.play.run_files import EVENTS, READINGS, SUMMARY, TABLE, TRACE, RobotFiles, clear_folder
+from offboard.loadgen.play.stolen_cpu_time import NOTED_PERCENT, StolenCpuTime
+from offboard.loadgen.scenario.outage_recovery import read_outage
+from offboard.loadgen.scenario.outcome import Answered, Outcome
+from offboard.loadgen.scenario.outcome_figures import FIGURES
+from offboard.loadgen.scenario.outcome_files import read_answered, read_readings, read_references
+from offboard.loadgen.scenario.pass_fail_check import Verdict
+from offboard.loadgen.scenario.scenario import Scenario
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
+from offboard.loadgen.table.measured_rows import write_whole
+from offboard.loadgen.table.table_settings import TableConfig
+from offboard.loadgen.table.table_two import table_text
+from offboard.loadgen.testbed.local_testbed import LocalTestbed
+from offboard.loadgen.testbed.testbed import Setup, Testbed
+from offboard.robot_client.records.trace import alone_path, reference_path
+
+DEMO_WINDOWS = ("5", "10", "20", "30", "40", "50")
+
+
+def _local(out: Path, setups: Mapping[str, Setup]) -> Testbed:
+    return LocalTestbed(out, setups)
+
+
+def _docker(out: Path, setups: Mapping[str, Setup]) -> Testbed:
+    from offboard.loadgen.testbed.docker_testbed import DockerTestbed
+
+    return DockerTestbed(out, setups)
+
+
+TESTBEDS: dict[str, Callable[[Path, Mapping[str, Setup]], Testbed]] = {"local": _local, "docker": _docker}
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """A run that was played to its end: its outcome, the verdict of every check, each robot's exit code.
+
+    `stolen_percent` is the stolen share of the CPU time that the run asked for; None: unknown.
+    """
+
+    scenario: Scenario
+    outcome: Outcome
+    verdicts: Sequence[Verdict]
+    exit_codes: Mapping[str, int]
+    stolen_percent: float | None = None
+
+    def check_robots(self) -> None:
+        """OffloadError if a robot failed, unless an event ended it."""
+        ended = {
+            event.value for event in self.scenario.timeline() if event.action in ("kill", "stop", "restart")
+        }
+        for robot, code in self.exit_codes.items():
+            if code != 0 and robot not in ended:
+                how = f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
+                raise OffloadError(f"{robot} {how}")
+
+    def check_verdicts(self) -> None:
+        """OffloadError if a check failed."""
+        failed = [verdict for verdict in self.verdicts if not verdict.holds]
+        if failed:
+            raise OffloadError(f"{len(failed)} of {len(self.verdicts)} checks of {self.scenario.name} failed")
+
+
+def play(scenario: Scenario, out: Path, testbed: str = "local", *, quiet: bool = False) -> Played:
+    """Play a scenario to its end. Its files in `out` (docs/formats.md) replace those of an older run.
+
+    Unless `quiet`, progress lines and the output of the first robot go to stdout.
+    """
+    say = _say_nothing if quiet else _say
+    started_at, workload = datetime.now(UTC), scenario.workload
+    played_from = digests(scenario)  # taken now, because the parts load the software now
+    with TESTBEDS[testbed](out, setups(scenario, out, shown=not quiet)) as bed:
+        clear_folder(out)
+        say(f"starting the cloud server and the relay (logs in {out / 'logs'})")
+        bed.start()
+        many = "the robot" if workload.robots == 1 else f"{workload.robots} robots"
+        tasks = f"{workload.tasks} {'plans' if workload.map else 'tasks'}"
+        say(f"starting {many} with a quota of {scenario.robot.cpus:g} CPU: {tasks}")
+        stolen = StolenCpuTime()
+        exit_codes = Player(scenario, bed, say).play()
+        stolen_percent = stolen.percent()
+    played = replace(judge(scenario, out, exit_codes), stolen_percent=stolen_percent)
+    about = {"testbed": testbed, "started_at": started_at.isoformat(timespec="seconds"), **played_from}
+    write_summary(out, played, about)
+    for verdict in played.verdicts:
+        say(str(verdict))
+    if stolen_percent is not None and stolen_percent >= NOTED_PERCENT:
+        say(f"warning: the host of this virtual machine took {stolen_percent:.0f} % of its CPU time (steal)")
+    for path in (out / TRACE, alone_path(out / TRACE), out / SUMMARY):
+        if path.exists():
+            say(f"written: {path}")
+    return played
+
+
+def play_demo(out: Path) -> int:
+    """Play the shipped demo scenario, then print Table II of the plans that were measured on both sites."""
+    play(read_scenario(find_scenario("demo")), out).check_robots()
+    text = table_text(out / TRACE, TableConfig(windows=DEMO_WINDOWS, feedback="both"))
+    (out / TABLE).write_text(text)
+    print(f"\n{text}\nwritten: {out / TABLE}; charts: loadgen report {out}")
+    return 0
+
+
+def judge(scenario: Scenario, out: Path, exit_codes: Mapping[str, int]) -> Played:
+    """Read the outcome of the run in `out`, verify its answers and judge its checks."""
+    workload, asked = scenario.workload, {}
+    answered: list[Answered] = []
+    stopped = {event.value for event in scenario.timeline() if event.action == "stop"}
+    for files in RobotFiles.of(scenario, out):
+        answers = read_answered(files.answers, files.trace, files.robot)
+        answered += verified(answers, workload, files.seed)
+        # A stopped robot asked for no further tasks. The missing answers of a killed robot count as lost.
+        last = max((one.i for one in answers), default=-1)
+        asked[files.robot] = last + 1 if files.robot in stopped else workload.tasks
+    outcome = Outcome(
+        asked=asked,
+        answered=answered,
+        references=read_references(reference_path(out / TRACE)),
+        readings=read_readings(out / READINGS),
+        deadline_s=None if workload.deadline_ms is None else workload.deadline_ms / 1e3,
+        outage=read_outage(out / EVENTS),
+    )
+    verdicts = [check.judge(outcome) for check in scenario.checks]
+    return Played(scenario, outcome, verdicts, exit_codes)
+
+
+def write_summary(out: Path, played: Played, about: Mapping[str, Any]) -> None:
+    """Write summary.json, the last file of a run. `about` holds what no other file of the run says."""
+    scenario = played.scenario
+    summary = {
+        "name": scenario.name,
+        "seed": scenario.seed,
+        "policy": scenario.robot.policy,
+        "predictor": scenario.robot.predictor,
+        "tasks": scenario.workload.tasks * scenario.workload.robots,
+        "software": VERSION,
+        **about,
+        "exit_codes": dict(played.exit_codes),
+        "stolen_percent": played.stolen_percent,
+        "figures": figures(played.outcome, scenario),
+        "checks": [verdict.as_dict() for verdict in played.verdicts],
+    }
+    write_whole(out / SUMMARY, json.dumps(summary, indent=2, ensure_ascii=False) + "\n")
+
+
+def figures(outcome: Outcome, scenario: Scenario) -> dict[str, float | None]:
+    """All figures that this workload allows, over the whole run."""
+    known = scenario.workload.known()
+    return {
+        name: figure.compute(outcome)
+        for name, figure in FIGURES.items()
+        if figure.needs is None or known[figure.needs]
+    }
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)
+
+
+def _say_nothing(_text: str) -> None:
+    pass

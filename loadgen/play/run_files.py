@@ -1,0 +1,68 @@
+"""The files in the folder of a run: their names, which robot writes which, and clearing old ones away.
+
+What is in them is described in docs/formats.md.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+from offboard.common.errors import ConfigError
+from offboard.loadgen.scenario.scenario import Scenario
+from offboard.loadgen.testbed.testbed import ROBOT
+
+TRACE = "trace.jsonl"
+ANSWERS = "answers.jsonl"
+LINK = "link.jsonl"
+EVENTS = "events.jsonl"
+READINGS = "usage.jsonl"
+SUMMARY = "summary.json"
+TABLE = "table.md"
+ROBOT_SEED_STEP = 1_000_003  # large: robots of one run differ, and so do runs with neighbouring seeds
+
+
+@dataclass(frozen=True, slots=True)
+class RobotFiles:
+    """The files that one robot of a run writes, and the seed of its tasks."""
+
+    robot: str
+    trace: Path
+    answers: Path
+    seed: int
+
+    @classmethod
+    def of(cls, scenario: Scenario, out: Path) -> Iterator[Self]:
+        """One for each robot. Only the first robot's files have names without a number."""
+        for n, robot in enumerate(scenario.robots()):
+            suffix = robot.removeprefix(ROBOT)
+            trace, answers = (out / name.replace(".", f"{suffix}.", 1) for name in (TRACE, ANSWERS))
+            yield cls(robot, trace, answers, scenario.seed + n * ROBOT_SEED_STEP)
+
+
+class LineCounter:
+    """Counts the whole lines of a file that grows; reads every byte once."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._count = self._read = 0
+
+    def count(self) -> int:
+        if self.path.exists():
+            with self.path.open("rb") as file:
+                file.seek(self._read)
+                new = file.read()
+            self._count += new.count(b"\n")
+            self._read += len(new)
+        return self._count
+
+
+def clear_folder(out: Path) -> None:
+    """Make the folder of a run, or remove what an earlier run left in it."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for name in ("trace*.jsonl", "answers*.jsonl", "link*.jsonl", EVENTS, READINGS, SUMMARY):
+            for left in out.glob(name):
+                left.unlink()
+    except OSError as error:
+        raise ConfigError(f"--out: {out} cannot be written to: {error.strerror}") from error

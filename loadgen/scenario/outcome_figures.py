@@ -1,0 +1,146 @@
+"""The figures of an outcome, such as lost tasks, P95 or time over oracle, registered in `FIGURES` by name.
+
+Which limits they must keep is up to `pass_fail_check`.
+"""
+
+import statistics
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from offboard.loadgen.scenario.outcome import Outcome, Reading
+from offboard.loadgen.table.table_two_figures import quantile
+from offboard.robot_client.sites.runner import CLOUD
+
+GROWTH_FROM = 1 / 3  # share of the run that is left out: a process needs it to reach its usual size
+READINGS_MIN = 6  # readings of a part that are needed to tell whether it grows
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One figure of an outcome: its unit, its meaning, and the function that computes it (None: undefined).
+
+    `needs` names the setting of the workload that the figure cannot do without.
+    """
+
+    unit: str
+    about: str
+    compute: Callable[[Outcome], float | None] = field(repr=False)
+    needs: str | None = None
+
+
+def _lost(run: Outcome) -> float:
+    return sum(run.asked.values()) - len({(one.robot, one.i) for one in run.answered})
+
+
+def _wrong(run: Outcome) -> float:
+    return sum(one.wrong is not None for one in run.answered)
+
+
+def _failed(run: Outcome) -> float:
+    return sum(one.error is not None for one in run.answered)
+
+
+def _mean_ms(run: Outcome) -> float | None:
+    return 1e3 * sum(one.response_s for one in run.answered) / len(run.answered) if run.answered else None
+
+
+def _quantile_ms(percent: int) -> Callable[[Outcome], float | None]:
+    def compute(run: Outcome) -> float | None:
+        times = np.array([one.response_s for one in run.answered])
+        return 1e3 * float(quantile(times, percent)) if len(times) else None
+
+    return compute
+
+
+def _percent(of: Callable[[Outcome], Sequence[bool]]) -> Callable[[Outcome], float | None]:
+    def compute(run: Outcome) -> float | None:
+        facts = of(run)
+        return 100 * sum(facts) / len(facts) if facts else None
+
+    return compute
+
+
+def _late(run: Outcome) -> list[bool]:
+    assert run.deadline_s is not None
+    return [one.response_s > run.deadline_s for one in run.answered]
+
+
+def _in_the_cloud(run: Outcome) -> list[bool]:
+    return [one.chosen == CLOUD for one in run.answered if one.chosen and not one.both]
+
+
+def _twice(run: Outcome) -> list[bool]:
+    return [len(one.sites) > 1 for one in run.answered if one.sites]
+
+
+def _right_site(run: Outcome) -> list[bool]:
+    known = [one for one in run.references if len(one.seconds) > 1 and not one.both]
+    return [one.chosen == min(one.seconds, key=one.seconds.__getitem__) for one in known]
+
+
+def _time_over_oracle(run: Outcome) -> float | None:
+    oracle_s = sum(one.oracle_s for one in run.references)
+    return sum(one.sent_s for one in run.references) / oracle_s if oracle_s else None
+
+
+def _regret_ms(run: Outcome) -> float | None:
+    regrets = [one.sent_s - one.oracle_s for one in run.references]
+    return 1e3 * sum(regrets) / len(regrets) if regrets else None
+
+
+def _growth(of: Callable[[Reading], float]) -> Callable[[Outcome], float | None]:
+    """Growth in percent of the part that grew most, from the first to the last third of its readings.
+
+    Compares the medians of the two thirds, so that a single high reading is no growth.
+    """
+
+    def compute(run: Outcome) -> float | None:
+        end_s = max((one.at_s for one in run.readings), default=0.0)
+        grown = []
+        for part in {one.part for one in run.readings}:
+            mine = [of(one) for one in run.readings if one.part == part and one.at_s >= GROWTH_FROM * end_s]
+            third = len(mine) // 3
+            if len(mine) >= READINGS_MIN:
+                first, last = statistics.median(mine[:third]), statistics.median(mine[-third:])
+                grown.append(100 * (last / first - 1))
+        return max(grown, default=None)
+
+    return compute
+
+
+FIGURES: dict[str, Figure] = {
+    "lost": Figure("tasks", "tasks that were never answered", _lost),
+    "wrong": Figure("tasks", "tasks with a wrong answer", _wrong, "jump"),
+    "failed": Figure("tasks", "tasks that ended with an error", _failed),
+    "mean_ms": Figure("ms", "mean time from when a task is due to its answer", _mean_ms),
+    "p95_ms": Figure("ms", "95 % of the tasks are answered within this time", _quantile_ms(95)),
+    "p99_ms": Figure("ms", "99 % of the tasks are answered within this time", _quantile_ms(99)),
+    "late_percent": Figure("%", "tasks answered after their deadline", _percent(_late), "deadline"),
+    "cloud_percent": Figure(
+        "%", "share of the cloud in the tasks that were sent to one site", _percent(_in_the_cloud)
+    ),
+    "twice_percent": Figure("%", "tasks that ran on two sites", _percent(_twice)),
+    "accuracy_percent": Figure(
+        "%",
+        "share of the reference tasks that were sent to the faster site",
+        _percent(_right_site),
+        "reference",
+    ),
+    "time_over_oracle": Figure(
+        "times",
+        "time of the reference tasks on the chosen site, divided by their time on the faster site",
+        _time_over_oracle,
+        "reference",
+    ),
+    "regret_ms": Figure("ms", "mean time that the faster site would have saved", _regret_ms, "reference"),
+    "memory_growth_percent": Figure(
+        "%", "memory growth of the part that grew most", _growth(lambda one: one.memory_bytes)
+    ),
+    "handles_growth_percent": Figure(
+        "%",
+        "growth in open files and sockets of the part that grew most",
+        _growth(lambda one: one.handles),
+    ),
+}

@@ -1,0 +1,78 @@
+"""Reads the outcome of a run from the files in its folder (docs/formats.md).
+
+The robot writes these files; what their lines mean is in `outcome`.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from offboard.common.errors import DataError
+from offboard.loadgen.scenario.interval_coverage import intervals_of, late_seconds
+from offboard.loadgen.scenario.outcome import Answered, Reading, Reference
+from offboard.robot_client.records import trace
+from offboard.robot_client.sites.runner import CLOUD
+
+
+def read_answered(answers: Path, records: Path, robot: str) -> list[Answered]:
+    """The answers of one robot, joined with its trace by task id. Without a trace record no site is known."""
+    by_id = {record["id"]: record for record in trace.read(records)} if records.is_file() else {}
+    late = late_seconds(by_id.values())
+    found = []
+    for line in read_lines(answers):
+        record = by_id.get(line["id"], {})
+        decision, executions = record.get("decision", {}), record.get("executions", ())
+        found.append(
+            Answered(
+                i=line["i"],
+                robot=robot,
+                due_s=line["due_s"],
+                ended_s=line["ended_s"],
+                error=line["error"],
+                answer=line["answer"],
+                chosen=decision.get("site"),
+                both=decision.get("both", False),
+                sites=tuple(one["site"] for one in executions),
+                intervals=intervals_of(record, late),
+                server_s=next(
+                    (one["run_s"] for one in executions if one["site"] == CLOUD and one["ok"]), None
+                ),
+            )
+        )
+    return found
+
+
+def read_references(path: Path) -> list[Reference]:
+    """The reference runs of a run; leaves out tasks that no site answered."""
+    found = []
+    for line in read_lines(path):
+        seconds = {site: run["seconds"] for site, run in line["sites"].items() if run["ok"]}
+        given_up_s = {site: run["seconds"] for site, run in line["sites"].items() if not run["ok"]}
+        if seconds:
+            found.append(
+                Reference(
+                    i=line["i"],
+                    chosen=line["chosen"],
+                    both=line["both"],
+                    seconds=seconds,
+                    given_up_s=given_up_s,
+                )
+            )
+    return found
+
+
+def read_readings(path: Path) -> list[Reading]:
+    return [Reading(**line) for line in read_lines(path)]
+
+
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """The lines of a JSON Lines file, without a torn last line; an absent file has none."""
+    if not path.is_file():
+        return []
+    found = []
+    for number, line in enumerate(path.read_bytes().split(b"\n")[:-1], 1):
+        try:
+            found.append(json.loads(line))
+        except ValueError as error:
+            raise DataError(f"{path}:{number}: not a JSON line: {error}") from None
+    return found

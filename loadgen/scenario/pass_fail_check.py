@@ -1,0 +1,124 @@
+"""The pass/fail checks of a scenario: each compares one figure of the outcome with a limit.
+
+How a figure is computed is in `outcome_figures`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from offboard.common.config import check, from_table, setting
+from offboard.common.errors import ConfigError, DataError
+from offboard.common.toml_file import line_of, unknown
+from offboard.loadgen.scenario.outcome import Outcome
+from offboard.loadgen.scenario.outcome_figures import FIGURES
+
+CHECKS_MAX = 100
+
+
+@dataclass(frozen=True)
+class Check:
+    """`[[check]]`: an upper or a lower limit for one figure.
+
+    `fails_with` names a policy or a broken part. `make chaos` plays the scenario with it and expects the
+    check to fail.
+    """
+
+    figure: str = setting("", "name of the figure")
+    at_most: float | None = setting(None, "largest allowed value")
+    at_least: float | None = setting(None, "smallest allowed value")
+    from_task: int = setting(0, "first task that counts", minimum=0)
+    to_task: int | None = setting(None, "first task that no longer counts", minimum=1)
+    fails_with: str = setting("", "policy or broken part that makes this check fail")
+    note: str = setting("", "explanation, printed when the check fails")
+
+    def __post_init__(self) -> None:
+        check(self)
+        if self.figure not in FIGURES:
+            raise ConfigError(f"figure: {unknown('figure', self.figure, tuple(FIGURES))}")
+        if (self.at_most is None) == (self.at_least is None):
+            raise ConfigError("figure: give either at_most or at_least")
+        if self.to_task is not None and self.to_task <= self.from_task:
+            raise ConfigError(f"to_task: {self.to_task} is not above from_task {self.from_task}")
+
+    def __str__(self) -> str:
+        which, limit = ("at most", self.at_most) if self.at_most is not None else ("at least", self.at_least)
+        span = f" from task {self.from_task}" if self.from_task else ""
+        span += f" before task {self.to_task}" if self.to_task is not None else ""
+        return f"{self.figure} {which} {limit:g} {FIGURES[self.figure].unit}{span}"
+
+    def judge(self, run: Outcome) -> "Verdict":
+        value = FIGURES[self.figure].compute(run.between(self.from_task, self.to_task))
+        if value is None:
+            return Verdict(self, None, holds=False)
+        holds = value <= self.at_most if self.at_most is not None else value >= (self.at_least or 0.0)
+        return Verdict(self, value, holds)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The result of a check; `value` is None if the figure is undefined for the tasks that count."""
+
+    check: Check
+    value: float | None
+    holds: bool
+
+    def __str__(self) -> str:
+        if self.value is None:
+            return f"FAILS  {self.check}: undefined for these tasks"
+        if self.holds:
+            return f"holds  {self.check}: {self.value:.4g}"
+        limit = self.check.at_most if self.check.at_most is not None else self.check.at_least
+        assert limit is not None
+        side = "above" if self.value > limit else "below"
+        note = f" ({self.check.note})" if self.check.note else ""
+        return f"FAILS  {self.check}: {self.value:.4g}, {abs(self.value - limit):.4g} {side} the limit{note}"
+
+    def as_dict(self) -> dict[str, Any]:
+        return {**asdict(self.check), "value": self.value, "holds": self.holds}
+
+
+def parse_checks(
+    table: Mapping[str, Any], path: Path, *, tasks: int, known: Mapping[str, bool]
+) -> tuple[Check, ...]:
+    """The checks in a scenario file; DataError names file and line.
+
+    `tasks` and `known` describe the workload. A check that no run of it can compute is an error too.
+    """
+    given = table.get("check", [])
+    if not isinstance(given, list) or not all(isinstance(one, dict) for one in given):
+        raise DataError(f"{path}: check is not a list of tables, each under [[check]]")
+    if len(given) > CHECKS_MAX:
+        raise DataError(f"{path}: {len(given)} checks, at most {CHECKS_MAX} are allowed")
+    lines = path.read_text().splitlines()
+    checks = []
+    for number, one in enumerate(given, 1):
+        place = f"{path}:{line_of(lines, 'check', number, 'figure')}"
+        for key in one:
+            if key not in Check.__dataclass_fields__:
+                line = line_of(lines, "check", number, key)
+                raise DataError(f"{path}:{line}: {unknown('key', key, tuple(Check.__dataclass_fields__))}")
+        try:
+            checks.append(from_table(Check, one, path, f"check {number}"))
+            check_computable(checks[-1], tasks=tasks, known=known)
+        except DataError as error:
+            raise DataError(f"{place}: {str(error).removeprefix(f'{path}: ')}") from None
+        except ConfigError as error:
+            raise DataError(f"{place}: {error}") from None
+    return tuple(checks)
+
+
+def check_computable(one: Check, *, tasks: int, known: Mapping[str, bool]) -> None:
+    """ConfigError if a run with this many tasks can never compute the check.
+
+    `known` says which optional settings of the workload are present.
+    """
+    needs = FIGURES[one.figure].needs
+    if needs is not None and not known[needs]:
+        raise ConfigError(f"check {one}: cannot be computed without workload.{needs}")
+    if max(one.from_task, (one.to_task or 1) - 1) >= tasks:
+        last = one.to_task if one.to_task is not None and one.to_task > tasks else one.from_task
+        raise ConfigError(
+            f"check {one}: cannot be computed, task {last} is not among the {tasks} of the workload"
+        )

@@ -1,0 +1,127 @@
+"""Scenario files: finds a scenario by name or path, reads the TOML file and checks every value in it.
+
+What the values mean is in `scenario`.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+from offboard.common.config import from_table
+from offboard.common.errors import ConfigError, DataError
+from offboard.common.toml_file import read_toml, unknown_key
+from offboard.loadgen.relay.link.link_settings import LinkFlags
+from offboard.loadgen.scenario.event_timeline import parse_events
+from offboard.loadgen.scenario.pass_fail_check import parse_checks
+from offboard.loadgen.scenario.random_faults import Chaos
+from offboard.loadgen.scenario.scenario import CloudPart, RobotPart, Scenario, Workload
+
+SHIPPED = Path(__file__).parents[1] / "scenarios"
+NAME = r"[A-Za-z0-9][A-Za-z0-9_-]*"
+LINK_KEYS = tuple(f.name for f in fields(LinkFlags))
+
+
+def read_scenario(path: Path) -> Scenario:
+    """The scenario in a TOML file; DataError names the file and the wrong key."""
+    table = read_toml(path)
+    known = [{"events": "event", "checks": "check"}.get(f.name, f.name) for f in fields(Scenario)]
+    for key in table:
+        if key not in known:
+            raise unknown_key(path, key, known)
+    name, seed = table.get("name"), table.get("seed", 1)
+    if not isinstance(name, str) or not re.fullmatch(NAME, name):
+        wrong = (
+            f"name = {name!r} may contain only letters, digits, _ and -, and starts with a letter or digit"
+        )
+        raise DataError(f"{path}: {wrong}" if name else f"{path}: name is missing")
+    if type(seed) is not int or seed < 0:
+        raise DataError(f"{path}: seed = {seed!r} is not a whole number of at least 0")
+    workload = _workload(_table(table, "workload", path), path)
+    link = _link(_table(table, "link", path), path)
+    return Scenario(
+        name=name,
+        seed=seed,
+        workload=workload,
+        about=str(table.get("about", "")).strip(),
+        robot=from_table(RobotPart, _table(table, "robot", path), path, "robot"),
+        cloud=from_table(CloudPart, _table(table, "cloud", path), path, "cloud"),
+        link=link,
+        events=parse_events(
+            table, path, parts=workload.parts(), link=from_table(LinkFlags, link, path, "link").link
+        ),
+        checks=parse_checks(table, path, tasks=workload.tasks, known=workload.known()),
+        chaos=_chaos(table, workload, path),
+    )
+
+
+def find_scenario(name: str) -> Path:
+    """The path of a scenario: `name` is a file, or the name of a shipped scenario."""
+    for path in (Path(name), SHIPPED / f"{name}.toml"):
+        if path.is_file():
+            return path
+    raise DataError(f"scenario {name!r} is neither a file nor one of {', '.join(shipped())}")
+
+
+def shipped() -> tuple[str, ...]:
+    """The names of the scenarios that come with Offboard."""
+    return tuple(sorted(path.stem for path in SHIPPED.glob("*.toml")))
+
+
+def _table(table: Mapping[str, Any], section: str, path: Path) -> Mapping[str, Any]:
+    found = table.get(section, {})
+    if not isinstance(found, dict):
+        raise DataError(f"{path}: {section} is not a table")
+    return found
+
+
+def _workload(table: Mapping[str, Any], path: Path) -> Workload:
+    workload = from_table(Workload, table, path, "workload")
+    try:
+        workload.robot(seed=0)
+    except ConfigError as error:
+        raise DataError(f"{path}: workload: {error}") from None
+    workload = replace(workload, sizes=_sizes(workload.sizes, path))
+    if workload.map is None:
+        return workload
+    place = (path.parent / workload.map).resolve()
+    if not place.is_file():
+        raise DataError(f"{path}: workload.map: {place}: no such file")
+    return replace(workload, map=place)
+
+
+def _sizes(texts: tuple[str, ...], path: Path) -> tuple[str, ...]:
+    """The sizes, with the full path if they come from a file. Such a file cannot be combined with others."""
+    files = [text for text in texts if text.endswith(".csv")]
+    if not files:
+        return texts
+    place = (path.parent / files[0]).resolve()
+    if len(texts) > 1 or not place.is_file():
+        wrong = (
+            "no such file" if len(texts) == 1 else "a file gives the sizes of all tasks; remove the others"
+        )
+        raise DataError(f"{path}: workload.sizes: {files[0]}: {wrong}")
+    return (str(place),)
+
+
+def _chaos(table: Mapping[str, Any], workload: Workload, path: Path) -> Chaos | None:
+    if "chaos" not in table:
+        return None
+    if workload.rate is None:
+        raise DataError(
+            f"{path}: chaos: random faults come by the clock; workload.arrivals must not be closed"
+        )
+    return from_table(Chaos, _table(table, "chaos", path), path, "chaos")
+
+
+def _link(table: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
+    for key in table:
+        if key not in LINK_KEYS:
+            raise unknown_key(path, key, LINK_KEYS)
+    table = {
+        key: (path.parent / str(value)).resolve() if key.endswith("samples") else value
+        for key, value in table.items()
+    }
+    from_table(LinkFlags, table, path, "link")
+    return table

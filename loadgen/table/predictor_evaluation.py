@@ -1,0 +1,165 @@
+"""Evaluates predictors on measured rows: replays Algorithm 1 and scores every prediction.
+
+`table_two` prints the scores; `table_two_figures` computes the figures.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from offboard.common.errors import MissingExtra
+from offboard.loadgen.table import confidence_intervals
+from offboard.loadgen.table.confidence_intervals import Picks
+from offboard.loadgen.table.measured_rows import Column, Rows
+from offboard.loadgen.table.table_settings import ALL, CHOSEN, FULL, FULL_WINDOW, NONE, TableConfig
+from offboard.loadgen.table.table_two_figures import Score, Scored, figures, mean_r, plain
+from offboard.robot_client import predictors
+
+
+class Evaluation:
+    """Predictors and constant rules, replayed over `rows`."""
+
+    def __init__(self, rows: Rows, config: TableConfig) -> None:
+        self._rows = rows
+        self._config = config
+        # These are the same for every table, so they are computed once.
+        self._split = cache(self._find_split)
+        self._correlations = cache(self._find_correlations)
+        self._correlation_ends = cache(self._find_correlation_ends)
+        self._blocks = cache(config.blocks)
+
+    def scores(self, feedback: str) -> Iterator[Score]:
+        """The lines of one table: each predictor with each window, then the constant rules."""
+        for name in self._config.names():
+            yield from self._predictor_scores(name, feedback)
+        oracle = self._rows.cloud_s < self._rows.onboard_s
+        for rule, to_cloud in (
+            ("always-onboard", np.zeros_like(oracle)),
+            ("always-cloud", np.ones_like(oracle)),
+            ("oracle", oracle),
+        ):
+            yield from self._lines(
+                Score("", rule), Scored(self._rows.onboard_s, self._rows.cloud_s, to_cloud)
+            )
+
+    def predictions(self, name: str, window: str, feedback: str) -> Scored | None:
+        """The rows after the first N (full: after the first 80 %), with predictions.
+
+        None if no row is left.
+        """
+        length = self._length(window)
+        if length < 2 or length >= len(self._rows):
+            return None
+        if window == FULL_WINDOW:
+            onboard_s, cloud_s = self._split(name)
+        else:
+            onboard_s, cloud_s = predict(
+                self._rows, length, predictor=name, feedback=feedback, seed=self._config.seed
+            )
+        scored = self._rows.since(length)
+        return Scored(
+            onboard_s=scored.onboard_s,
+            cloud_s=scored.cloud_s,
+            to_cloud=cloud_s < onboard_s,  # Eq. 1; a tie stays onboard
+            onboard_predicted_s=onboard_s,
+            cloud_predicted_s=cloud_s,
+        )
+
+    def _predictor_scores(self, name: str, feedback: str) -> Iterator[Score]:
+        for window in self._config.windows:
+            if predictors.slow(name) and window != FULL_WINDOW and not self._config.every_window:
+                continue
+            try:
+                scored = self.predictions(name, window, feedback)
+            except MissingExtra as error:
+                if ALL not in self._config.predictors:
+                    raise
+                yield Score(name, window, note=str(error))
+                continue
+            if scored is None:
+                yield Score(name, window, note="not enough rows")
+            else:
+                yield from self._lines(Score(name, window), scored, self._correlated(window))
+
+    def _length(self, window: str) -> int:
+        return len(self._rows) * 4 // 5 if window == FULL_WINDOW else int(window)
+
+    def _correlated(self, window: str) -> int:
+        """The length of the sliding windows over which r is computed; for full, all rows."""
+        return len(self._rows) if window == FULL_WINDOW else int(window)
+
+    def _find_split(self, name: str) -> tuple[Column, Column]:
+        """The predictions for full.
+
+        The same in both feedback modes, because nothing is learnt after the split.
+        """
+        return predict(
+            self._rows, self._length(FULL_WINDOW), predictor=name, feedback=NONE, seed=self._config.seed
+        )
+
+    def _lines(self, line: Score, scored: Scored, correlated: int | None = None) -> Iterator[Score]:
+        """The figures, and with --bootstrap the ends of their intervals."""
+        count = len(scored.to_cloud)
+        found = plain(figures(scored)) | self._correlations(correlated)
+        yield replace(line, scored=count, **found)
+        if self._config.bootstrap:
+            ends = self._blocks(count).intervals(lambda picks: figures(scored.picked(picks)))
+            r_ends = self._correlation_ends(correlated)
+            for bound, end, r_end in zip(confidence_intervals.BOUNDS, ends, r_ends, strict=True):
+                yield replace(line, scored=count, bound=bound, **end, **r_end)
+
+    def _find_correlations(self, length: int | None) -> dict[str, Any]:
+        if length is None:
+            return {}
+        rows = self._rows
+        return {
+            "r_cloud": mean_r(rows.size, rows.cloud_s, length),
+            "r_onboard": mean_r(rows.size, rows.onboard_s, length),
+        }
+
+    def _find_correlation_ends(self, length: int | None) -> tuple[dict[str, Any], ...]:
+        if length is None:
+            return ({},) * len(confidence_intervals.BOUNDS)
+        rows = self._rows
+
+        def both(picks: Picks) -> dict[str, Column]:
+            size = rows.size[picks]
+            return {
+                "r_cloud": confidence_intervals.mean_r(size, rows.cloud_s[picks], length),
+                "r_onboard": confidence_intervals.mean_r(size, rows.onboard_s[picks], length),
+            }
+
+        return self._blocks(len(rows)).intervals(both)
+
+
+def predict(rows: Rows, length: int, *, predictor: str, feedback: str, seed: int) -> tuple[Column, Column]:
+    """The predicted onboard and cloud times of every row after the first `length`; both sites learn those."""
+    onboard, cloud = (predictors.make(predictor, length, seed) for _ in range(2))
+    triples = list(zip(rows.size.tolist(), rows.onboard_s.tolist(), rows.cloud_s.tolist(), strict=True))
+    for size, onboard_s, cloud_s in triples[:length]:
+        onboard.learn(size, onboard_s)
+        cloud.learn(size, cloud_s)
+    predicted = np.empty((2, len(triples) - length))
+    onboard_ahead = cloud_ahead = 1
+    for at, (size, onboard_s, cloud_s) in enumerate(triples[length:]):
+        p_onboard, p_cloud = _seconds(onboard, size, onboard_ahead), _seconds(cloud, size, cloud_ahead)
+        predicted[:, at] = p_onboard, p_cloud
+        to_cloud = p_cloud < p_onboard  # Eq. 1; a tie stays onboard
+        onboard_ahead += 1
+        cloud_ahead += 1
+        if feedback == FULL or (feedback == CHOSEN and not to_cloud):
+            onboard.learn(size, onboard_s)
+            onboard_ahead = 1
+        if feedback == FULL or (feedback == CHOSEN and to_cloud):
+            cloud.learn(size, cloud_s)
+            cloud_ahead = 1
+    return predicted[0], predicted[1]
+
+
+def _seconds(predictor: predictors.Predictor, size: float, ahead: int) -> float:
+    prediction = predictor.predict(size, ahead)
+    assert prediction is not None, "a predictor that has learnt something can predict"
+    return prediction.seconds

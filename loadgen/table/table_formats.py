@@ -1,0 +1,121 @@
+"""The output formats of tables: Markdown, CSV, JSON and LaTeX.
+
+The modules that make a table compute its figures.
+"""
+
+import csv
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+UNDEFINED = "–"  # noqa: RUF001 (the dash for "no value" in tables)
+
+
+@dataclass(frozen=True, slots=True)
+class Heading:
+    """The heading of a column, and the digits after the point in its cells; None: the cells are text."""
+
+    markdown: str
+    latex: str
+    digits: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table: lines, which are dataclasses of one type, and their headings.
+
+    `headings` are the columns of Markdown and LaTeX, in order. CSV and JSON hold all fields of the lines.
+    `about` comes before the cells of each CSV line, and with the lines in JSON.
+    The `note` of a line is shown in its first column. None in a line means undefined.
+    """
+
+    caption: str
+    about: Mapping[str, Any]
+    headings: Mapping[str, Heading]
+    lines: Sequence[Any]
+    notes: tuple[str, ...] = ()
+
+
+def render(tables: Sequence[Table], format: str) -> str:
+    """All tables as text, in one of `FORMATS`."""
+    return _RENDERERS[format](tables)
+
+
+def cells(table: Table, line: Any) -> list[str]:
+    """The cells of one line, as Markdown shows them."""
+    return [_cell(table, line, name) for name in table.headings]
+
+
+def _markdown(tables: Sequence[Table]) -> str:
+    blocks = []
+    for table in tables:
+        heading = "| " + " | ".join(heading.markdown for heading in table.headings.values()) + " |"
+        rule = "|" + " --- |" * len(table.headings)
+        lines = ["| " + " | ".join(cells(table, line)) + " |" for line in table.lines]
+        notes = [f"- {note}" for note in table.notes]
+        blocks.append("\n".join([table.caption, *notes, "", heading, rule, *lines, ""]))
+    return "\n".join(blocks)
+
+
+def _csv(tables: Sequence[Table]) -> str:
+    """Numbers have full precision, every line names its table, and an undefined cell is empty."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*tables[0].about, *(field.name for field in fields(tables[0].lines[0]))])
+    for table in tables:
+        for line in table.lines:
+            values = ["" if value is None else value for value in asdict(line).values()]
+            writer.writerow([*table.about.values(), *values])
+    return text.getvalue()
+
+
+def _json(tables: Sequence[Table]) -> str:
+    plain = [
+        {**table.about, "notes": table.notes, "scores": [asdict(line) for line in table.lines]}
+        for table in tables
+    ]
+    return json.dumps({"tables": plain}, indent=2, ensure_ascii=False) + "\n"
+
+
+def _latex(tables: Sequence[Table]) -> str:
+    blocks = []
+    for table in tables:
+        heading = " & ".join(heading.latex for heading in table.headings.values()) + r" \\"
+        lines = [
+            " & ".join(_latex_cell(cell) for cell in cells(table, line)) + r" \\" for line in table.lines
+        ]
+        caption = _latex_text(" ".join([table.caption, *table.notes]))
+        top = [r"\begin{table*}", rf"\caption{{{caption}}}"]
+        body = [r"\begin{tabular}{l" + "r" * (len(table.headings) - 1) + "}", r"\hline", heading, r"\hline"]
+        blocks.append("\n".join([*top, *body, *lines, r"\hline", r"\end{tabular}", r"\end{table*}", ""]))
+    return "\n".join(blocks)
+
+
+def _cell(table: Table, line: Any, name: str) -> str:
+    value, digits = getattr(line, name), table.headings[name].digits
+    if digits is None:
+        first = name == next(iter(table.headings))
+        return f"{value}: {line.note}" if first and line.note else str(value)
+    return UNDEFINED if value is None else f"{value:z.{digits}f}"  # z: no -0.00000
+
+
+def _latex_cell(cell: str) -> str:
+    if cell == UNDEFINED:
+        return "--"
+    return f"${cell}$" if cell.startswith("-") else _latex_text(cell)
+
+
+def _latex_text(text: str) -> str:
+    special = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    return "".join(special.get(sign, f"\\{sign}" if sign in "&%$#_{}" else sign) for sign in text)
+
+
+_RENDERERS: dict[str, Callable[[Sequence[Table]], str]] = {
+    "md": _markdown,
+    "csv": _csv,
+    "json": _json,
+    "latex": _latex,
+}
+FORMATS = tuple(_RENDERERS)

@@ -1,0 +1,195 @@
+"""One process of the local testbed: starts it so that it cannot outlive us, waits until it is ready, ends it.
+
+`local_testbed` decides which processes there are.
+"""
+
+import contextlib
+import http.client
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn
+
+from offboard.common.errors import ConfigError, OffloadError
+from offboard.loadgen.relay.client import ask
+from offboard.loadgen.testbed.cpu_quota import Quota
+from offboard.loadgen.testbed.testbed import PART
+
+LAUNCH_S = 10.0
+POLL_S = 0.05
+TERMINATE_S = 5.0
+KILL_S = 5.0
+TAIL_LINES = 15
+TAIL_BYTES = 1 << 16
+USAGE_EXIT = 2
+INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
+
+# A Python program that becomes the command argv[3:]. The kernel kills it when the testbed (process argv[1])
+# dies, even if it is stopped. The pipe argv[2] closes when it becomes the command. The parent is checked
+# after prctl, because prctl has no effect if the parent died before.
+LAUNCHER = """
+import ctypes, os, signal, sys
+PR_SET_PDEATHSIG = 1
+if ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
+    sys.exit("prctl: " + os.strerror(ctypes.get_errno()))
+if os.getppid() != int(sys.argv[1]):
+    sys.exit("the testbed is gone")
+os.set_inheritable(int(sys.argv[2]), False)
+try:
+    os.execvp(sys.argv[3], sys.argv[3:])
+except OSError as error:
+    sys.exit(f"cannot run {sys.argv[3]}: {error.strerror}")
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One process of a testbed.
+
+    `http` (HOST:PORT) answers 200 at the path `ready` once the process is ready; None: there is nothing to
+    wait for.
+    `cpus` is its CPU quota; None: no quota.
+    Its output goes to logs/NAME.log, or to our own output if it is `shown`.
+    """
+
+    name: str
+    command: tuple[str, ...]
+    http: str | None = None
+    ready: str = "/ready"
+    cpus: float | None = None
+    shown: bool = False
+
+
+@dataclass(slots=True)
+class Child:
+    """A part that was started."""
+
+    part: Part
+    process: subprocess.Popen[bytes]
+    log: Path
+    log_start: int  # size of the log before this start
+    launched: int  # pipe that reaches its end once the launcher has become the part
+    quota: Quota | None = None
+
+    def wait_launched(self) -> None:
+        """Wait until the process can no longer outlive us; from then on it may be stopped."""
+        try:
+            if not select.select([self.launched], [], [], LAUNCH_S)[0]:
+                raise OffloadError(f"{self.part.name} could not be launched within {LAUNCH_S:g} s")
+        finally:
+            os.close(self.launched)
+
+    def let_go(self) -> None:
+        """Release the process from its quota and continue it."""
+        if self.quota is not None:
+            self.quota.close()
+            self.quota = None
+        self.send(signal.SIGCONT)
+
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal to the process and to its workers, which are in its process group."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.process.pid, number)
+
+    def tail(self) -> str:
+        """The last lines that the process logged since its start."""
+        with self.log.open("rb") as file:
+            file.seek(max(self.log_start, self.log.stat().st_size - TAIL_BYTES))
+            lines = file.read().decode(errors="replace").splitlines()
+        return "\n".join(lines[-TAIL_LINES:]) or "(it logged nothing)"
+
+
+def launch(part: Part, log: Path, *, again: bool) -> Child:
+    """Start the part. From the start on, it dies with this thread.
+
+    `again` appends to its log instead of replacing it.
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("ab" if again else "wb") as file:
+        launched, launching = os.pipe()
+        command = [
+            sys.executable,
+            "-I",
+            "-S",
+            "-c",
+            LAUNCHER,
+            str(os.getpid()),
+            str(launching),
+            *part.command,
+        ]
+        output: Any = {} if part.shown else {"stdout": file, "stderr": subprocess.STDOUT}
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            env={**os.environ, PART: part.name},
+            start_new_session=True,
+            pass_fds=[launching],
+            **output,
+        )
+        os.close(launching)
+        return Child(part, process, log, log_start=file.tell(), launched=launched)
+
+
+def wait_ready(child: Child, timeout_s: float) -> None:
+    """Poll until the part answers 200.
+
+    If it ends before, or takes too long, the error contains the end of its log.
+    """
+    part = child.part
+    assert part.http is not None
+    end_s = time.monotonic() + timeout_s
+    while child.process.poll() is None:
+        with contextlib.suppress(OffloadError):
+            if ask(part.http, "GET", part.ready)[0] == http.client.OK:
+                return
+        if time.monotonic() > end_s:
+            raise OffloadError(
+                f"{part.name} was not ready within {timeout_s:g} s; its log ends with:\n{child.tail()}"
+            )
+        time.sleep(POLL_S)
+    code = child.process.returncode
+    if code == USAGE_EXIT:
+        raise ConfigError(child.tail())
+    raise OffloadError(
+        f"{part.name} ended during start with exit code {code}; {child.log} ends with:\n{child.tail()}"
+    )
+
+
+def end(child: Child) -> None:
+    """Release the part from its quota, ask it to end, then kill it and the workers that are left."""
+    child.let_go()
+    if child.process.poll() is None:
+        child.process.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            child.process.wait(TERMINATE_S)
+    child.send(signal.SIGKILL)
+    child.process.wait(KILL_S)
+
+
+def leave(number: int, _frame: FrameType | None) -> NoReturn:
+    """Handler for SIGTERM: raises SystemExit, so that `with` blocks end what they started."""
+    raise SystemExit(128 + number)
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Delay Ctrl-C and SIGTERM until the end of the block.
+
+    They are not blocked: children would inherit that.
+    """
+    kept: list[int] = []
+    before = {number: signal.signal(number, lambda n, _: kept.append(n)) for number in INTERRUPTS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for interrupt in set(kept):
+            signal.raise_signal(interrupt)
