@@ -6,8 +6,8 @@ from typing import Any
 
 from offboard.loadgen.compare.compare import CompareConfig, split_strategy, table
 from offboard.loadgen.scenario.scenario import Scenario
-from offboard.loadgen.simulation.batch import Batch
-from offboard.loadgen.simulation.world import check_simulated
+from offboard.loadgen.simulation.simulated_testbed import check_simulated
+from offboard.loadgen.simulation.simulation_pool import SimulationPool
 from offboard.loadgen.table.render import Heading, Table, render
 
 ABOUT = "time over oracle of each policy"
@@ -18,7 +18,7 @@ def simulated(scenarios: Sequence[Scenario], config: CompareConfig) -> str:
     """All tables as text."""
     for scenario in scenarios:
         check_simulated(scenario)
-    with Batch(config.jobs) as batch:
+    with SimulationPool(config.jobs) as batch:
         tables = [_table(scenario, config, batch) for scenario in scenarios]
     if len(tables) == 1:
         return render(tables, config.format)
@@ -54,7 +54,7 @@ def _mean_and_worst(values: Sequence[float | None]) -> tuple[Any, Any]:
     return (sum(there) / len(there), max(there)) if there else (None, None)
 
 
-def _table(scenario: Scenario, config: CompareConfig, batch: Batch) -> Table:
+def _table(scenario: Scenario, config: CompareConfig, batch: SimulationPool) -> Table:
     strategies = {
         name: dict(zip(("policy", "predictor"), split_strategy(name), strict=True))
         for name in config.policies

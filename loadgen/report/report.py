@@ -14,7 +14,7 @@ from offboard.common.errors import ConfigError, DataError
 from offboard.loadgen.play.player import TRACE
 from offboard.loadgen.report.chart_data import POINTS_MAX, Times
 from offboard.loadgen.report.findings import Findings
-from offboard.loadgen.report.page import Panel, page
+from offboard.loadgen.report.html_page import Panel, page
 from offboard.loadgen.table import paper_table as paper
 from offboard.loadgen.table.replay import ORACLE, RECORDED, ReplayConfig
 from offboard.loadgen.table.rows import write_whole

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any, Self
 
 from offboard.common.errors import ConfigError, MissingExtra, OffloadError
-from offboard.loadgen.relay.client import RelayClient, ask
 from offboard.loadgen.relay.link.link_settings import as_flags
+from offboard.loadgen.relay.relay_client import RelayClient, ask
 from offboard.loadgen.testbed import container_part as inside
 from offboard.loadgen.testbed.container_output import Output
 from offboard.loadgen.testbed.container_part import FAR, NEAR, kind_of

@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from offboard.loadgen.relay.http_control import BODY_BYTES_MAX
-from offboard.loadgen.relay.link.jitter import SAMPLES_MAX
-from offboard.loadgen.relay.schedule import EVENTS_MAX
+from offboard.loadgen.relay.control_api import BODY_BYTES_MAX
+from offboard.loadgen.relay.link.delay_samples import SAMPLES_MAX
+from offboard.loadgen.relay.link_schedule import EVENTS_MAX
 from offboard.loadgen.relay.wan import WanConfig
 from tests.relays import QUIET_S, WAIT_S, WAN, echo, quietest, receive, round_trip_s, silent, wait_until
 
@@ -243,7 +243,7 @@ def test_a_body_beyond_the_bound_is_refused(wan: Any, method: str, path: str) ->
     before = relay.ask("GET", path)
     assert relay.ask(method, path, " " * (BODY_BYTES_MAX - 2) + "{}")[0] == 200
     status, reply = relay.ask(method, path, " " * (BODY_BYTES_MAX - 1) + "{}")
-    assert (status, reply) == (413, {"detail": "body: 4194304 bytes is the most"})
+    assert (status, reply) == (413, {"detail": "body: longer than 4194304 bytes"})
     assert relay.ask("GET", path) == before
 
 
@@ -257,7 +257,7 @@ def test_the_largest_samples_and_schedule_fit(wan: Any) -> None:
     assert relay.ask("POST", "/schedule", {"event": events})[0] == 200
     status, reply = relay.ask("POST", "/schedule", {"event": [*events, {"at_s": 1}]})
     assert status == 422
-    assert reply["detail"] == "schedule: 10001 events, at most 10000 are allowed"
+    assert reply["detail"] == "schedule: 10001 events; at most 10000 are allowed"
 
 
 def test_the_api_describes_itself(wan: Any) -> None:

@@ -75,13 +75,13 @@ OWNERS = {
     },
     "fastapi": {
         "cloud_server/http_api.py",
-        "loadgen/relay/http_control.py",
+        "loadgen/relay/control_api.py",
         "loadgen/relay/toxiproxy/toxiproxy_api.py",
     },
     "uvicorn": {
         "common/security/bounded_http.py",
         "cloud_server/http_api.py",
-        "loadgen/relay/http_control.py",
+        "loadgen/relay/control_api.py",
     },
     "docker": {"loadgen/testbed/containers.py"},
     "numba": {"common/planning/compiled.py"},

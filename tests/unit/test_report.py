@@ -17,8 +17,8 @@ from offboard.loadgen.__main__ import main
 from offboard.loadgen.report import chart_data as series
 from offboard.loadgen.report import charts
 from offboard.loadgen.report.findings import Findings
+from offboard.loadgen.report.inline_svg import inline
 from offboard.loadgen.report.report import ReportConfig, all_charts, facts, find_source, run_report
-from offboard.loadgen.report.svg import inline
 from offboard.loadgen.table import paper_table as paper
 from offboard.loadgen.table.render import render
 from offboard.loadgen.table.rows import Rows, read

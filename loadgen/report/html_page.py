@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 
-from offboard.loadgen.report.svg import inline
+from offboard.loadgen.report.inline_svg import inline
 from offboard.loadgen.table.render import Table, cells
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"

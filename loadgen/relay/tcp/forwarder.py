@@ -1,6 +1,6 @@
-"""One direction of one connection: bytes in from a socket, out to another when the link says so.
+"""One direction of one connection: reads bytes from one socket, and writes them to the other when due.
 
-When they are due is `link.py`'s business, the two sockets and their connection are `connection.py`'s.
+When they are due is computed by `link/pipe.py`; the two sockets belong to `connection.py`.
 """
 
 import asyncio
@@ -8,11 +8,13 @@ import contextlib
 from collections import deque
 from typing import Protocol
 
-from offboard.loadgen.relay.link.link import LinkConditions, Pipe
-from offboard.loadgen.relay.tcp.link_record import Truth
+from offboard.loadgen.relay.link.link import LinkConditions
+from offboard.loadgen.relay.link.outage import delivers, swallows
+from offboard.loadgen.relay.link.pipe import Pipe
+from offboard.loadgen.relay.tcp.link_record import Chunk, LinkRecord
 
-READ_BYTES = 256 << 10  # at a time, and written at a time; the fastest of 64 KiB to 1 MiB
-CHUNKS_MAX = 65_536  # under way in one direction: a chunk of one byte takes memory for a hundred
+READ_BYTES = 256 << 10  # per read and per write; the fastest of 64 KiB to 1 MiB
+CHUNKS_MAX = 65_536  # under way in one direction: a chunk of one byte takes the memory of a hundred
 
 
 class ReadBuffer:
@@ -22,37 +24,37 @@ class ReadBuffer:
         self.renew()
 
     def renew(self) -> None:
-        """Leave the memory to whoever still looks at it."""
+        """Take new memory, and leave the old memory to asyncio, which still holds it."""
         self.view = memoryview(bytearray(READ_BYTES))
 
 
 class Owner(Protocol):
-    """The connection that a flow belongs to."""
+    """The connection that a forwarder belongs to."""
 
     number: int
     buffer: ReadBuffer
     buffer_bytes: int
-    truth: Truth | None
+    record: LinkRecord | None
 
     def because(self, how: str) -> None:
-        """The connection ends for this reason, unless it had another before."""
+        """The connection ends for this reason, unless it already has one."""
 
     def close(self) -> None:
-        """The last byte that a truncated stream lets through was delivered."""
+        """The last byte before the truncation was delivered."""
 
     def settle(self) -> None:
-        """A source has ended, or nothing more can be delivered to a target."""
+        """The source has ended, or nothing more can be delivered to the target."""
 
     def count(self, direction: str, size: int) -> None:
-        """So many bytes were delivered."""
+        """`size` bytes were delivered."""
 
 
-class Flow:
-    """Takes bytes from the source, gives them to the target when due: at once where nothing holds them.
+class Forwarder:
+    """Reads bytes from the source and delivers them to the target when they are due.
 
-    What is under way is bounded, in bytes and in chunks: beyond it the source is not read, and TCP makes
-    the sender wait. In an outage nothing is read and nothing delivered. While the target's side hangs all
-    is read and lost. The source's end is delivered like bytes, after them.
+    The bytes and the chunks under way are bounded. When they reach the bound, the source is not read, and
+    TCP makes the sender wait. In an outage nothing is read and nothing is delivered. While the side of the
+    target hangs, everything is read and lost. The end of the source is delivered like bytes, after them.
     """
 
     def __init__(self, owner: Owner, direction: str, pipe: Pipe) -> None:
@@ -60,26 +62,26 @@ class Flow:
         self._direction = direction
         self._pipe = pipe
         self._loop = asyncio.get_running_loop()
-        # (due, chunk, its line of the truth); an empty chunk is the end
+        # (due, chunk, its line in the record); an empty chunk is the end
         self._under_way: deque[tuple[float, bytes, str]] = deque()
         self._under_way_bytes = 0
-        self._ended = False  # the end is under way, or was
+        self._ended = False  # the end was read: it is under way or delivered
         self._cut = False  # ended by truncation
         self._timer: asyncio.TimerHandle | None = None
         self.source_ended = False
-        self.done = False  # nothing more will be delivered: the end was, or never can be
-        self.swallowed = False  # a hang took something that can never be delivered
+        self.done = False  # nothing more will be delivered
+        self.swallowed = False  # a hang took bytes, which can never be delivered
         self.writable = True  # the target has room
         self.source: asyncio.Transport | None = None
         self.target: asyncio.Transport | None = None
 
     def room(self) -> memoryview:
-        """Where to read to, as much as may be under way."""
+        """The memory to read into, as long as the bytes that may still be under way."""
         return self._owner.buffer.view[: max(1, self._owner.buffer_bytes - self._under_way_bytes)]
 
     def take(self, size: int) -> None:
-        """So many bytes arrived from the source, in `room`."""
-        if self._ended:  # truncated before
+        """`size` bytes arrived from the source, in `room`."""
+        if self._ended:  # by truncation
             return
         arrived_s = self._loop.time()
         data = self._owner.buffer.view[: self._pipe.left(size)]
@@ -92,7 +94,7 @@ class Flow:
         self.refresh()
 
     def end(self) -> None:
-        """The source is closed, or closes its half."""
+        """The source is closed, at least in this direction."""
         self.source_ended = True
         if not self._ended:
             self._owner.because("client" if self._direction == "up" else "cloud")
@@ -102,34 +104,35 @@ class Flow:
         self._owner.settle()
 
     def lose_target(self) -> None:
-        """The target is closed: what is under way to it, and what comes, is lost when due."""
+        """The target is closed: bytes for it are lost when they are due."""
         self.done = self.writable = True
         self.refresh()
         self._owner.settle()
 
     def set_conditions(self, conditions: LinkConditions) -> None:
         self._pipe.conditions = conditions
-        if conditions.hang and not conditions.outage:
+        if swallows(conditions):
             self.drop()
         self._truncate()
         self.refresh()
 
     def refresh(self) -> None:
-        """Deliver what is due, set the timer for the next chunk, read the source if there is room."""
+        """Deliver what is due, set the timer for the next chunk, and read the source if there is room."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
         now = self._pipe.conditions
-        if self.target is not None and not now.outage:
+        if self.target is not None and delivers(now):
             self._deliver(self.target)
         if self.source is not None and not self.source.is_closing():
-            if (now.hang or (self._has_room() and self.target is not None)) and not now.outage:
+            accepts = delivers(now) and self._has_room() and self.target is not None
+            if accepts or swallows(now):
                 self.source.resume_reading()
             else:
                 self.source.pause_reading()
 
     def drop(self) -> None:
-        """Forget what is under way: it will never be delivered."""
+        """Lose all chunks under way."""
         if self._under_way:
             self.swallowed = True
             self.done = self.done or not self._under_way[-1][1]
@@ -145,9 +148,19 @@ class Flow:
         segment, size = self._pipe.segment, len(chunk)
         due_s = self._pipe.due(arrived_s, size)
         line = ""
-        if self._owner.truth is not None:
-            number, direction = self._owner.number, self._direction
-            line = self._owner.truth.chunk(number, direction, segment, size, arrived_s, due_s, self._pipe)
+        if self._owner.record is not None:
+            line = self._owner.record.chunk(
+                Chunk(
+                    connection=self._owner.number,
+                    direction=self._direction,
+                    segment=segment,
+                    size=size,
+                    arrived_s=arrived_s,
+                    due_s=due_s,
+                    drawn_ms=self._pipe.drawn_ms,
+                    stall_ms=self._pipe.stall_ms,
+                )
+            )
         now = self._pipe.conditions
         clear = self.writable and not (self._under_way or now.outage or now.hang)
         if self.target is not None and clear and size and due_s <= arrived_s:
@@ -156,7 +169,7 @@ class Flow:
             return
         self._under_way.append((due_s, bytes(chunk), line))
         self._under_way_bytes += size
-        if now.hang and not now.outage:
+        if swallows(now):
             self.drop()
 
     def _truncate(self) -> None:
@@ -188,7 +201,7 @@ class Flow:
             return
         self._owner.count(self._direction, len(data))
         target.write(data)
-        # asyncio keeps what the socket did not take, since Python 3.12 without copying it.
+        # asyncio keeps the bytes that the socket did not take; since Python 3.12 it does not copy them.
         if isinstance(data, memoryview) and target.get_write_buffer_size():
             self._owner.buffer.renew()
 
@@ -197,10 +210,10 @@ class Flow:
         if self._cut:
             self._owner.close()
         else:
-            with contextlib.suppress(OSError):  # the target is reset, and asyncio has not said so yet
+            with contextlib.suppress(OSError):  # the target is reset, and asyncio does not know it yet
                 target.write_eof()
             self._owner.settle()
 
     def _note(self, line: str, delivered_s: float | None) -> None:
-        if self._owner.truth is not None:
-            self._owner.truth.delivered(line, delivered_s)
+        if self._owner.record is not None:
+            self._owner.record.delivered(line, delivered_s)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from benchmarks.measure import Table
 from offboard.loadgen.scenario.outcome import Reference
 from offboard.loadgen.scenario.scenario import find_scenario, read_scenario
-from offboard.loadgen.simulation.batch import Batch
+from offboard.loadgen.simulation.simulation_pool import SimulationPool
 from offboard.robot_client import policies
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
@@ -30,7 +30,7 @@ def tables() -> list[Table]:
 def _played(scenario: str, *names: str) -> dict[str, list[Reference]]:
     one = read_scenario(find_scenario(scenario)).changed(tasks=TASKS)
     seeds = [replace(one, seed=one.seed + n) for n in range(SEEDS)]
-    with Batch(1) as batch:
+    with SimulationPool(1) as batch:
         played = batch.play(seeds, {name: {"policy": name} for name in names})
     return {
         name: [one for run in runs for one in run.references if one.i >= FROM_TASK]

@@ -1,4 +1,4 @@
-"""Simulated runs of scenarios by several processes; what comes of them does not depend on how many."""
+"""A pool of processes that simulate scenarios; the number of processes does not change the results."""
 
 import logging
 import multiprocessing
@@ -12,27 +12,27 @@ from typing import Any, Self
 from offboard.loadgen.play.player import ROBOT_SEED_STEP
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.scenario import Scenario, Workload
-from offboard.loadgen.simulation.model.simulated_tasks import OTHERS_TASKS_MAX, Tasks, find_tasks
-from offboard.loadgen.simulation.run import simulate
+from offboard.loadgen.simulation.model.simulated_tasks import OTHERS_TASKS_MAX, RobotTasks, find_tasks
+from offboard.loadgen.simulation.simulated_run import simulate
 from offboard.loadgen.testbed.testbed import ROBOT
 
-Wanted = tuple[Workload, int]  # whose tasks, and the seed of the robot
+Wanted = tuple[Workload, int]  # a robot: its workload and its seed
 
 
-class Batch:
-    """Plays with `jobs` processes (None: one a CPU). A context manager."""
+class SimulationPool:
+    """Simulates with `jobs` processes; None means one for each CPU. A context manager."""
 
     def __init__(self, jobs: int | None = None) -> None:
         self._jobs = jobs or os.cpu_count() or 1
         self._pool: ProcessPoolExecutor | None = None
-        self._known: dict[Wanted, Tasks] = {}
+        self._known: dict[Wanted, RobotTasks] = {}
 
     def __enter__(self) -> Self:
         if self._jobs > 1:
             # A planner that was compiled in this process does not survive a fork.
             context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(self._jobs, context, initializer=_keep_quiet)
-        _keep_quiet()
+            self._pool = ProcessPoolExecutor(self._jobs, context, initializer=_silence)
+        _silence()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -41,16 +41,17 @@ class Batch:
             self._pool.shutdown(cancel_futures=True)
 
     def map(self, do: Callable[..., Any], *units: Sequence[Any]) -> Iterator[Any]:
-        """As the built-in one, by all processes."""
+        """The built-in `map`, on all processes."""
         return self._pool.map(do, *units) if self._pool else map(do, *units)
 
     def play(self, scenarios: Sequence[Scenario], strategies: Mapping[str, Any]) -> dict[str, list[Outcome]]:
-        """Each of `scenarios`, which differ in their seed, by every one of `strategies`.
+        """Play every scenario with every strategy; the scenarios differ only in their seed.
 
-        The outcomes come by strategy in the order of the seeds; a strategy is what `Scenario.changed` takes.
+        A strategy holds arguments of `Scenario.changed`. The result has the outcomes of each strategy, in the
+        order of the scenarios.
         """
         wanted = [_wanted(scenario) for scenario in scenarios]
-        self._find([one for robots in wanted for one in robots.values()])
+        self._find([robot for robots in wanted for robot in robots.values()])
         units = [
             ([scenario.changed(**changes) for changes in strategies.values()], self._tasks(robots))
             for scenario, robots in zip(scenarios, wanted, strict=True)
@@ -63,31 +64,31 @@ class Batch:
         return played
 
     def _find(self, wanted: Iterable[Wanted]) -> None:
-        """The tasks of robots that are not known yet, or too few of them."""
+        """Find the tasks of all robots for which not enough tasks are known yet."""
         most: dict[Wanted, Workload] = {}
         for workload, seed in wanted:
             key = _key(workload, seed)
-            known = len(self._known[key].asked) if key in self._known else 0
+            known = len(self._known[key].tasks) if key in self._known else 0
             if workload.tasks > max(known, most[key].tasks if key in most else 0):
                 most[key] = workload
         units = [(workload, key[1]) for key, workload in most.items()]
         for key, tasks in zip(most, self.map(_find_tasks, units), strict=True):
             self._known[key] = tasks
 
-    def _tasks(self, robots: Mapping[str, Wanted]) -> dict[str, Tasks]:
+    def _tasks(self, robots: Mapping[str, Wanted]) -> dict[str, RobotTasks]:
         return {
             name: self._known[_key(workload, seed)].first(workload.tasks)
             for name, (workload, seed) in robots.items()
         }
 
 
-def _keep_quiet() -> None:
-    """What robots say of their map and their sites is of no use a thousand times."""
+def _silence() -> None:
+    """Turn off warnings: a thousand runs would repeat what robots log about their map and their sites."""
     logging.disable(logging.WARNING)
 
 
 def _wanted(scenario: Scenario) -> dict[str, Wanted]:
-    """For each robot; those that only make load begin again after a few."""
+    """The workload and the seed of each robot. Robots that only make load repeat a few tasks."""
     found: dict[str, Wanted] = {}
     for n, name in enumerate(scenario.robots()):
         count = scenario.workload.tasks
@@ -98,7 +99,7 @@ def _wanted(scenario: Scenario) -> dict[str, Wanted]:
 
 
 def _key(workload: Workload, seed: int) -> Wanted:
-    """Scenarios that ask for the same tasks have it in common."""
+    """The same key for all scenarios that have the same tasks."""
     plain = Workload(map=workload.map, task=workload.task, sizes=workload.sizes)
     return replace(
         plain,
@@ -110,11 +111,11 @@ def _key(workload: Workload, seed: int) -> Wanted:
     ), seed
 
 
-def _find_tasks(wanted: Wanted) -> Tasks:
+def _find_tasks(wanted: Wanted) -> RobotTasks:
     workload, seed = wanted
     return find_tasks(workload, seed, workload.tasks)
 
 
-def _simulate_all(unit: tuple[Sequence[Scenario], Mapping[str, Tasks]]) -> list[Outcome]:
+def _simulate_all(unit: tuple[Sequence[Scenario], Mapping[str, RobotTasks]]) -> list[Outcome]:
     scenarios, tasks = unit
     return [simulate(scenario, tasks) for scenario in scenarios]

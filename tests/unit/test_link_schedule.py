@@ -1,4 +1,4 @@
-"""Schedules as data: read, sorted, and refused with file, line and nearest key."""
+"""Link schedules: read, sorted, checked, and played."""
 
 import asyncio
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 
 from offboard.common.errors import ConfigError, DataError
 from offboard.loadgen.relay.link.link import Link, LinkConditions
-from offboard.loadgen.relay.schedule import EVENTS_MAX, Schedule, parse_schedule, read_schedule
+from offboard.loadgen.relay.link_schedule import EVENTS_MAX, Schedule, parse_schedule, read_schedule
 
 GOOD = """
 [[event]]
@@ -27,7 +27,7 @@ reset = true
 
 
 class Recorder:
-    """A link that keeps what is done to it."""
+    """A link that remembers what is done to it."""
 
     def __init__(self) -> None:
         self.link = Link()
@@ -43,7 +43,7 @@ class Recorder:
 
 
 def test_events_come_in_order_of_time(tmp_path: Path) -> None:
-    """Events are sorted by time, those of one time stay as written; each holds what the file says."""
+    """Events are sorted by time; events at the same time keep the order of the file."""
     file = tmp_path / "events.toml"
     file.write_text(GOOD)
     events = read_schedule(file, Link())
@@ -72,13 +72,13 @@ def test_events_come_in_order_of_time(tmp_path: Path) -> None:
         ("[[event]]\nat_s = 1\ndown = 3\n", ":3: down: 3 is not a table"),
         (
             '[[event]]\nat_s = 1\ndistribution = "samples"\n',
-            ":1: up.samples: none are given, distribution 'samples' draws from them",
+            ":1: up.samples: the list is empty, but distribution 'samples' needs delays",
         ),
         ("event = 3\n", ":1: event is not a list of tables"),
     ],
 )
 def test_a_bad_schedule_names_file_line_and_key(tmp_path: Path, text: str, message: str) -> None:
-    """A key or value that cannot be is refused with its file and line, and the nearest key."""
+    """A wrong key or value is refused; the error names file and line, and the nearest known key."""
     file = tmp_path / "events.toml"
     file.write_text(text)
     with pytest.raises(DataError) as caught:
@@ -86,28 +86,28 @@ def test_a_bad_schedule_names_file_line_and_key(tmp_path: Path, text: str, messa
     assert str(caught.value) == f"{file}{message}"
 
 
-def test_json_names_the_event() -> None:
-    """Over HTTP there are no lines: the event's number is named."""
+def test_an_error_in_json_names_the_event() -> None:
+    """JSON has no line numbers, so the error names the number of the event."""
     with pytest.raises(ConfigError) as caught:
         parse_schedule({"event": [{"at_s": 1}, {"at_s": 2, "hangs": True}]}, Link())
     assert str(caught.value) == "event 2: unknown key 'hangs'; did you mean 'hang'?"
 
 
 def test_a_schedule_is_bounded() -> None:
-    """More events than the bound are refused."""
-    with pytest.raises(ConfigError, match="at most 10000 are allowed"):
+    """A schedule with too many events is refused."""
+    with pytest.raises(ConfigError, match="10001 events; at most 10000 are allowed"):
         parse_schedule({"event": [{"at_s": 1}] * (EVENTS_MAX + 1)}, Link())
 
 
-def test_what_samples_the_link_has_counts() -> None:
-    """An event may switch to the samples that the link was given at start."""
+def test_an_event_can_use_the_samples_of_the_link() -> None:
+    """An event may switch to the measured delays that the link was started with."""
     conditions = LinkConditions(samples=(1.0, 2.0))
     event = {"at_s": 1, "distribution": "samples"}
     assert parse_schedule({"event": [event]}, Link(conditions, conditions))[0].shown() == event
 
 
 def test_events_due_are_played_at_once_and_in_order() -> None:
-    """Events of time 0 are done when `start` returns; a later one waits, and `stop` forgets it."""
+    """Events at time 0 are played when `start` returns; a later event waits, and `stop` forgets it."""
     recorder = Recorder()
 
     async def play() -> None:

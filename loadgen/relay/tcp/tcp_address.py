@@ -1,4 +1,4 @@
-"""HOST:PORT as text, and the listening socket there."""
+"""HOST:PORT as text, and the socket that listens there."""
 
 import socket
 
@@ -9,7 +9,7 @@ PORT_MAX = 65_535
 
 
 def address(flag: str, text: str) -> tuple[str, int]:
-    """Host and port of HOST:PORT, [HOST]:PORT for IPv6; ConfigError names the flag."""
+    """Host and port of HOST:PORT, or [HOST]:PORT for IPv6; ConfigError names the flag."""
     host, _, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
     if not (host and "/" not in host and port.isascii() and port.isdigit() and int(port) <= PORT_MAX):
@@ -30,6 +30,6 @@ def bind(flag: str, text: str) -> socket.socket:
 
 
 def name_of(listening: socket.socket) -> str:
-    """The HOST:PORT where a socket listens, with the real port."""
+    """The HOST:PORT where a socket listens, with its real port."""
     host, port = listening.getsockname()[:2]
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

@@ -1,4 +1,7 @@
-"""Virtual time: a heap of events, and a clock that goes from one to the next as somebody waits."""
+"""The virtual clock: events in order of time, and a clock that jumps to the next event while a caller waits.
+
+Several tasks at once need the clock of `lockstep_clock.py`.
+"""
 
 import heapq
 import itertools
@@ -9,9 +12,10 @@ from typing import Any
 
 
 class VirtualClock:
-    """The offloader's clock in a simulation (`offboard.robot_client.sites.clock`). For one thread.
+    """The clock of the offloader in a simulation (see `offboard.robot_client.sites.clock`), for one thread.
 
-    Nothing happens but while somebody waits; events due at one instant happen in the order they were set.
+    Events happen only while a caller waits. Events at the same time happen in the order in which they were
+    added.
     """
 
     def __init__(self) -> None:
@@ -23,7 +27,7 @@ class VirtualClock:
         return self._now_s
 
     def at(self, due_s: float, event: Callable[[], object]) -> None:
-        """Make it happen then, or next where that is past; never where it is infinite."""
+        """Call `event` at this time: at once if the time is past, never if it is infinite."""
         if due_s < math.inf:
             heapq.heappush(self._due, (max(due_s, self._now_s), next(self._numbers), event))
 
@@ -31,21 +35,24 @@ class VirtualClock:
         self.at(self._now_s + seconds, event)
 
     def wait(self, pending: "Collection[Future[Any]]", timeout_s: float | None = None) -> None:
-        """Return once one of these futures is done, or after `timeout_s`."""
+        """Return when one of these futures is done, or after `timeout_s`."""
         until_s = math.inf if timeout_s is None else self._now_s + timeout_s
         while not any(future.done() for future in pending) and self.step(until_s):
             pass
 
     def pass_by(self, seconds: float) -> None:
-        """Let so much time go by."""
+        """Let this much time pass."""
         self.wait((), seconds)
 
     def step(self, until_s: float) -> bool:
-        """The next event; without one up to then, only the time comes, and False is returned."""
+        """Make the next event happen, if it is due by `until_s`; else set the time to `until_s`.
+
+        Returns whether an event happened.
+        """
         if self._due and self._due[0][0] <= until_s:
             self._now_s, _, event = heapq.heappop(self._due)
             event()
             return True
-        assert until_s < math.inf, "somebody waits for what never happens"
+        assert until_s < math.inf, "a caller waits for an event that never happens"
         self._now_s = max(self._now_s, until_s)
         return False

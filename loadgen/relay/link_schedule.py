@@ -1,6 +1,6 @@
-"""Changes of the link at set times: read from TOML or JSON, checked as a whole, then played.
+"""The link schedule: changes of the link at given times, read from TOML or JSON, checked, and played.
 
-When a change holds for which bytes is the business of `relay.py`.
+What a change does to bytes is left to the relay.
 """
 
 import asyncio
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 
 class Linked(Protocol):
-    """Has a link that can be changed, and connections that can be reset."""
+    """A relay: it has a link that can be changed, and connections that can be reset."""
 
     @property
     def link(self) -> Link: ...
@@ -35,19 +35,22 @@ class Linked(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """What happens `at_s` seconds after the start: conditions as PUT /link takes them, then maybe a reset."""
+    """A change of the link, `at_s` seconds after the start of the schedule.
+
+    `changes` are conditions as in PUT /link. With `reset` all connections are reset after the change.
+    """
 
     at_s: float
     changes: Mapping[str, Any]
     reset: bool = False
 
     def shown(self) -> dict[str, Any]:
-        """As it was given."""
+        """The event as the user wrote it."""
         return {"at_s": self.at_s, **self.changes} | ({"reset": True} if self.reset else {})
 
 
 class Schedule:
-    """Plays events on a link, in order; an event whose time is over already comes at once."""
+    """Plays events on a link in order of time; an event that is already due is played at once."""
 
     def __init__(self, linked: Linked) -> None:
         self._linked = linked
@@ -57,20 +60,20 @@ class Schedule:
         self._timer: asyncio.TimerHandle | None = None
 
     def start(self, events: Sequence[Event]) -> None:
-        """Play these from now on, in place of what was left of others."""
+        """Play these events from now on, and forget those left of an earlier schedule."""
         self.stop()
         self._events, self._done = events, 0
         self._start_s = asyncio.get_running_loop().time()
         self._play()
 
     def stop(self) -> None:
-        """Forget what is left; the link stays as it is."""
+        """Forget the events that are left; the link stays as it is."""
         if self._timer is not None:
             self._timer.cancel()
         self._events, self._done = (), 0
 
     def status(self) -> dict[str, Any]:
-        """Seconds since the start, events done, and all events in order."""
+        """Seconds since the start, number of events played, and all events in order."""
         now_s = asyncio.get_running_loop().time() - self._start_s if self._events else 0.0
         return {"now_s": now_s, "done": self._done, "event": [event.shown() for event in self._events]}
 
@@ -88,14 +91,14 @@ class Schedule:
         try:
             if event.changes:
                 self._linked.set_link(self._linked.link.changed(event.changes), by="schedule")
-        except ConfigError as error:  # it fitted the link as it was when the schedule was read
-            log.warning("schedule, at %g s: %s; left out", event.at_s, error)
+        except ConfigError as error:  # the link has changed since the schedule was checked
+            log.warning("schedule: the event at %g s was skipped: %s", event.at_s, error)
         if event.reset:
             self._linked.reset()
 
 
 def read_schedule(path: Path, link: Link) -> tuple[Event, ...]:
-    """The events of a TOML file in order of time, for this link; DataError names file, line and key."""
+    """The events of a TOML file, in order of time, checked for this link; errors name file, line and key."""
     table = read_toml(path)
     lines = path.read_text().splitlines()
     try:
@@ -111,9 +114,10 @@ def parse_schedule(
     link: Link,
     place: Callable[[int, str], str] = lambda number, _key: f"event {number}" if number else "schedule",
 ) -> tuple[Event, ...]:
-    """The events of `{"event": [{"at_s": 5, ...}, ...]}` in order of time, for this link.
+    """The events of `{"event": [{"at_s": 5, ...}, ...]}`, in order of time, checked for this link.
 
-    `place` names where a key of event 1, 2, ... is, or of the whole with 0, for the ConfigError.
+    `place` gives the text with which a ConfigError starts: where key `key` of event `number` is. Events are
+    numbered from 1; number 0 is the schedule as a whole.
     """
     for key in table:
         if key != "event":
@@ -122,7 +126,7 @@ def parse_schedule(
     if not isinstance(given, list) or not all(isinstance(event, dict) for event in given):
         raise ConfigError(f"{place(0, 'event')}: event is not a list of tables")
     if len(given) > EVENTS_MAX:
-        raise ConfigError(f"{place(0, 'event')}: {len(given)} events, at most {EVENTS_MAX} are allowed")
+        raise ConfigError(f"{place(0, 'event')}: {len(given)} events; at most {EVENTS_MAX} are allowed")
     numbered = [(_event(event, number, place), number) for number, event in enumerate(given, 1)]
     numbered.sort(key=lambda pair: pair[0].at_s)
     for event, number in numbered:

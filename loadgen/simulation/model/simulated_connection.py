@@ -1,25 +1,28 @@
-"""One robot's connection to a simulated server: both ways of it, and making it again when it is lost."""
+"""The connection of a robot to the simulated server: both directions, losses and reconnects."""
 
 from collections.abc import Callable
 from functools import partial
 
 from offboard.loadgen.relay.link.link import Link
-from offboard.loadgen.simulation.model.clock import VirtualClock
-from offboard.loadgen.simulation.model.costs import HELLO_BYTES
-from offboard.loadgen.simulation.model.one_way import Way
-from offboard.loadgen.simulation.model.server import Server
+from offboard.loadgen.simulation.model.simulated_direction import Message, SimulatedDirection
+from offboard.loadgen.simulation.model.simulated_server import SimulatedServer
+from offboard.loadgen.simulation.model.task_costs import HELLO_BYTES
+from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
 from offboard.robot_client.sites.cloud import RECONNECT_MAX_MS, RECONNECT_MS
 
 HANDSHAKE_TRIPS = 2  # round trips of ZMTP (greeting, ready) before hello
 
 
-class Connection:
-    """Up at first. `on_up` and `on_lost` are told of every change; draws by `seed`."""
+class SimulatedConnection:
+    """A connection that is up at first; `on_up` and `on_lost` are called when that changes.
+
+    `seed` is that of the random draws of the link.
+    """
 
     def __init__(
         self,
         clock: VirtualClock,
-        server: Server,
+        server: SimulatedServer,
         link: Link,
         seed: int,
         *,
@@ -27,8 +30,8 @@ class Connection:
         on_lost: Callable[[], None],
     ) -> None:
         self.up = True
-        self.to_cloud = Way(clock, link.up, seed, "up")
-        self.to_robot = Way(clock, link.down, seed, "down")
+        self.to_cloud = SimulatedDirection(clock, link.up, seed, "up")
+        self.to_robot = SimulatedDirection(clock, link.down, seed, "down")
         self._clock = clock
         self._server = server
         self._on_up = on_up
@@ -36,13 +39,13 @@ class Connection:
         self._life = 0
         server.listeners.append(self.lose)
 
-    def say(self, size: int, what: str, number: int, message: Callable[[], object]) -> None:
-        """To the server, where `message` happens."""
-        self.to_cloud.send(size, what, number, partial(self._server.hear, message))
+    def send(self, message: Message, arrive: Callable[[], object]) -> None:
+        """Send a message to the server, which then calls `arrive`."""
+        self.to_cloud.send(message, partial(self._server.receive, arrive))
 
-    def answer(self, size: int, what: str, number: int, arrive: Callable[[], object]) -> None:
-        """To the robot."""
-        self.to_robot.send(size, what, number, arrive)
+    def reply(self, message: Message, arrive: Callable[[], object]) -> None:
+        """Send a message to the robot; `arrive` is called when it is there."""
+        self.to_robot.send(message, arrive)
 
     def change(self, link: Link) -> None:
         kept = [self.to_cloud.change(link.up), self.to_robot.change(link.down)]
@@ -50,7 +53,7 @@ class Connection:
             self.lose()
 
     def lose(self) -> None:
-        """It breaks, with all that is under way, and is tried again."""
+        """The connection breaks, with all messages on their way, and is tried again after a pause."""
         self.up = False
         self._life += 1
         self.to_cloud.lose()
@@ -70,8 +73,8 @@ class Connection:
 
     def _say_hello(self, life: int) -> None:
         if life == self._life:
-            back = partial(self.answer, HELLO_BYTES, "hello", life, self._connected)
-            self.say(HELLO_BYTES, "hello", life, back)
+            hello = Message(HELLO_BYTES, "hello", life)
+            self.send(hello, partial(self.reply, hello, self._connected))
 
     def _connected(self) -> None:
         self.up = True

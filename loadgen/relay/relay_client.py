@@ -1,4 +1,7 @@
-"""Whoever commands a relay from outside: its HTTP side, asked."""
+"""A client of the relay's control API: changes the link of a relay that runs in another process.
+
+The API itself is in `control_api.py`.
+"""
 
 import contextlib
 import http.client
@@ -17,7 +20,7 @@ class RelayClient:
         self._address = address
 
     def set_link(self, changes: dict[str, Any]) -> dict[str, Any]:
-        """PUT /link; the whole link on return, ConfigError where the relay refuses it."""
+        """Change some conditions and return the whole link; ConfigError if the relay refuses the change."""
         return self._ask("PUT", "/link", json.dumps(changes))
 
     def link(self) -> dict[str, Any]:
@@ -35,7 +38,7 @@ class RelayClient:
 
 
 def ask(address: str, method: str, path: str, body: str | None = None) -> tuple[int, str]:
-    """Status and body of one HTTP request; OffloadError where nothing answers within ASK_S."""
+    """Send one HTTP request and return status and body; OffloadError if there is no answer within ASK_S."""
     connection = http.client.HTTPConnection(address, timeout=ASK_S)
     headers = {} if body is None else {"Content-Type": "application/json"}
     try:

@@ -14,8 +14,8 @@ import pytest
 import scipy.stats
 
 from offboard.loadgen.relay.link.link import SEGMENT_BYTES, Link, LinkConditions
-from offboard.loadgen.relay.tcp import flow
-from offboard.loadgen.relay.tcp.link_record import Truth
+from offboard.loadgen.relay.tcp import forwarder
+from offboard.loadgen.relay.tcp.link_record import LinkRecord
 from offboard.loadgen.relay.tcp.relay import Relay
 from tests.relays import WAIT_S, echo, quietest, read_truth, receive, round_trip_s, stop, wait_until
 
@@ -207,7 +207,7 @@ def test_the_truth_keeps_the_delay(cloud: Any, wan: Any, tmp_path: Path) -> None
 
 def test_chunks_under_way_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A sender of single bytes under a long delay is not read while so many are under way, and all arrive."""
-    monkeypatch.setattr(flow, "CHUNKS_MAX", 8)
+    monkeypatch.setattr(forwarder, "CHUNKS_MAX", 8)
     path = tmp_path / "link.jsonl"
 
     async def play() -> bytes:
@@ -219,10 +219,10 @@ def test_chunks_under_way_are_bounded(tmp_path: Path, monkeypatch: pytest.Monkey
             writer.close()
 
         cloud = await asyncio.start_server(talk, "127.0.0.1", 0)
-        truth = Truth(path, loop.time())
+        record = LinkRecord(path, loop.time())
         link = Link(up=LinkConditions(delay_ms=500))
         options = {"seed": 0, "connections_max": 1, "buffer_bytes": 1 << 20}
-        relay = Relay(cloud.sockets[0].getsockname(), link, truth=truth, **options)
+        relay = Relay(cloud.sockets[0].getsockname(), link, record=record, **options)
         server = await loop.create_server(relay.accept, "127.0.0.1", 0)
         with socket.create_connection(server.sockets[0].getsockname()) as client:
             client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -231,7 +231,7 @@ def test_chunks_under_way_are_bounded(tmp_path: Path, monkeypatch: pytest.Monkey
                 await asyncio.sleep(0.005)
         heard = await asyncio.wait_for(got, WAIT_S)
         await relay.ended(WAIT_S)
-        truth.close(loop.time())
+        record.close(loop.time())
         server.close()
         cloud.close()
         return heard

@@ -1,4 +1,4 @@
-"""The runner of the cloud in a simulation: `CloudRunner` with modelled messages in place of a socket."""
+"""The simulated runner of the site `cloud`: works as `CloudRunner`, with modelled messages and no socket."""
 
 from concurrent.futures import Future
 from dataclasses import dataclass, field
@@ -7,12 +7,18 @@ from functools import partial
 from offboard.common.errors import CloudBroken, CloudBusy, CloudTimeout, OffloadError, Overtaken
 from offboard.common.tasks import Kind, Task
 from offboard.loadgen.relay.link.link import Link
-from offboard.loadgen.simulation.model.clock import VirtualClock
-from offboard.loadgen.simulation.model.costs import BEAT_BYTES, BEAT_REPLY_BYTES, CANCEL_BYTES, MISSING_BYTES
-from offboard.loadgen.simulation.model.processor import Processor
-from offboard.loadgen.simulation.model.robot_connection import Connection
-from offboard.loadgen.simulation.model.server import BUSY, NEED_BLOB, Key, Reply, Server
-from offboard.loadgen.simulation.model.true_costs import Truth, number_of
+from offboard.loadgen.simulation.model.simulated_connection import SimulatedConnection
+from offboard.loadgen.simulation.model.simulated_cpu import SimulatedCpu
+from offboard.loadgen.simulation.model.simulated_direction import Message
+from offboard.loadgen.simulation.model.simulated_server import BUSY, NEED_BLOB, Key, Reply, SimulatedServer
+from offboard.loadgen.simulation.model.task_costs import (
+    BEAT_BYTES,
+    BEAT_REPLY_BYTES,
+    CANCEL_BYTES,
+    MISSING_BYTES,
+)
+from offboard.loadgen.simulation.model.true_costs import TrueCosts, number_of
+from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client.sites.cloud import PENDING_MAX
 from offboard.robot_client.sites.heartbeat import ALONG_S, Heartbeat, Told
@@ -24,7 +30,7 @@ TASK, BEAT, CANCEL, BLOB = "task", "beat", "cancel", "blob"  # sorts of messages
 
 @dataclass(eq=False, slots=True)
 class _Pending:
-    """A request in flight."""
+    """A request without an answer so far."""
 
     call: Task
     published_s: float
@@ -39,28 +45,33 @@ class _Pending:
 
 
 class SimulatedCloud:
-    """Of the first robot, whose CPU packs and unpacks the messages. `heartbeat_s` 0: there are none."""
+    """The cloud, as the first robot uses it.
+
+    - `cpu`: the CPU of the robot, which packs and unpacks the messages.
+    - `heartbeat_s`: time between heartbeats; 0 means none.
+    """
 
     site = CLOUD
 
     def __init__(
         self,
         clock: VirtualClock,
-        server: Server,
-        robot: Processor,
-        truth: Truth,
+        server: SimulatedServer,
+        cpu: SimulatedCpu,
+        costs: TrueCosts,
+        *,
         link: Link,
         seed: int,
         heartbeat_s: float,
         own_cpu: OwnCpu,
     ) -> None:
-        self.connection = Connection(
+        self.connection = SimulatedConnection(
             clock, server, link, seed, on_up=self._start_beating, on_lost=self._fail_all
         )
         self._clock = clock
         self._server = server
-        self._robot = robot
-        self._truth = truth
+        self._cpu = cpu
+        self._costs = costs
         self._pending: dict[int, _Pending] = {}
         self._heartbeat = Heartbeat(heartbeat_s, seed, own_cpu)
         self._start_beating()
@@ -78,7 +89,7 @@ class SimulatedCloud:
         else:
             self._pending[task.id] = pending
             if self._heartbeat.due_s <= now_s + ALONG_S:
-                self._say_beat()
+                self._send_beat()
             self._clock.after(self.sending_s, partial(self._send, pending))
             self._clock.at(pending.deadline_s, partial(self._expire, pending))
         return pending.future
@@ -99,39 +110,40 @@ class SimulatedCloud:
 
     @property
     def sending_s(self) -> float:
-        """Seconds that packing a request takes now, or unpacking a reply."""
-        return self._truth.cost.sending_s / 2 / self._robot.share_of_one_more
+        """How long the robot needs now to pack and send a request, or to receive and unpack a reply."""
+        return self._costs.cost.sending_s / 2 / self._cpu.share_of_one_more
 
     def _send(self, pending: _Pending) -> None:
         if not self._waits(pending):
             return
-        size = self._truth.asked(pending.number).bytes_out
+        size = self._costs.task(pending.number).bytes_out
         pending.bytes_out += size
         budget_s = pending.deadline_s - self._clock.now_s()
-        cpu_s = self._truth.cpu_s(CLOUD, pending.call)
-        answer = partial(self._answer, pending)
-        request = partial(self._server.request, self._key(pending), cpu_s, budget_s, answer)
-        self.connection.say(size, f"{TASK}{pending.attempt}", pending.number, request)
+        cpu_s = self._costs.cpu_s(CLOUD, pending.call)
+        reply = partial(self._reply, pending)
+        request = partial(self._server.request, self._key(pending), cpu_s, budget_s, reply)
+        self.connection.send(Message(size, f"{TASK}{pending.attempt}", pending.number), request)
 
-    def _answer(self, pending: _Pending, reply: Reply) -> None:
-        """The server says this."""
+    def _reply(self, pending: _Pending, reply: Reply) -> None:
+        """The server sends a reply."""
         size = MISSING_BYTES
         if reply.status not in (BUSY, NEED_BLOB):
-            size = self._truth.asked(pending.number).bytes_in
-        what = f"{TASK}{pending.attempt}"
-        self.connection.answer(size, what, pending.number, partial(self._hear, pending, reply, size))
+            size = self._costs.task(pending.number).bytes_in
+        message = Message(size, f"{TASK}{pending.attempt}", pending.number)
+        self.connection.reply(message, partial(self._receive, pending, reply, size))
 
-    def _hear(self, pending: _Pending, reply: Reply, size: int) -> None:
-        """The robot receives it."""
+    def _receive(self, pending: _Pending, reply: Reply, size: int) -> None:
+        """The reply arrives at the robot."""
         self._heartbeat.hear(self._clock.now_s(), reply.told)
         self._clock.after(self.sending_s, partial(self._take, pending, reply, size))
 
     def _take(self, pending: _Pending, reply: Reply, size: int) -> None:
+        """The robot has unpacked the reply."""
         if not self._waits(pending):
             return
         if reply.status == NEED_BLOB:
-            blob_bytes = self._truth.blob_bytes
-            self.connection.say(blob_bytes, BLOB, pending.number, self._server.take_blob)
+            blob_bytes = self._costs.blob_bytes
+            self.connection.send(Message(blob_bytes, BLOB, pending.number), self._server.take_blob)
             pending.bytes_out += blob_bytes
             pending.attempt += 1
             self._send(pending)
@@ -147,7 +159,7 @@ class SimulatedCloud:
             Execution(
                 CLOUD,
                 seconds,
-                self._truth.value(pending.call),
+                self._costs.value(pending.call),
                 queue_s=reply.queue_s,
                 run_s=reply.run_s,
                 network_s=max(0.0, seconds - reply.queue_s - reply.run_s),
@@ -162,9 +174,9 @@ class SimulatedCloud:
             self._give_up(pending, CloudTimeout("no answer within the budget"))
 
     def _give_up(self, pending: _Pending, failure: OffloadError) -> None:
-        """Nobody waits for the answer any more."""
+        """Cancel a request whose answer is not needed any more."""
         cancel = partial(self._server.cancel, self._key(pending))
-        self.connection.say(CANCEL_BYTES, CANCEL, pending.number, cancel)
+        self.connection.send(Message(CANCEL_BYTES, CANCEL, pending.number), cancel)
         self._end(pending, failure, censored=True)
         self._hurry()
 
@@ -207,18 +219,18 @@ class SimulatedCloud:
         self._plan_beat()
 
     def _beat(self, due_s: float) -> None:
-        if self._heartbeat.due_s == due_s:  # else it was sent with a task, or another connection beats by now
-            self._say_beat()
+        if self._heartbeat.due_s == due_s:  # else it was sent with a task, or the connection is a new one
+            self._send_beat()
 
-    def _say_beat(self) -> None:
+    def _send_beat(self) -> None:
         number = self._heartbeat.beat(self._clock.now_s())
-        self.connection.say(BEAT_BYTES, BEAT, number, partial(self._beat_back, number))
+        self.connection.send(Message(BEAT_BYTES, BEAT, number), partial(self._reply_to_beat, number))
         self._plan_beat()
 
-    def _beat_back(self, number: int) -> None:
-        told = self._server.told
-        self.connection.answer(BEAT_REPLY_BYTES, BEAT, number, partial(self._beat_heard, number, told))
+    def _reply_to_beat(self, number: int) -> None:
+        arrive = partial(self._beat_replied, number, self._server.told)
+        self.connection.reply(Message(BEAT_REPLY_BYTES, BEAT, number), arrive)
 
-    def _beat_heard(self, number: int, told: Told) -> None:
+    def _beat_replied(self, number: int, told: Told) -> None:
         self._heartbeat.answer(number, self._clock.now_s(), told)
         self._plan_beat()

@@ -1,4 +1,4 @@
-"""The runner of the robot's own computer in a simulation, and what it measures of its load."""
+"""The simulated runner of the site `onboard`: the computer of the robot, and the load that it measures."""
 
 import math
 from concurrent.futures import Future
@@ -7,44 +7,44 @@ from functools import partial
 from offboard.common.errors import Overtaken
 from offboard.common.host.load import EVERY_S, HURRIED_S, LOADED
 from offboard.common.tasks import Kind, Task
-from offboard.loadgen.simulation.model.clock import VirtualClock
-from offboard.loadgen.simulation.model.measured_load import SimulatedLoad
-from offboard.loadgen.simulation.model.processor import Processor, Run
-from offboard.loadgen.simulation.model.true_costs import Truth
+from offboard.loadgen.simulation.model.simulated_cpu import Run, SimulatedCpu
+from offboard.loadgen.simulation.model.simulated_load import SimulatedLoad
+from offboard.loadgen.simulation.model.true_costs import TrueCosts
+from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client.sites.own_cpu import OwnCpu
 from offboard.robot_client.sites.runner import ONBOARD, Condition, Execution
 
 
 class SimulatedOnboard:
-    """One task at a time on the robot's quota, as `OnboardRunner`."""
+    """Runs one task at a time on the CPU quota of the robot, as `OnboardRunner` does."""
 
     site = ONBOARD
 
-    def __init__(self, clock: VirtualClock, processor: Processor, truth: Truth) -> None:
+    def __init__(self, clock: VirtualClock, cpu: SimulatedCpu, costs: TrueCosts) -> None:
         self._clock = clock
-        self._processor = processor
-        self._truth = truth
+        self._cpu = cpu
+        self._costs = costs
         self._runs: dict[int, tuple[Run, Future[Execution]]] = {}
-        self._load = SimulatedLoad(clock, processor)
+        self._load = SimulatedLoad(clock, cpu)
         self.own_cpu = OwnCpu()
 
     def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - onboard always exists
         return None
 
-    def submit(self, task: Task, budget_s: float) -> "Future[Execution]":  # noqa: ARG002 - not to be stopped
+    def submit(self, task: Task, budget_s: float) -> "Future[Execution]":  # noqa: ARG002 - it has no limit
         future: Future[Execution] = Future()
-        cpu_s = self._truth.cpu_s(ONBOARD, task)
-        run = self._processor.add(cpu_s, partial(self._ended, task, cpu_s), owner=ROBOT)
+        cpu_s = self._costs.cpu_s(ONBOARD, task)
+        run = self._cpu.add(cpu_s, partial(self._ended, task, cpu_s), owner=ROBOT)
         self._runs[task.id] = run, future
         self.own_cpu.begin()
         return future
 
     def cancel(self, task: Task) -> None:
-        """The tasks of scenarios look often whether they are wanted: one that runs ends now too."""
+        """End the run, even if it has begun: the tasks of scenarios check often if they are cancelled."""
         run, future = self._runs.pop(task.id, (None, None))
         if run is not None and future is not None:
-            self._processor.stop(run)
+            self._cpu.stop(run)
             self.own_cpu.end(self._clock.now_s())
             failure, seconds = Overtaken("another site answered first"), self._clock.now_s() - run.added_s
             started = run.begun_s < math.inf
@@ -69,7 +69,7 @@ class SimulatedOnboard:
             Execution(
                 ONBOARD,
                 now_s - run.added_s,
-                self._truth.value(task),
+                self._costs.value(task),
                 queue_s=run.begun_s - run.added_s,
                 run_s=now_s - run.begun_s,
                 network_s=0.0,
