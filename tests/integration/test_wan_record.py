@@ -1,4 +1,4 @@
-"""The relay's record of the truth, and the figures of its link that are read from it."""
+"""The record of what the link did, and the statistics of the link that are computed from it."""
 
 import asyncio
 import math
@@ -17,15 +17,15 @@ from offboard.loadgen.relay.link.link import SEGMENT_BYTES, Link, LinkConditions
 from offboard.loadgen.relay.tcp import forwarder
 from offboard.loadgen.relay.tcp.link_record import LinkRecord
 from offboard.loadgen.relay.tcp.relay import Relay
-from tests.relays import WAIT_S, echo, quietest, read_truth, receive, round_trip_s, stop, wait_until
+from tests.relays import WAIT_S, echo, quietest, read_record, receive, round_trip_s, stop, wait_until
 
 pytestmark = pytest.mark.integration
 
 BARE = ("--delay-ms", "0", "--bandwidth-mbps", "0")
 
 
-def test_the_truth_is_whole(cloud: Any, wan: Any, tmp_path: Path) -> None:
-    """All that was sent is in the truth: bytes of each direction, no segment missing, none early."""
+def test_the_record_is_complete(cloud: Any, wan: Any, tmp_path: Path) -> None:
+    """The record holds all bytes of both directions, with no missing segment, and none too early."""
     truth = tmp_path / "link.jsonl"
     flags = ("--delay-ms", "2", "--jitter-ms", "1", "--loss", "0.05", "--stall-ms", "3")
     relay = wan(cloud(echo), *flags, "--bandwidth-mbps", "0", "--truth", str(truth))
@@ -38,7 +38,7 @@ def test_the_truth_is_whole(cloud: Any, wan: Any, tmp_path: Path) -> None:
     relay.change(delay_ms=0)
     counted = relay.ask("GET", "/link")[1]
     stop(relay)
-    lines = read_truth(truth)
+    lines = read_record(truth)
     assert counted["truth"]["dropped"] == 0
     assert lines[-1]["what"] == "end"
     assert lines[-1]["lines"] == counted["truth"]["lines"] == len(lines) - 1
@@ -57,7 +57,7 @@ def test_the_truth_is_whole(cloud: Any, wan: Any, tmp_path: Path) -> None:
 
 
 def check_stream(chunks: list[dict[str, Any]], size: int) -> None:
-    """Chunks of one stream, in order: all bytes, then the end; none before it is due."""
+    """The chunks of a stream hold all bytes and then the end, in order, and none came before it was due."""
     at = 0
     for chunk in chunks:
         assert chunk["segment"] == at // SEGMENT_BYTES
@@ -75,9 +75,9 @@ def check_stream(chunks: list[dict[str, Any]], size: int) -> None:
 def test_drawn_delays_have_the_named_distribution(
     cloud: Any, wan: Any, tmp_path: Path, distribution: str
 ) -> None:
-    """The delays in the truth, one a segment, pass the Kolmogorov-Smirnov test against the distribution.
+    """The delays of the segments pass the Kolmogorov-Smirnov test against the named distribution.
 
-    What was achieved is in the truth too: no chunk came sooner than drawn.
+    The record also holds the delays that were achieved: no chunk came earlier than its drawn delay.
     """
     truth = tmp_path / "link.jsonl"
     shape = ("--delay-ms", "30", "--jitter-ms", "4", "--distribution", distribution, "--seed", "11")
@@ -88,7 +88,7 @@ def test_drawn_delays_have_the_named_distribution(
         receive(client, 4000 * SEGMENT_BYTES)
         sender.join()
     stop(relay)
-    chunks = [line for line in read_truth(truth) if line["what"] == "chunk" and line["bytes"]]
+    chunks = [line for line in read_record(truth) if line["what"] == "chunk" and line["bytes"]]
     drawn = {(chunk["direction"], chunk["segment"]): chunk["drawn_ms"] for chunk in chunks}
     theory = {
         "normal": scipy.stats.norm(30, 4),
@@ -109,10 +109,10 @@ def test_drawn_delays_have_the_named_distribution(
 
 
 @pytest.mark.parametrize("burst", [1, 4])
-def test_as_many_segments_stall_as_are_lost(cloud: Any, wan: Any, tmp_path: Path, burst: int) -> None:
-    """With 2 % loss the share of stalled segments in the truth is within its 99.9 % binomial interval.
+def test_the_share_of_stalled_segments_is_the_loss(cloud: Any, wan: Any, tmp_path: Path, burst: int) -> None:
+    """At 2 % loss, the number of stalled segments in the record is within its 99.9 % binomial interval.
 
-    In bursts of `burst` segments the variance of the count is larger by their correlation in time.
+    With bursts the interval is wider, because neighbouring segments are correlated.
     """
     truth = tmp_path / "link.jsonl"
     flags = ("--loss", "0.02", "--loss-burst", str(burst), "--stall-ms", "1", "--seed", "7")
@@ -124,9 +124,9 @@ def test_as_many_segments_stall_as_are_lost(cloud: Any, wan: Any, tmp_path: Path
         assert len(receive(client, size)) == size
         sender.join()
     stop(relay)
-    first = of_segments(read_truth(truth))
-    keeps = 1 - (0.02 / 0.98 + 1) / burst if burst > 1 else 0.0  # of the state, from segment to segment
-    spread = math.sqrt((1 + keeps) / (1 - keeps))
+    first = of_segments(read_record(truth))
+    memory = 1 - (0.02 / 0.98 + 1) / burst if burst > 1 else 0.0  # correlation of neighbouring segments
+    spread = math.sqrt((1 + memory) / (1 - memory))
     for direction in ("up", "down"):
         stalled = sum(stall_ms > 0 for _drawn_ms, stall_ms in first[direction].values())
         low, high = scipy.stats.binom.interval(0.999, 8000, 0.02)
@@ -136,7 +136,7 @@ def test_as_many_segments_stall_as_are_lost(cloud: Any, wan: Any, tmp_path: Path
 
 
 def of_segments(lines: list[dict[str, Any]]) -> dict[str, dict[int, tuple[float, float]]]:
-    """By direction and segment: delay and stall that its first byte met."""
+    """By direction and segment, the delay and the stall of the first byte."""
     found: dict[str, dict[int, tuple[float, float]]] = {"up": {}, "down": {}}
     for line in lines:
         if line["what"] == "chunk" and line["bytes"]:
@@ -146,8 +146,10 @@ def of_segments(lines: list[dict[str, Any]]) -> dict[str, dict[int, tuple[float,
 
 @pytest.mark.timeout(40)  # three relays
 def test_the_same_bytes_meet_the_same_link(cloud: Any, wan: Any, tmp_path: Path) -> None:
-    """Two relays of one seed draw the same delay and stall for every segment of two connections, whether
-    the bytes come at once or in small messages that are waited for; another seed draws others."""
+    """Two relays with the same seed draw the same delay and stall for every segment of two connections.
+
+    It does not matter whether the bytes come at once or in small messages. Another seed draws others.
+    """
     size = 60 * SEGMENT_BYTES
     shape = ("--jitter-ms", "0.3", "--distribution", "pareto", "--correlation", "0.3")
     shape += ("--loss", "0.1", "--loss-burst", "3", "--stall-ms", "0.5")
@@ -165,7 +167,7 @@ def test_the_same_bytes_meet_the_same_link(cloud: Any, wan: Any, tmp_path: Path)
                     assert len(receive(client, part)) == part
                     left -= part
         stop(relay)
-        return read_truth(truth)
+        return read_record(truth)
 
     whole, cut, other = run(3, size), run(3, 2000), run(4, size)
     counts = [sum(line["what"] == "chunk" for line in lines) for lines in (whole, cut)]
@@ -181,8 +183,8 @@ def test_the_same_bytes_meet_the_same_link(cloud: Any, wan: Any, tmp_path: Path)
         assert drawn[0] != drawn[2]
 
 
-def test_what_was_never_delivered_says_so(cloud: Any, wan: Any, tmp_path: Path) -> None:
-    """Bytes under way when the relay is stopped are in the truth with a delivery of null."""
+def test_lost_bytes_are_marked_in_the_record(cloud: Any, wan: Any, tmp_path: Path) -> None:
+    """Bytes that are under way when the relay stops have a delivered_s of null in the record."""
     truth = tmp_path / "link.jsonl"
     relay = wan(cloud(echo), "--delay-ms", "30000", "--truth", str(truth))
     with relay.connect() as client:
@@ -190,14 +192,14 @@ def test_what_was_never_delivered_says_so(cloud: Any, wan: Any, tmp_path: Path) 
         wait_until(lambda: relay.ask("GET", "/link")[1]["connections"] == 1)
         time.sleep(0.05)
         stop(relay)
-    lines = read_truth(truth)
+    lines = read_record(truth)
     chunks = [(line["bytes"], line["delivered_s"]) for line in lines if line["what"] == "chunk"]
     assert chunks[0] == (4, None)
     assert [line["how"] for line in lines if line["what"] == "closed"] == ["stopped"]
 
 
-def test_the_truth_keeps_the_delay(cloud: Any, wan: Any, tmp_path: Path) -> None:
-    """With the truth on, 15 ms each way are still 30 ms at the median, at most 1.5 ms more."""
+def test_the_record_does_not_change_the_delay(cloud: Any, wan: Any, tmp_path: Path) -> None:
+    """With a record and 15 ms in each direction, the median round trip still takes 30 to 31.5 ms."""
     relay = wan(cloud(echo), "--delay-ms", "15", "--truth", str(tmp_path / "link.jsonl"))
     with relay.connect() as client:
         median_ms = 1e3 * quietest(lambda: round_trip_s(client))
@@ -206,7 +208,7 @@ def test_the_truth_keeps_the_delay(cloud: Any, wan: Any, tmp_path: Path) -> None
 
 
 def test_chunks_under_way_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A sender of single bytes under a long delay is not read while so many are under way, and all arrive."""
+    """The relay stops reading when CHUNKS_MAX chunks are under way, and all bytes arrive in the end."""
     monkeypatch.setattr(forwarder, "CHUNKS_MAX", 8)
     path = tmp_path / "link.jsonl"
 
@@ -237,7 +239,7 @@ def test_chunks_under_way_are_bounded(tmp_path: Path, monkeypatch: pytest.Monkey
         return heard
 
     assert asyncio.run(play()) == b"x" * 30
-    chunks = [line for line in read_truth(path) if line["what"] == "chunk" and line["bytes"]]
+    chunks = [line for line in read_record(path) if line["what"] == "chunk" and line["bytes"]]
     changes = [(chunk["arrived_s"], 1) for chunk in chunks] + [(chunk["delivered_s"], -1) for chunk in chunks]
     under_way, most = 0, 0
     for _at_s, change in sorted(changes):

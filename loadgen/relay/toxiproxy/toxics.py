@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from offboard.common.errors import OffloadError
+from offboard.loadgen.relay.link.delay_samples import DELAY_MS_MAX
 from offboard.loadgen.relay.link.link import (
     BANDWIDTH_MBPS_MAX,
-    DELAY_MS_MAX,
     RESET_MS_MAX,
     TRUNCATE_BYTES_MAX,
     Link,
