@@ -1,4 +1,7 @@
-"""The report's HTML: one file that opens offline, without a script, and asks the network for nothing."""
+"""The HTML page of a report: one file without scripts, which opens offline and makes no requests.
+
+Its charts are made fit for the page in `inline_svg.py`.
+"""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -10,23 +13,25 @@ from offboard.loadgen.table.render import Table, cells
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
 TERMS = {
-    "d": "input size: the one number that a task's time is predicted from; "
-    "for a plan, n ln n over the map's cells",
-    "N": "window: how many of a site's latest executions its prediction is made from; "
-    "full: learnt on the first 80 % of the rows, scored on the rest",
-    "feedback": "who learns after warm-up. chosen: the site that ran the task; "
-    "full: both, as no robot can without running everything twice",
-    "residual": "mean prediction minus mean time; MAE: mean size of an error, where errors cannot cancel",
-    "accuracy": "share of tasks sent to the site that was truly faster",
-    "oracle": "always takes the truly faster site; regret is the time beyond the oracle's",
-    "paper": "the published rule: the cloud where its predicted time is the lower, else onboard",
+    "d": "The input size: the number from which the time of a task is predicted. "
+    "For a plan it is n ln n, divided by the number of cells of the map.",
+    "N": "The window size: a prediction uses the latest N executions of a site. "
+    "full: the predictor learns from the first 80 % of the rows and is tested on the others.",
+    "feedback": "The sites that learn after the warm-up. chosen: only the site that ran the task. "
+    "full: both sites, which a real robot could only do by running every task twice.",
+    "residual": "The mean predicted time minus the mean real time: errors can cancel. "
+    "MAE: the mean absolute error, in which errors cannot cancel.",
+    "accuracy": "The share of tasks that were sent to the site that was really faster.",
+    "oracle": "A policy that always chooses the site that is really faster. "
+    "Regret is the time that another policy takes beyond it.",
+    "paper": "The published policy: the cloud if its predicted time is lower, else onboard.",
 }
-RAISED = re.compile(r"\^(\w)")  # t^c of a heading
+RAISED = re.compile(r"\^(\w)")  # as in the heading t^c
 
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One chart (`svg`, a file) or, where there is none, the reason in its caption."""
+    """One chart, as the content of an SVG file; None if there is no chart, for the reason in the caption."""
 
     name: str
     title: str
@@ -36,14 +41,15 @@ class Panel:
 
 def page(
     title: str,
+    *,
     about: Sequence[str],
     facts: Mapping[str, str],
     panels: Sequence[Panel],
     tables: Sequence[Table],
 ) -> str:
-    """The whole document; every text is escaped here, but that of the charts.
+    """The whole document. All texts are escaped here, except those inside the charts.
 
-    `about` is said once, at the top: what notes the tables bring are among it.
+    `about` is shown once, at the top; it includes the notes of all tables.
     """
     said = "".join(f"<p>{escape(line)}</p>" for line in about)
     parts = [

@@ -1,4 +1,4 @@
-"""An SVG file of a chart made fit to stand inside an HTML page: ids of its own, a title, nothing global."""
+"""Makes the SVG file of a chart fit for an HTML page: unique ids, a title, and no global styles."""
 
 import re
 from xml.etree import ElementTree
@@ -8,13 +8,13 @@ REFERENCE = re.compile(r"url\(#([^)]+)\)")
 
 
 def inline(svg: bytes, prefix: str, title: str) -> str:
-    """The `<svg>` element as HTML; every id is `prefix-` and what it was."""
+    """The `<svg>` element as HTML; every id gets the prefix `prefix-`."""
     root = ElementTree.fromstring(svg)
     for element in root.iter():
         element.tag = _local(element.tag)
     for parent in list(root.iter()):
         for child in list(parent):
-            if child.tag in ("metadata", "style"):  # a style inside an SVG would hold for the whole page
+            if child.tag in ("metadata", "style"):  # a style inside an SVG would apply to the whole page
                 parent.remove(child)
         _hoist_style(parent)
     for element in root.iter():
@@ -29,7 +29,7 @@ def inline(svg: bytes, prefix: str, title: str) -> str:
 
 
 def _clean(element: ElementTree.Element, prefix: str) -> None:
-    """No namespaces, no white space between tags, hundredths of a point."""
+    """Remove namespaces and white space between tags, and round numbers to hundredths of a point."""
     for name, value in list(element.attrib.items()):
         del element.attrib[name]
         local = _local(name)
@@ -46,7 +46,7 @@ def _clean(element: ElementTree.Element, prefix: str) -> None:
 
 
 def _hoist_style(group: ElementTree.Element) -> None:
-    """A thousand marks of one style name it once."""
+    """Move a style that all marks of a group share to the group, so that it is written once."""
     styles = {child.get("style") for child in group}
     style = styles.pop() if len(styles) == 1 else None
     if style and len(group) > 1 and all(child.tag == "use" for child in group):

@@ -87,7 +87,7 @@ OWNERS = {
     "numba": {"common/planning/compiled.py"},
     "PIL": {"common/planning/maps.py"},
     "yaml": {"common/planning/maps.py"},
-    "matplotlib": {"loadgen/report/charts.py"},
+    "matplotlib": {"loadgen/report/chart_parts.py"},
     "sklearn": {"robot_client/predictors/random_forest.py"},
     "statsmodels": {"robot_client/predictors/arima.py"},
     "threadpoolctl": {"robot_client/predictors/arima.py"},
