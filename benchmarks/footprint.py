@@ -1,4 +1,4 @@
-"""What the processes take at rest and until they are ready, and what is installed for them."""
+"""The time to start, the memory and CPU at rest, and the installed size."""
 
 import contextlib
 import os
@@ -11,17 +11,18 @@ from pathlib import Path
 
 import zmq
 
-from benchmarks.measure import Bar, Table, interleaved
+from benchmarks.measure import Requirement, Table, interleaved
 from benchmarks.servers import READY_S, Server, cloud_server, running
 from offboard.common.wire import messages as wire
 
 COMMANDS = {"robot-client": "robot_client", "cloud-server": "cloud_server", "loadgen": "loadgen"}
-ROBOTS = 500  # that are connected and idle
+ROBOTS = 500  # connected and idle
 REST_S = 10.0
 HEAVY = ("zmq", "numba")
+NOTHING = "python -c pass"
 ROOT = Path(__file__).parents[1]
 TICK_S = 1 / os.sysconf("SC_CLK_TCK")
-# A robot that has planned once, and now waits.
+# A robot that is connected and idle, with its planner compiled.
 ROBOT = """
 import sys
 from offboard import Offloader
@@ -40,20 +41,24 @@ def tables() -> list[Table]:
 
 def _help() -> Table:
     python = [sys.executable]
-    cases: dict[str, Callable[[], object]] = {"python -c pass": lambda: _run([*python, "-c", "pass"])}
+    cases: dict[str, Callable[[], object]] = {NOTHING: lambda: _run([*python, "-c", "pass"])}
     for name, package in COMMANDS.items():
         cases[f"{name} --help"] = lambda package=package: _run(
             [*python, "-m", f"offboard.{package}", "--help"]
         )
     seconds = interleaved(cases)
-    least = seconds["python -c pass"]
+    least = seconds[NOTHING]
     rows = [[name, f"{each * 1e3:.0f}", f"{each / least:.1f}"] for name, each in seconds.items()]
-    bars = [Bar(f"{name} over nothing", each / least, 6.0) for name, each in seconds.items() if each != least]
+    requirements = [
+        Requirement(f"{name}, relative to {NOTHING}", each / least, 6.0)
+        for name, each in seconds.items()
+        if each != least
+    ]
     for name, package in COMMANDS.items():
         said = _run([*python, "-X", "importtime", "-m", f"offboard.{package}", "--help"])
         loaded = [heavy for heavy in HEAVY if f"| {heavy}\n" in said.replace(" " * 2, "")]
-        bars.append(Bar(f"heavy libraries that {name} --help loads", len(loaded), 0))
-    return Table("--help", ("command", "ms", "over nothing"), rows, bars)
+        requirements.append(Requirement(f"heavy libraries that {name} --help imports", len(loaded), 0))
+    return Table("Time of --help", ("command", "ms", f"relative to {NOTHING}"), rows, requirements)
 
 
 def _run(command: list[str]) -> str:
@@ -73,19 +78,19 @@ def _rest() -> Table:
         busy = _cpu_share({"robot": robot.pid, "server": server.pid})
         each_kb = _connected(stack, server)
     rows = [
-        ["server, from nothing to ready", f"{cold.took_s:.2f} s"],
-        ["server, its planner compiled before", f"{server.took_s:.2f} s"],
+        ["server, cold start until ready", f"{cold.took_s:.2f} s"],
+        ["server, warm start (planner compiled before)", f"{server.took_s:.2f} s"],
         *([f"{name} at rest", f"{mib[name]:.0f} MiB, {busy[name]:.2%} of a core"] for name in mib),
-        [f"server, for each of {ROBOTS} connected robots", f"{each_kb:.1f} kB"],
+        [f"server, per robot ({ROBOTS} are connected)", f"{each_kb:.1f} kB"],
     ]
-    bars = [
-        Bar("cold start", cold.took_s, 15.0, " s"),
-        Bar("warm start", server.took_s, 3.0, " s"),
-        Bar("robot at rest, planner compiled", mib["robot"], 200, " MiB"),
-        *(Bar(f"CPU of the {name} at rest", 100 * share, 0.5, " %") for name, share in busy.items()),
-        Bar("server memory a robot", each_kb, 50, " kB"),
+    requirements = [
+        Requirement("cold start", cold.took_s, 15.0, "s"),
+        Requirement("warm start", server.took_s, 3.0, "s"),
+        Requirement("robot at rest, planner compiled", mib["robot"], 200, "MiB"),
+        *(Requirement(f"CPU of the {name} at rest", 100 * share, 0.5, "%") for name, share in busy.items()),
+        Requirement("server memory per robot", each_kb, 50, "kB"),
     ]
-    return Table("At rest", ("what", "takes"), rows, bars)
+    return Table("Start and rest", ("process", "time, or memory and CPU"), rows, requirements)
 
 
 def _mib(pid: int) -> float:
@@ -105,7 +110,7 @@ def _ticks(pid: int) -> int:
 
 
 def _connected(stack: contextlib.ExitStack, server: Server) -> float:
-    """kB that the server takes more for each robot that has said hello."""
+    """The memory of the server for each robot that has said hello, in kB."""
     context = stack.enter_context(zmq.Context())
     context.set(zmq.MAX_SOCKETS, 2 * ROBOTS)
     before, hello = _mib(server.pid), wire.pack(wire.Hello({}, "bench", 2**20))
@@ -120,22 +125,13 @@ def _connected(stack: contextlib.ExitStack, server: Server) -> float:
 
 
 def _installed() -> Table:
-    """As pip installs the package and what it needs into an empty folder."""
-    rows, bars = [], []
+    """The size of the package with its dependencies, as pip installs them into an empty folder."""
+    rows, requirements = [], []
     for what, extra, limit in (("base", "", 110), ("with planning", "[planning]", 330)):
         with tempfile.TemporaryDirectory() as folder:
-            command = [
-                sys.executable,
-                "-m",
-                "pip",
-                "install",
-                "--quiet",
-                "--target",
-                folder,
-                f"{ROOT}{extra}",
-            ]
-            subprocess.run(command, check=True, capture_output=True)
+            pip = [sys.executable, "-m", "pip", "install", "--quiet", "--target", folder]
+            subprocess.run([*pip, f"{ROOT}{extra}"], check=True, capture_output=True)
             mb = sum(file.stat().st_size for file in Path(folder).rglob("*") if file.is_file()) / 1e6
         rows.append([what, f"{mb:.0f}"])
-        bars.append(Bar(f"installed, {what}", mb, limit, " MB"))
-    return Table("Installed", ("what", "MB"), rows, bars)
+        requirements.append(Requirement(f"installed, {what}", mb, limit, "MB"))
+    return Table("Installed size", ("package", "MB"), rows, requirements)

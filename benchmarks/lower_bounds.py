@@ -1,4 +1,4 @@
-"""What no rule can beat in two simulated scenarios, whatever it knows of sites but not of what is drawn."""
+"""Lower bounds of two simulated scenarios: times that no policy can beat without foreseeing random draws."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,10 +14,10 @@ from offboard.robot_client import policies
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 SEEDS, TASKS, FROM_TASK = 6, 500, 20
-ALLOWANCES = (0.0, 0.05, 0.1, 0.2)  # second runs a task
-PRICES_S = np.linspace(0.0, 0.3, 61)  # of a second run
-STARTS = 250  # instants at which the second site may start: most where most answers come
-DRAWS = 400  # of what the way there and back takes
+ALLOWANCES = (0.0, 0.05, 0.1, 0.2)  # second runs per task
+PRICES_S = np.linspace(0.0, 0.3, 61)  # of one second run
+STARTS = 250  # instants at which the second site may start, at quantiles of the answer times
+DRAWS = 400  # of the round trip
 PERCENTILE = 95
 
 Column = NDArray[np.float64]
@@ -30,8 +30,8 @@ def tables() -> list[Table]:
 def _played(scenario: str, *names: str) -> dict[str, list[Reference]]:
     one = read_scenario(find_scenario(scenario)).changed(tasks=TASKS)
     seeds = [replace(one, seed=one.seed + n) for n in range(SEEDS)]
-    with SimulationPool(1) as batch:
-        played = batch.play(seeds, {name: {"policy": name} for name in names})
+    with SimulationPool(1) as pool:
+        played = pool.play(seeds, {name: {"policy": name} for name in names})
     return {
         name: [one for run in runs for one in run.references if one.i >= FROM_TASK]
         for name, runs in played.items()
@@ -39,15 +39,15 @@ def _played(scenario: str, *names: str) -> dict[str, list[Reference]]:
 
 
 def _mean_of_lossy() -> Table:
-    """The dual of: least mean time of a plan for each task, with so many second runs in the mean.
+    """The lowest possible mean time for a given mean number of second runs, computed from the dual problem.
 
-    A plan is a first site, and when the other one starts if it has not answered; the robot knows what each
-    task takes of its own CPU and of the server's, and how the rest, the way there and back, is distributed.
+    A plan is a first site, and the instant at which the other site starts if the first has not answered. The
+    robot knows the CPU time of each task on both sites, and the distribution of the round trip.
     """
     found = _played("lossy", ONBOARD)[ONBOARD]
     both = [one.seconds for one in found if CLOUD in one.seconds]
     onboard, cloud = (np.array([seconds[site] for seconds in both]) for site in (ONBOARD, CLOUD))
-    server = read_scenario(find_scenario("lossy")).robot.cpus * onboard  # of a whole CPU there
+    server = read_scenario(find_scenario("lossy")).robot.cpus * onboard  # time on a full CPU
     way = np.quantile(cloud - server, (np.arange(DRAWS) + 0.5) / DRAWS)
     plans = _plans(onboard, server, way)
     oracle_s = float(np.minimum(onboard, cloud).mean())
@@ -59,11 +59,15 @@ def _mean_of_lossy() -> Table:
         ]
         rows.append([f"{allowance:.0%}", f"{max(dual) / oracle_s:.3f}"])
     rows.append(["always onboard", f"{onboard.mean() / oracle_s:.3f}"])
-    return Table("lossy: mean time over the oracle's, at the least", ("second runs", "time/oracle"), rows)
+    return Table(
+        "lossy: lowest possible mean time",
+        ("second runs per task", "mean time, relative to the oracle"),
+        rows,
+    )
 
 
 def _plans(onboard: Column, server: Column, way: Column) -> list[tuple[Column, Column]]:
-    """Expected seconds and second runs of each task, by plan."""
+    """For each plan, the expected seconds and second runs of each task."""
     cloud = server[:, np.newaxis] + way
     plans = [(onboard, np.zeros(len(onboard))), (cloud.mean(axis=1), np.zeros(len(onboard)))]
     answers = np.concatenate([onboard, cloud[:: len(cloud) // DRAWS + 1].ravel()])
@@ -78,7 +82,7 @@ def _plans(onboard: Column, server: Column, way: Column) -> list[tuple[Column, C
 
 
 def _tail_of_heavy_tail() -> Table:
-    """A rule that knew what each task takes on each site would have this 95th percentile."""
+    """The 95th percentile of a policy that knows the time of each task on each site, and of two real ones."""
     names = ("paper", policies.DEFAULT)
     played = _played("heavy-tail", *names)
     waited = {name: [_waited_s(one) for one in found] for name, found in played.items()}
@@ -88,12 +92,12 @@ def _tail_of_heavy_tail() -> Table:
         for name, seconds in waited.items()
         for at in [_percentile(seconds)]
     ]
-    return Table("heavy-tail: the 95th percentile", ("rule", "ms", "over paper"), rows)
+    return Table("heavy-tail: 95th percentile of the time", ("policy", "ms", "relative to paper"), rows)
 
 
 def _waited_s(one: Reference) -> float:
     seconds = one.sent_s
-    assert seconds is not None, "a simulation foresees every task"
+    assert seconds is not None, "a simulation has a reference for every task"
     return seconds
 
 

@@ -1,4 +1,4 @@
-"""An empty task and one of 1 MB through the real client and server, beside raw ZMQ and other ways to call."""
+"""The time of an empty task and of a task with 1 MB, compared to plain ZMQ and to other ways to call."""
 
 import contextlib
 import http.client
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import zmq
 
-from benchmarks.measure import Bar, Table, each_of
+from benchmarks.measure import Requirement, Table, each_of
 from benchmarks.robots import request_frames
 from benchmarks.servers import READY_S, cloud_server, serve
 from benchmarks.tasks import length, nothing
@@ -21,6 +21,8 @@ from offboard.robot_client.sites.runner import CLOUD
 CALLS, MEGABYTE_CALLS = 200, 20
 MEGABYTE = 1_000_000
 LISTENS_S = 0.5
+RAW = "raw ZMQ echo of the same bytes"
+COLUMNS = ("call", "us", "relative to raw echo")
 
 
 def tables() -> list[Table]:
@@ -31,7 +33,7 @@ def tables() -> list[Table]:
 def _empty(stack: contextlib.ExitStack) -> Table:
     missing: list[str] = []
     cases: dict[str, Callable[[int], object]] = {
-        "raw ZMQ echo of the same bytes": _echo(stack, request_frames(nothing)),
+        RAW: _echo(stack, request_frames(nothing)),
         "offboard": _ours(stack, nothing),
         "FastAPI, keep-alive": _http(stack),
     }
@@ -42,34 +44,31 @@ def _empty(stack: contextlib.ExitStack) -> Table:
             continue
         try:
             cases[name] = start(stack)
-        except Exception as error:  # noqa: BLE001 - a peer that does not start must not take the others along
-            missing.append(f"{name}: it did not start: {describe(error)}")
+        except Exception as error:  # noqa: BLE001 - the others must be measured if one does not start
+            missing.append(f"{name}: did not start: {describe(error)}")
     seconds = each_of(cases, CALLS, rounds=9)
-    ours, raw = seconds["offboard"], seconds["raw ZMQ echo of the same bytes"]
-    bars = [Bar("offboard over raw echo", ours / raw, 4.0)]
+    ours, raw = seconds["offboard"], seconds[RAW]
+    requirements = [Requirement("offboard, relative to raw echo", ours / raw, 4.0)]
     least = {"FastAPI, keep-alive": 1.0, "gRPC, bytes": 1.0, "Ray actor": 4.0, "Dask actor": 10.0}
-    bars += [
-        Bar(f"{name} over offboard", seconds[name] / ours, limit, at_least=True)
+    requirements += [
+        Requirement(f"{name}, relative to offboard", seconds[name] / ours, limit, at_least=True)
         for name, limit in least.items()
         if name in seconds
     ]
-    return Table("An empty task", ("way", "us", "over raw echo"), _rows(seconds, raw), bars, missing)
+    return Table("An empty task", COLUMNS, _rows(seconds, raw), requirements, missing=missing)
 
 
 def _megabyte(stack: contextlib.ExitStack) -> Table:
     array = np.random.default_rng(1).integers(0, 255, MEGABYTE, np.uint8)
-    arrays = [
-        array + np.uint8(n) for n in range(MEGABYTE_CALLS)
-    ]  # as blobs they would be known the next time
-    raw_name = "raw ZMQ echo of the same bytes"
+    arrays = [array + np.uint8(n) for n in range(MEGABYTE_CALLS)]  # different, so that no blob is known
     seconds = each_of(
-        {raw_name: _echo(stack, request_frames(length, array)), "offboard": _ours(stack, length, arrays)},
+        {RAW: _echo(stack, request_frames(length, array)), "offboard": _ours(stack, length, arrays)},
         MEGABYTE_CALLS,
         rounds=9,
     )
-    raw = seconds[raw_name]
-    bar = Bar("offboard over raw echo", seconds["offboard"] / raw, 1.6)
-    return Table("A task with an array of 1 MB", ("way", "us", "over raw echo"), _rows(seconds, raw), [bar])
+    raw = seconds[RAW]
+    requirement = Requirement("offboard, relative to raw echo", seconds["offboard"] / raw, 1.6)
+    return Table("A task with an array of 1 MB", COLUMNS, _rows(seconds, raw), [requirement])
 
 
 def _rows(seconds: dict[str, float], raw: float) -> list[list[str]]:
@@ -92,6 +91,7 @@ def _echo(stack: contextlib.ExitStack, frames: list[Any]) -> Callable[[int], Non
 def _ours(
     stack: contextlib.ExitStack, function: Callable[..., Any], given: Any = None
 ) -> Callable[[int], None]:
+    """Calls through the real client and server; `given` are the arguments."""
     endpoint = stack.enter_context(cloud_server()).endpoint
     offload = stack.enter_context(Offloader.connect(endpoint, policy=CLOUD))
     absent = offload.wait_for_sites(function, READY_S)
@@ -103,7 +103,7 @@ def _ours(
             if given is None:
                 offload(function)
             else:
-                given[n][:8] += 1  # another array each time
+                given[n][:8] += 1  # a different array in each call
                 offload(function, given[n])
         record = offload.last
         assert record is not None
@@ -114,7 +114,7 @@ def _ours(
 
 def _http(stack: contextlib.ExitStack) -> Callable[[int], None]:
     connection = http.client.HTTPConnection("127.0.0.1", serve(stack, "http"))
-    time.sleep(LISTENS_S)  # it says its port just before it listens
+    time.sleep(LISTENS_S)  # the server prints its port just before it listens
     stack.callback(connection.close)
 
     def call(count: int) -> None:

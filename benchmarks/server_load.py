@@ -1,4 +1,4 @@
-"""What one server takes: empty tasks from many robots, and plans that come as fast as it can just bear."""
+"""The load that one server can take: empty tasks from many robots, and plans at 80 % of its capacity."""
 
 import contextlib
 import random
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.measure import Bar, Table
+from benchmarks.measure import Requirement, Table
 from benchmarks.servers import cloud_server, running, serve
 from offboard.common.planning import planner
 from offboard.common.planning.maps import free_pairs, read_map
@@ -21,7 +21,7 @@ from offboard.robot_client.sites.cloud import CloudRunner
 from offboard.robot_client.sites.runner import Execution
 
 ROBOTS = (1, 10, 100, 1_000)
-PROCESSES, IN_FLIGHT = 4, 32  # of the robots; tasks of all of them
+PROCESSES, IN_FLIGHT = 4, 32  # processes of robots, and tasks in flight of all robots together
 CLIENTS, CLIENT_PROCESSES = 8, 2
 TASKS = 6_000
 ROUNDS = 5
@@ -55,47 +55,40 @@ def _robots(ours: str, echo: str) -> Table:
         for robots, (rate, limit) in middle.items()
     ]
     full = [middle[robots][0] for robots in ROBOTS[1:]]
-    bars = [
-        Bar(f"least over most from {ROBOTS[1]} robots on", min(full) / max(full), 0.8, at_least=True),
-        Bar(f"wrong answers to up to {ROBOTS[-1]} robots", wrong, 0),
+    requirements = [
+        Requirement(
+            f"lowest / highest rate, from {ROBOTS[1]} robots on", min(full) / max(full), 0.8, at_least=True
+        ),
+        Requirement(f"wrong answers, with up to {ROBOTS[-1]} robots", wrong, 0),
     ]
-    return Table("Empty tasks a second", ("robots", "offboard", "raw ROUTER echo", "share"), rows, bars)
+    columns = ("robots", "offboard", "raw ROUTER echo", "offboard / echo")
+    return Table("Empty tasks per second", columns, rows, requirements)
 
 
 def _clients(ours: str, echo: str) -> Table:
-    """Our own clients against bare sockets: what both ends cost."""
+    """The clients of Offboard compared to plain sockets: the cost of both ends."""
     found: list[tuple[float, float]] = []
     for _ in range(ROUNDS):
         rate, wrong = _rate("client", ours, CLIENTS, CLIENT_PROCESSES)
         if wrong:
-            raise RuntimeError(f"{wrong} of {TASKS} answers are wrong")
+            raise RuntimeError(f"{wrong} of {TASKS} answers were wrong")
         found.append((rate, _rate("raw", echo, CLIENTS, CLIENT_PROCESSES)[0]))
     rate, limit = (statistics.median(each) for each in zip(*found, strict=True))
     rows = [["offboard", f"{rate:.0f}"], ["raw ROUTER echo", f"{limit:.0f}"]]
-    bar = Bar("offboard over raw echo", rate / limit, 0.25, at_least=True)
-    return Table(f"Empty tasks a second, pipelined from {CLIENTS} clients", ("way", "tasks/s"), rows, [bar])
+    requirement = Requirement("offboard, relative to raw echo", rate / limit, 0.25, at_least=True)
+    title = f"Empty tasks per second, pipelined from {CLIENTS} clients"
+    return Table(title, ("server", "tasks/s"), rows, [requirement])
 
 
 def _rate(way: str, endpoint: str, robots: int, processes: int) -> tuple[float, int]:
-    """Tasks a second of all together, and wrong answers."""
+    """Tasks per second of all robots together, and the number of wrong answers."""
     shares = [robots // processes + (n < robots % processes) for n in range(processes)]
     each = TASKS // processes
     with contextlib.ExitStack() as stack:
+        command = [sys.executable, "-m", "benchmarks.robots", way, endpoint]
+        in_flight = IN_FLIGHT // processes
         started = [
-            stack.enter_context(
-                running(
-                    [
-                        sys.executable,
-                        "-m",
-                        "benchmarks.robots",
-                        way,
-                        endpoint,
-                        str(share),
-                        str(each),
-                        str(IN_FLIGHT // processes),
-                    ]
-                )
-            )
+            stack.enter_context(running([*command, str(share), str(each), str(in_flight)]))
             for share in shares
         ]
         for process in started:
@@ -110,7 +103,7 @@ def _rate(way: str, endpoint: str, robots: int, processes: int) -> tuple[float, 
 
 
 def _loaded() -> Table:
-    """Plans at random instants, LOAD of what one worker does; beside a queue without any other cost."""
+    """Plans at random instants, at LOAD of the capacity of one worker, compared to an ideal queue."""
     grid, kind = read_map(MAP), kind_of(planner.plan_path)
     goals = [
         (Pose(*map(float, start)), Point(*map(float, goal)))
@@ -126,25 +119,31 @@ def _loaded() -> Table:
         while runner.unavailable(kind):
             time.sleep(0.01)
         alone = [runner.submit(task, BUDGET_S).result() for task in tasks[:WARM]]
-        gaps = random.Random(1)
         mean_s = statistics.fmean(_ran_s(one) for one in alone) / LOAD
-        due, answers, sent = time.perf_counter(), list[Future[Execution]](), list[float]()
-        for task in tasks:
-            due += gaps.expovariate(1 / mean_s)
-            time.sleep(max(0.0, due - time.perf_counter()))
-            sent.append(time.perf_counter())
-            answers.append(runner.submit(task, BUDGET_S))
-        done = [answer.result() for answer in answers]
+        sent, done = _run_at_random(runner, tasks, mean_s)
     real, ideal = np.array([one.seconds for one in done]), _ideal(sent, [_ran_s(one) for one in done])
     rows = [
         [name, *(f"{np.percentile(seconds, percent) * 1e3:.1f}" for percent in (50, 95, 99))]
-        for name, seconds in (("offboard", real), ("first come, first served, at no cost", ideal))
+        for name, seconds in (("offboard", real), ("ideal queue, in order of arrival", ideal))
     ]
     load = sum(_ran_s(one) for one in done) / (sent[-1] - sent[0])
-    bar = Bar(
-        "P99 over that of the ideal queue", float(np.percentile(real, 99) / np.percentile(ideal, 99)), 1.3
-    )
-    return Table(f"{PLANS} plans at {load:.0%} load, ms", ("queue", "P50", "P95", "P99"), rows, [bar])
+    ratio = float(np.percentile(real, 99) / np.percentile(ideal, 99))
+    requirement = Requirement("P99, relative to the ideal queue", ratio, 1.3)
+    return Table(f"{PLANS} plans at {load:.0%} load, ms", ("queue", "P50", "P95", "P99"), rows, [requirement])
+
+
+def _run_at_random(
+    runner: CloudRunner, tasks: Sequence[Task], mean_s: float
+) -> tuple[list[float], list[Execution]]:
+    """Start tasks at random instants, `mean_s` apart on average; returns these instants and the results."""
+    gaps = random.Random(1)
+    due, answers, sent = time.perf_counter(), list[Future[Execution]](), list[float]()
+    for task in tasks:
+        due += gaps.expovariate(1 / mean_s)
+        time.sleep(max(0.0, due - time.perf_counter()))
+        sent.append(time.perf_counter())
+        answers.append(runner.submit(task, BUDGET_S))
+    return sent, [answer.result() for answer in answers]
 
 
 def _ran_s(one: Execution) -> float:
@@ -154,6 +153,7 @@ def _ran_s(one: Execution) -> float:
 
 
 def _ideal(sent: Sequence[float], service: Sequence[float]) -> "np.ndarray[tuple[int], np.dtype[np.float64]]":
+    """The response times of a queue without any cost but the service times."""
     free_s, found = 0.0, []
     for at_s, took_s in zip(sent, service, strict=True):
         free_s = max(free_s, at_s) + took_s

@@ -37,18 +37,10 @@ def errors(figure: Figure, scores: Sequence[Score]) -> None:
         for at, name in enumerate(names):
             own = [score for score in scores if score.predictor == name]
             look = predictor_look(LOOKS[site], at, len(names))
-            for measure, field, line in (("mae", "mae_s", "-"), ("residual", "residual_s", ":")):
-                values = {score.window: abs(getattr(score, f"{site}_{field}")) for score in own}
+            for measure, line in (("mae", "-"), ("residual", ":")):
+                values = {score.window: _error(score, site, measure) for score in own}
                 _against_n(panel, windows, values, replace(look, line=line), gid=f"{measure}-{site}-{at}")
-    drawn = [
-        abs(getattr(score, f"{site}_{field}"))
-        for score in scores
-        for site in (ONBOARD, CLOUD)
-        for field in ("mae_s", "residual_s")
-    ]
-    low, high = min(drawn), max(drawn)
-    if 0 < WIDE * low <= high:
-        logarithmic(panels[0].set_yscale, panels[0].yaxis, low, high)
+    _scale_errors(panels[0], scores)
     _windows_axis(panels[-1], windows)
     keys = [
         key(NEUTRAL, "mean absolute error"),
@@ -91,6 +83,25 @@ def accuracy(figure: Figure, shown: Accuracies) -> None:
     axes.set_ylim(top=102)
     _windows_axis(axes, PAPER_WINDOWS)
     legend(figure, keys, columns=3 if len(names) == 1 else 2)
+
+
+def _error(score: Score, site: str, measure: str) -> float:
+    """The mean absolute error ("mae") or the absolute residual ("residual") of a site, in seconds."""
+    seconds: float = getattr(score, f"{site}_{measure}_s")
+    return abs(seconds)
+
+
+def _scale_errors(axes: Axes, scores: Sequence[Score]) -> None:
+    """Make the scale logarithmic if the errors differ much."""
+    drawn = [
+        _error(score, site, measure)
+        for score in scores
+        for site in (ONBOARD, CLOUD)
+        for measure in ("mae", "residual")
+    ]
+    low, high = min(drawn), max(drawn)
+    if 0 < WIDE * low <= high:
+        logarithmic(axes.set_yscale, axes.yaxis, low, high)
 
 
 def _against_n(

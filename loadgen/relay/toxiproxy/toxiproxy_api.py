@@ -143,7 +143,13 @@ class ToxicBody(Body):
         stream = "downstream" if self.stream is None else self.stream
         kind = self.type or ""
         name = self.name or f"{kind}_{stream}"
-        return Toxic(name, kind, stream, self._toxicity(1.0), attributes(kind, self.attributes or {}))
+        return Toxic(
+            name=name,
+            type=kind,
+            stream=stream,
+            toxicity=self._toxicity(1.0),
+            attributes=attributes(kind, self.attributes or {}),
+        )
 
     def changed(self, toxic: Toxic) -> Toxic:
         """The toxic with a new toxicity and new attributes; name, type and stream cannot be changed."""

@@ -54,7 +54,7 @@ class SimulatedCpu:
         self, cpu_s: float, ended: Callable[[Run], object], *, owner: str = "", until_s: float = math.inf
     ) -> Run:
         assert len(self._queue) < QUEUE_MAX
-        run = Run(cpu_s, owner, ended, until_s, self._clock.now_s())
+        run = Run(cpu_s, owner, ended, until_s=until_s, added_s=self._clock.now_s())
         self.settle()
         self._queue.append(run)
         self._plan()

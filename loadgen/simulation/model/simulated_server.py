@@ -134,4 +134,4 @@ class SimulatedServer:
         if self._wanted.pop(key, None) is not None:
             queue_s, run_s = run.begun_s - run.added_s, self._clock.now_s() - run.begun_s
             self._load.share(HURRIED_S)
-            answer(Reply(OK, self.told, queue_s, run_s, cpu_s))
+            answer(Reply(OK, self.told, queue_s=queue_s, run_s=run_s, cpu_s=cpu_s))

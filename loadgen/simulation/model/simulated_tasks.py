@@ -74,7 +74,7 @@ def find_tasks(workload: Workload, seed: int, count: int) -> RobotTasks:
 def _task(kind: Kind, request: tuple[Any, ...], answer: Any, units: Mapping[str, float]) -> SimulatedTask:
     """The bytes are counted on the messages that a real robot and server would send."""
     body = wire.encode(list(request), kind.types, blobs=True)
-    frames = wire.pack(wire.Request(1, kind.name, 1.0, 1, tuple(body.blobs), body.frames))
-    reply = wire.Reply(1, "ok", "", 0.0, 1.0, 0, body=wire.encode(answer, kind.types).frames, cpu_s=1.0)
+    frames = wire.pack(wire.Request(1, kind.name, 1.0, blobs=tuple(body.blobs), body=body.frames))
+    reply = wire.Reply(1, "ok", run_s=1.0, body=wire.encode(answer, kind.types).frames, cpu_s=1.0)
     size = kind.size_of(kind.bind(request, {}))
     return SimulatedTask(size, units, wire.byte_count(frames), wire.byte_count(wire.pack(reply)))
