@@ -51,7 +51,7 @@ class _Phase:
 def during_attacks(keys: Keys, plans: int, attacks: Iterable[str]) -> Table:
     """The same plans before and during each attack.
 
-    Each attacker is a robot of its own, because the server shuts out a robot that floods it.
+    Each attacker has its own keys, because the server shuts out a robot that floods it.
     """
     good, attackers = keys.add("good"), {name: keys.add(f"attacker-{name}") for name in attacks}
     sizes = {

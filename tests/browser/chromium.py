@@ -1,4 +1,4 @@
-"""The Chromium of this machine, headless and without requests of its own."""
+"""The Chromium of this machine, headless and without background requests."""
 
 import shutil
 

@@ -23,7 +23,7 @@ class Relay:
     - `connections_max`: connections at a time. When all are taken, a connection whose client has left is
       ended to make room for the next one.
     - `buffer_bytes`: bytes under way in one direction of one connection.
-    - `record`: is told everything that the link does.
+    - `record`: writes down everything that the link does.
     """
 
     def __init__(
