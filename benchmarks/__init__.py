@@ -1,1 +1,1 @@
-"""Speed beside peers on the same work: `make bench`. One file a table."""
+"""Speed compared to other software and to limits: `make bench`. One file for each table."""

@@ -1,4 +1,4 @@
-"""`python -m benchmarks [TABLE ...]`: speed beside peers and limits, each table in one run."""
+"""`python -m benchmarks [TABLE ...]`: measures the speed, compared to other software and to limits."""
 
 import argparse
 import importlib
@@ -8,12 +8,14 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
-TABLES = ("planner", "decision", "bounds", "wire", "load", "attacks", "start")
+TABLES = ("planner", "decision", "lower_bounds", "round_trip", "server_load", "attacks", "footprint")
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("table", nargs="*", metavar="TABLE", help=f"of {', '.join(TABLES)} (default: all)")
+    parser.add_argument(
+        "table", nargs="*", metavar="TABLE", help=f"one of {', '.join(TABLES)} (default: all)"
+    )
     chosen = parser.parse_args().table or TABLES
     for name in chosen:
         if name not in TABLES:
@@ -24,8 +26,8 @@ def main() -> int:
     for name in chosen:
         for table in importlib.import_module(f"benchmarks.{name}").tables():
             print(table, flush=True)
-            failed += sum(not bar.holds for bar in table.bars)
-    print(f"{failed} bars fail" if failed else "all bars hold")
+            failed += sum(not requirement.holds for requirement in table.requirements)
+    print(f"requirements that fail: {failed}" if failed else "all requirements hold")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""What deciding costs: predict both sites, decide, learn and record, with runners that answer at once."""
+"""The time to predict, decide, learn and record a task, with runners that answer at once."""
 
 import itertools
 import random
@@ -7,7 +7,7 @@ from concurrent.futures import Future
 
 import numpy as np
 
-from benchmarks.measure import Bar, Table, each_of
+from benchmarks.measure import Requirement, Table, each_of
 from offboard.common.tasks import Kind, Task, kind_of, task
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.offloader import Offloader
@@ -15,13 +15,13 @@ from offboard.robot_client.policies import Policy
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
 
 CALLS = 2_000
-RUN = "a run that is over at once"
+RUN = "a run that ends at once"
 WINDOW = 50
 RANDOM = random.Random(1)
 SIZES = [RANDOM.uniform(1, 5) for _ in range(CALLS)]
 MEASURED = Condition(round_trip_s=0.03)
 NOISE = [RANDOM.lognormvariate(0.0, 0.1) for _ in range(CALLS)]
-SECONDS = {ONBOARD: 0.02, CLOUD: 0.04}  # for size 1
+SECONDS = {ONBOARD: 0.02, CLOUD: 0.04}  # of a task of size 1
 
 
 @task("counted", size=lambda size: size)
@@ -29,8 +29,8 @@ def counted(size: float) -> float:
     return size
 
 
-class AtOnce:
-    """A site whose answers are there when they are asked for, and take what a line says."""
+class InstantRunner:
+    """A runner that answers at once, and reports times that are linear in the size, with noise."""
 
     def __init__(self, site: str) -> None:
         self.site = site
@@ -57,8 +57,8 @@ class AtOnce:
         pass
 
 
-class Kept:
-    """A policy that remembers the last forecast it was asked about."""
+class Remembering:
+    """A policy that remembers its last forecast."""
 
     def __init__(self, inner: Policy) -> None:
         self.inner = inner
@@ -72,13 +72,13 @@ def tables() -> list[Table]:
     return [_decisions(), _predictors()]
 
 
-def _offloader(policy: str, window: int) -> tuple[Offloader, Kept]:
-    """One that knows both sites well."""
+def _offloader(policy: str, window: int) -> tuple[Offloader, Remembering]:
+    """An offloader that has learned both sites well, and its policy."""
     name = policies.predictor_of(policy)
     plain = name.removeprefix(predictors.WORK)
-    kept = Kept(policies.make(policy))
+    kept = Remembering(policies.make(policy))
     offload = Offloader(
-        [AtOnce(ONBOARD), AtOnce(CLOUD)],
+        [InstantRunner(ONBOARD), InstantRunner(CLOUD)],
         policy=kept,
         predictor=lambda: predictors.make(plain, window),
         shared_work=name != plain,
@@ -98,18 +98,20 @@ def _decisions() -> Table:
             cases[f"{policy}, N = {window}"] = lambda count, offload=offload: _ask(offload, count)
             if window == WINDOW:
                 cases[f"{policy}: predict, decide and learn"] = _thinks(offload)
-                cases[f"{policy}: the rule alone"] = lambda count, kept=kept: _decide(kept, count)
+                cases[f"{policy}: decide only"] = lambda count, kept=kept: _decide(kept, count)
     seconds = each_of(cases, CALLS)
     empty, run = seconds["an empty call"], seconds[RUN]
     rows = [[name, f"{each * 1e6:.2f}", f"{each / empty:.0f}"] for name, each in seconds.items()]
-    bars = []
+    requirements = []
     for policy, limit in (("paper", 25.0), (policies.DEFAULT, 80.0)):
         few, usual, many = (seconds[f"{policy}, N = {window}"] for window in (10, WINDOW, 1_000))
         thought = seconds[f"{policy}: predict, decide and learn"]
-        bars.append(Bar(f"{policy}: predict, decide and learn", thought * 1e6, limit, " us"))
-        bars.append(Bar(f"{policy}, a task without its run", (usual - run) * 1e6, limit, " us"))
-        bars.append(Bar(f"{policy}, N = 10 and N = 1,000 apart", abs(many / few - 1), 0.2))
-    return Table("Deciding", ("what", "us", "empty calls"), rows, bars)
+        requirements += [
+            Requirement(f"{policy}: predict, decide and learn", thought * 1e6, limit, "us"),
+            Requirement(f"{policy}: a task without its run", (usual - run) * 1e6, limit, "us"),
+            Requirement(f"{policy}: N = 1,000, relative difference to N = 10", abs(many / few - 1), 0.2),
+        ]
+    return Table("Time of a decision", ("step", "us", "relative to an empty call"), rows, requirements)
 
 
 def _empty_calls(count: int) -> None:
@@ -121,7 +123,7 @@ def _empty_calls(count: int) -> None:
 
 
 def _runs(count: int) -> None:
-    site, work = AtOnce(ONBOARD), Task(kind_of(counted), (2.0,), 2.0)
+    site, work = InstantRunner(ONBOARD), Task(kind_of(counted), (2.0,), 2.0)
     for _ in range(count):
         site.submit(work, 2.0).exception()
 
@@ -132,7 +134,7 @@ def _ask(offload: Offloader, count: int) -> None:
 
 
 def _thinks(offload: Offloader) -> Callable[[int], None]:
-    """What is between a task and where it runs, and its time and the next task: no future, no record."""
+    """From a task to its decision, and from its time to the next task, without futures and records."""
     kind = kind_of(counted)
     tasks = [Task(kind, (size,), size) for size in SIZES]
     ran = {
@@ -152,7 +154,7 @@ def _thinks(offload: Offloader) -> Callable[[int], None]:
     return think
 
 
-def _decide(kept: Kept, count: int) -> None:
+def _decide(kept: Remembering, count: int) -> None:
     forecast = kept.forecast
     for _ in range(count):
         kept.inner.decide(forecast)
@@ -198,9 +200,9 @@ def _predictors() -> Table:
     found |= each_of({"numpy.polyfit": polyfit, "scikit-learn": sklearn}, CALLS // 10)
     base = found["least squares"]
     rows = [[name, f"{each * 1e6:.2f}", f"{each / base:.1f}"] for name, each in found.items()]
-    bars = [
-        Bar("numpy.polyfit over ours", found["numpy.polyfit"] / base, 8.0, at_least=True),
-        Bar("river over ours", found["river"] / base, 2.0, at_least=True),
-        Bar("scikit-learn over ours", found["scikit-learn"] / base, 50.0, at_least=True),
+    requirements = [
+        Requirement(f"{name}, relative to least squares", found[name] / base, limit, at_least=True)
+        for name, limit in (("numpy.polyfit", 8.0), ("river", 2.0), ("scikit-learn", 50.0))
     ]
-    return Table(f"Learn and predict one site, N = {WINDOW}", ("what", "us", "over ours"), rows, bars)
+    columns = ("predictor", "us", "relative to least squares")
+    return Table(f"Learn and predict for one site, N = {WINDOW}", columns, rows, requirements)

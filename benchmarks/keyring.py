@@ -1,4 +1,4 @@
-"""The keys of one server and its robots, in a folder."""
+"""The keys of a server and of its robots, in one folder."""
 
 import shutil
 from pathlib import Path
@@ -7,7 +7,7 @@ from offboard.common.security.keys import ROBOT, SERVER, make_keys
 
 
 class Keys:
-    """A server's folder of keys, and robots with folders of their own."""
+    """The folder with the keys of the server, and a folder for each robot."""
 
     def __init__(self, folder: Path) -> None:
         self.server = folder / "server"
@@ -17,14 +17,14 @@ class Keys:
         self._folder = folder
 
     def make(self, name: str) -> Path:
-        """The keys of a robot that nobody knows yet."""
+        """Make the keys of a robot that the server does not know yet; returns their folder."""
         folder = self._folder / name
         make_keys(folder, ROBOT)
         shutil.copy(self.server / "server.key", folder)
         return folder
 
     def add(self, name: str) -> Path:
-        """The keys of a robot that the server knows."""
+        """Make the keys of a robot that the server knows; returns their folder."""
         folder = self.make(name)
         self.let_in(name)
         return folder

@@ -1,4 +1,4 @@
-"""What every table is made of: cases in turn, their medians, and bars that hold or do not."""
+"""How benchmarks measure: medians of interleaved cases, tables, and requirements that figures must meet."""
 
 import statistics
 import time
@@ -9,8 +9,8 @@ ROUNDS = 15
 
 
 @dataclass(frozen=True, slots=True)
-class Bar:
-    """A figure that should be at most, or at least, its limit."""
+class Requirement:
+    """A figure that must be at most `limit`, or at least `limit`."""
 
     what: str
     value: float
@@ -25,17 +25,18 @@ class Bar:
     def __str__(self) -> str:
         side = "at least" if self.at_least else "at most"
         verdict = "holds" if self.holds else "**fails**"
-        return f"{self.what}: {self.value:.3g}{self.unit}, {side} {self.limit:g}{self.unit}: {verdict}"
+        unit = f" {self.unit}" if self.unit else ""
+        return f"{self.what}: {self.value:.3g}{unit}, {side} {self.limit:g}{unit}: {verdict}"
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Title, columns and rows as printed, the bars that follow from them, and what could not be measured."""
+    """A table as it is printed, its requirements, and the reasons why some cases were not measured."""
 
     title: str
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
-    bars: Sequence[Bar] = ()
+    requirements: Sequence[Requirement] = ()
     missing: Sequence[str] = ()
 
     def __str__(self) -> str:
@@ -44,16 +45,16 @@ class Table:
         lines += [f"| {' | '.join(row)} |" for row in self.rows]
         lines += [
             "",
-            *(f"- {bar}" for bar in self.bars),
-            *(f"- not measured: {what}" for what in self.missing),
+            *(f"- {requirement}" for requirement in self.requirements),
+            *(f"- not measured: {reason}" for reason in self.missing),
         ]
         return "\n".join(lines).rstrip() + "\n"
 
 
 def interleaved(cases: Mapping[str, Callable[[], object]], rounds: int = ROUNDS) -> dict[str, float]:
-    """Median seconds of each case: each round runs all of them once, every other one backwards.
+    """The median seconds of each case.
 
-    A first round is not counted.
+    Each round runs all cases once, every other round in reverse order. One round before them is not counted.
     """
     seconds: dict[str, list[float]] = {name: [] for name in cases}
     for number in range(rounds + 1):
@@ -68,6 +69,6 @@ def interleaved(cases: Mapping[str, Callable[[], object]], rounds: int = ROUNDS)
 def each_of(
     cases: Mapping[str, Callable[[int], object]], count: int, rounds: int = ROUNDS
 ) -> dict[str, float]:
-    """Median seconds of one call of each case, where `case(count)` makes so many."""
+    """The median seconds of one call of each case; `case(count)` makes `count` calls."""
     found = interleaved({name: lambda case=case: case(count) for name, case in cases.items()}, rounds)
     return {name: seconds / count for name, seconds in found.items()}

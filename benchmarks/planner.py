@@ -1,6 +1,7 @@
-"""One shortest path from corner to corner, beside what can be installed with pip."""
+"""The time of one shortest path from corner to corner, compared to packages that pip can install."""
 
 import concurrent.futures
+import dataclasses
 import functools
 import math
 import multiprocessing
@@ -12,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.measure import Bar, Table, interleaved
+from benchmarks.measure import Requirement, Table, interleaved
 from offboard.common.planning import planner
 from offboard.common.planning.maps import GridMap, free_pairs, largest_component, passable, read_map
 from offboard.common.planning.planner import Point, Pose, Scan
@@ -22,12 +23,12 @@ from offboard.common.planning.search import Cell, Field, Route
 ROOT = Path(__file__).parents[1]
 BERLIN = ROOT.parent / "shared/maps/movingai/Berlin_1_1024.map"
 SIDE = 4000
-BLOCKS, BLOCK = 1500, 60  # rectangles on a map of that side, and the longest side of one
+BLOCKS, BLOCK = 1500, 60  # rectangles on a map with this side, and the longest side of a rectangle
 SIDES = (400, 1000, 2000, SIDE)
 ROUNDS = 9
 BEAMS, SCAN_M = 360, 3.5
 PAIRS = 40
-# Directions of dijkstra3d's graphs (row, column) and their bits.
+# The directions (row, column) in the graphs of dijkstra3d, and their bits.
 BITS = {(1, 0): 0, (-1, 0): 1, (0, 1): 2, (0, -1): 3, (1, 1): 6, (-1, 1): 7, (1, -1): 8, (-1, -1): 9}
 
 Free = NDArray[np.bool_]
@@ -40,22 +41,20 @@ def tables() -> list[Table]:
         found.append(_against_peers(name, free, 10.0 if name.startswith("Berlin") else 8.0))
     found.append(_of_one_map(maps["Willow Garage"]))
     if len(maps) < 3:
-        found[-1] = Table(
-            found[-1].title, found[-1].columns, found[-1].rows, found[-1].bars, [f"{BERLIN.name}: not here"]
-        )
+        found[-1] = dataclasses.replace(found[-1], missing=[f"{BERLIN.name}: the file is missing"])
     return [*found, _growth()]
 
 
 def _maps() -> dict[str, Free]:
-    """Their passable cells, of which all can be reached from each other."""
+    """For each map, the passable cells that can all be reached from each other."""
     found = {} if not BERLIN.exists() else {"Berlin_1_1024": passable(read_map(BERLIN))}
     found["Willow Garage"] = passable(read_map(ROOT / "maps/willow-full-0.05.yaml"))
-    found[f"{SIDE} x {SIDE}, drawn"] = _drawn(SIDE)
+    found[f"{SIDE} x {SIDE}, generated"] = _generated(SIDE)
     return {name: largest_component(free) for name, free in found.items()}
 
 
-def _drawn(side: int) -> Free:
-    """Free but for rectangles, as many for an area whatever the side."""
+def _generated(side: int) -> Free:
+    """A free map with random rectangles; the number of rectangles per area does not depend on the side."""
     random, blocks = np.random.default_rng(1), BLOCKS * side**2 // SIDE**2
     free = np.ones((side, side), np.bool_)
     for row, col, height, width in zip(
@@ -91,7 +90,7 @@ def _against_peers(name: str, free: Free, times: float) -> Table:
 
     route, peer = field.route(start, goal), _length(exact())
     if not math.isclose(route.cost, peer, rel_tol=1e-6):
-        raise AssertionError(f"{name}: our path costs {route.cost}, dijkstra3d's {peer}")
+        raise AssertionError(f"{name}: our path costs {route.cost}, the path of dijkstra3d {peer}")
     for planner_name in (ASTAR, JPS):
         if (cost := field.route(start, goal, planner=planner_name).cost) != route.cost:
             raise AssertionError(f"{name}: the path of {planner_name} costs {cost}, not {route.cost}")
@@ -109,18 +108,20 @@ def _against_peers(name: str, free: Free, times: float) -> Table:
     ours = seconds["offboard"]
     rows = [[peer, f"{each * 1e3:.1f}", f"{each / ours:.2f}"] for peer, each in seconds.items()]
     title = f"Planner: {name}, corner to corner, {route.expanded} cells expanded, cost {route.cost:.3f}"
-    bars = [
-        Bar("dijkstra3d over ours", seconds["dijkstra3d"] / ours, times, at_least=True),
-        Bar("ours over ours by jps", ours / seconds["offboard, jps"], 2.0, at_least=True),
+    requirements = [
+        Requirement("dijkstra3d, relative to offboard", seconds["dijkstra3d"] / ours, times, at_least=True),
+        Requirement(
+            "offboard, relative to offboard with jps", ours / seconds["offboard, jps"], 2.0, at_least=True
+        ),
     ]
-    return Table(title, ("planner", "ms", "over ours"), rows, bars)
+    return Table(title, ("planner", "ms", "relative to offboard"), rows, requirements)
 
 
 def _growth() -> Table:
-    """The paper takes n ln n for the time of a plan."""
+    """The paper assumes that the time of a plan is proportional to n ln n."""
     routes: dict[str, Callable[[], Route]] = {}
     for side in SIDES:
-        free = largest_component(_drawn(side))
+        free = largest_component(_generated(side))
         routes[f"{side} x {side}"] = functools.partial(Field(free).route, *_corners(free))
     cells = {name: route().expanded for name, route in routes.items()}
     seconds = interleaved(routes, ROUNDS)
@@ -128,10 +129,10 @@ def _growth() -> Table:
     rows = [
         [name, str(cells[name]), f"{seconds[name] * 1e3:.2f}", f"{each:.3f}"] for name, each in ns.items()
     ]
-    said = "most over least; distances are 0.6 MB, which a core's own cache holds, to 64 MB, which none does"
-    bars = [Bar(said, max(ns.values()) / min(ns.values()), 3.0)]
-    title = "Planner: growth, corner to corner of drawn maps, n cells expanded"
-    return Table(title, ("map", "n", "ms", "ns over n ln n"), rows, bars)
+    # The distances take 0.6 MB on the smallest map, which fits the cache of a core, and 64 MB on the largest.
+    requirement = Requirement("highest / lowest ns per n ln n", max(ns.values()) / min(ns.values()), 3.0)
+    title = "Planner: time by map size, corner to corner of generated maps, n cells expanded"
+    return Table(title, ("map", "n", "ms", "ns per n ln n"), rows, [requirement])
 
 
 def _of_one_map(free: Free) -> Table:
@@ -143,13 +144,13 @@ def _of_one_map(free: Free) -> Table:
     scan = Scan(beams, -math.pi, 2 * math.pi / BEAMS, SCAN_M)
     hits = planner.scan_hits(grid, scan, pose, 0.2)
     zeros = np.zeros(free.shape, np.uint8)
-    beside = Point(pose.x, pose.y)
-    there = grid.cell(beside.x, beside.y) or start
+    same = Point(pose.x, pose.y)
+    there = grid.cell(same.x, same.y) or start
     seconds = interleaved(
         {
             "a search": lambda: field.route(start, goal),
             "preparing the map": lambda: Field(free).route(start, start),
-            "a search on costs, all 0": lambda: field.route(start, goal, costs=zeros),
+            "a search with costs, all 0": lambda: field.route(start, goal, costs=zeros),
             "start = goal": lambda: field.route(start, there),
             "start = goal, with a scan": lambda: field.route(start, there, hits),
         },
@@ -159,23 +160,24 @@ def _of_one_map(free: Free) -> Table:
     rows = [[name, f"{each * 1e3:.3f}", f"{each / search:.2f}"] for name, each in seconds.items()]
     overlay_ms = seconds["start = goal, with a scan"] * 1e3
     share, allocated = _two_threads(free), _allocated(field, start, goal)
-    bars = [
-        Bar("preparing a map over a search", seconds["preparing the map"] / search, 2.0),
-        Bar(
-            f"a search of no cell that lays {BEAMS} beams over the map and takes them off",
-            overlay_ms,
-            0.3,
-            " ms",
+    requirements = [
+        Requirement("preparing a map, relative to a search", seconds["preparing the map"] / search, 2.0),
+        Requirement(f"start = goal, with a scan of {BEAMS} beams", overlay_ms, 0.3, "ms"),
+        Requirement(
+            "a search with costs, relative to one without",
+            seconds["a search with costs, all 0"] / search,
+            3.0,
         ),
-        Bar("costs over no costs", seconds["a search on costs, all 0"] / search, 3.0),
-        Bar("bytes that a search allocates, for each cell of the map", allocated / free.size, 0.1),
-        Bar("two threads over two processes", share, 0.85, at_least=True),
+        Requirement("bytes that a search allocates per cell of the map", allocated / free.size, 0.1),
+        Requirement("searches per second, two threads relative to two processes", share, 0.85, at_least=True),
     ]
-    return Table("Planner: Willow Garage, one map", ("what", "ms", "over a search"), rows, bars)
+    return Table(
+        "Planner: Willow Garage, one map", ("step", "ms", "relative to a search"), rows, requirements
+    )
 
 
 def _allocated(field: Field, start: Cell, goal: Cell) -> int:
-    """Bytes at the peak of a search that is not the first."""
+    """The highest number of bytes that a search allocates; the first search is not counted."""
     field.route(start, goal)
     tracemalloc.start()
     field.route(start, goal)
@@ -185,7 +187,7 @@ def _allocated(field: Field, start: Cell, goal: Cell) -> int:
 
 
 def _two_threads(free: Free) -> float:
-    """Searches a second of two threads over those of two processes, the median of several turns."""
+    """Searches per second of two threads, relative to two processes; the median of several rounds."""
     grid = GridMap(np.where(free, 0, 100).astype(np.int8), 0.05)
     pairs = [(tuple(start), tuple(goal)) for start, goal in free_pairs(grid, PAIRS, seed=1).tolist()]
     context = multiprocessing.get_context("spawn")
@@ -220,7 +222,7 @@ def _search(pair: tuple[Cell, Cell]) -> float:
 
 
 def _allowed(free: Free) -> NDArray[np.uint32]:
-    """The moves that we allow as a graph of dijkstra3d: no corner is cut."""
+    """The moves that our planner allows, as a graph of dijkstra3d: no corner is cut."""
     framed = np.pad(free, 1)
     height, width = free.shape
     allowed = np.zeros(free.shape, np.uint32, order="F")

@@ -1,7 +1,7 @@
-"""Robots that ask for empty tasks as fast as they are answered.
+"""Robots that run empty tasks on a server, as fast as it answers.
 
-`python -m benchmarks.robots raw|client ENDPOINT ROBOTS TASKS IN_FLIGHT` says when all are connected, begins
-when it gets a line, and says how many seconds all tasks took and how many answers were wrong.
+`python -m benchmarks.robots raw|client ENDPOINT ROBOTS TASKS IN_FLIGHT` prints "ready" when all robots are
+connected, begins when it reads a line, and prints the seconds of all tasks and the number of wrong answers.
 """
 
 import sys
@@ -39,7 +39,7 @@ def main() -> None:
 
 
 def raw(endpoint: str) -> Callable[[], Callable[[], bool]]:
-    """A DEALER that sends the bytes of a request; an echo of them is an answer too."""
+    """A plain DEALER socket that sends the bytes of a request; an echo of the request counts as an answer."""
     socket = zmq.Context.instance().socket(zmq.DEALER)
     socket.linger = 0
     socket.connect(endpoint)
@@ -59,7 +59,7 @@ def raw(endpoint: str) -> Callable[[], Callable[[], bool]]:
 
 
 def client(endpoint: str) -> Callable[[], Callable[[], bool]]:
-    """Ours."""
+    """The client of Offboard."""
     runner, kind = CloudRunner(endpoint), kind_of(nothing)
     until = time.monotonic() + READY_S
     while runner.unavailable(kind) and time.monotonic() < until:
@@ -73,10 +73,10 @@ def client(endpoint: str) -> Callable[[], Callable[[], bool]]:
 
 
 def request_frames(function: Callable[..., Any], *args: Any, budget_s: float = 1.0) -> list[Any]:
-    """What the client sends for this call."""
+    """The frames that the client sends for this call."""
     kind = kind_of(function)
     body = wire.encode(list(args), kind.types)
-    return list(wire.pack(wire.Request(1, kind.name, budget_s, 1, (), body.frames)))
+    return list(wire.pack(wire.Request(1, kind.name, budget_s, body=body.frames)))
 
 
 if __name__ == "__main__":

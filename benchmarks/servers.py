@@ -1,4 +1,7 @@
-"""Our server, and peers that answer an empty call: `python -m benchmarks.servers NAME` says at which port."""
+"""Servers to measure: `cloud-server`, and other software that answers an empty call.
+
+`python -m benchmarks.servers NAME` starts one of the others, and prints its port.
+"""
 
 import contextlib
 import os
@@ -18,7 +21,7 @@ POLL_S = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Server:
-    """A `cloud-server` that is ready, after `took_s`."""
+    """A `cloud-server` that is ready; its start took `took_s`."""
 
     endpoint: str
     http_port: int
@@ -28,23 +31,24 @@ class Server:
 
 @contextlib.contextmanager
 def running(command: Sequence[str], **environ: str) -> Iterator["subprocess.Popen[str]"]:
-    pipe = subprocess.PIPE  # an input too, of which there is no end before we let go
+    """Run a process until the end of the block."""
+    pipe = subprocess.PIPE  # also for the input, so that it does not end early
     process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=os.environ | environ)
     try:
         yield process
     finally:
         process.terminate()
-        process.communicate(timeout=READY_S)  # closes the pipes too
+        process.communicate(timeout=READY_S)  # also closes the pipes
 
 
 @contextlib.contextmanager
 def cloud_server(tasks: str = "benchmarks.tasks", **environ: str) -> Iterator[Server]:
-    """The real one, on loopback; a robot may send what it can, unless `environ` bounds it."""
+    """Start `cloud-server` on loopback, without a rate limit for robots unless `environ` sets one."""
     endpoint, http = f"tcp://127.0.0.1:{free_port()}", f"127.0.0.1:{free_port()}"
     command = [sys.executable, "-m", "offboard.cloud_server", "--listen", endpoint, "--tasks", tasks]
     began = time.perf_counter()
-    unbounded = {"CLOUD_ROBOT_MIB_S": "65536"}
-    with running([*command, "--http", http, "--log", "error"], **(unbounded | environ)) as process:
+    unlimited = {"CLOUD_ROBOT_MIB_S": "65536"}
+    with running([*command, "--http", http, "--log", "error"], **(unlimited | environ)) as process:
         while time.perf_counter() - began < READY_S:
             with contextlib.suppress(OSError), urllib.request.urlopen(f"http://{http}/ready", timeout=1):
                 break
@@ -53,7 +57,7 @@ def cloud_server(tasks: str = "benchmarks.tasks", **environ: str) -> Iterator[Se
 
 
 def serve(stack: contextlib.ExitStack, name: str) -> int:
-    """One of those below in a process of its own; its port."""
+    """Start one of the servers below in its own process, and return its port."""
     process = stack.enter_context(running([sys.executable, "-m", "benchmarks.servers", name]))
     assert process.stdout is not None
     return int(process.stdout.readline())
@@ -65,7 +69,7 @@ def free_port() -> int:
 
 
 def echo() -> None:
-    """ROUTER: what is sent comes back, frame by frame."""
+    """A plain ROUTER socket that sends every frame back."""
     import zmq
 
     router = zmq.Context.instance().socket(zmq.ROUTER)
@@ -75,7 +79,7 @@ def echo() -> None:
 
 
 def http() -> None:
-    """FastAPI on uvicorn."""
+    """FastAPI on uvicorn, with an empty handler."""
     import uvicorn
     from fastapi import FastAPI
 
@@ -94,7 +98,7 @@ def http() -> None:
 
 
 def grpc() -> None:
-    """A unary call of bytes."""
+    """gRPC, with an empty unary call of bytes."""
     import grpc as library
 
     def nothing(request: bytes, _context: Any) -> bytes:

@@ -1,4 +1,4 @@
-"""Tasks that take no time, so that what is measured is the way to them and back."""
+"""Tasks that take no time, so that only the way to the server and back is measured."""
 
 from typing import Any
 

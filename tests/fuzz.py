@@ -29,7 +29,7 @@ with atheris.instrument_imports(
     from offboard.common.wire import messages as wire
     from offboard.common.wire.blobs import BlobStore
 
-from benchmarks.attackers import Frames, bombs, valid_messages  # noqa: E402
+from benchmarks.attack_messages import Frames, bombs, valid_messages  # noqa: E402
 from offboard.common.planning import planner  # noqa: E402
 
 FRAMES_MAX = 40

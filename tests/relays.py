@@ -1,4 +1,4 @@
-"""A relay in a process of its own, and what to say through it."""
+"""A relay in its own process, and functions that send bytes through it."""
 
 import contextlib
 import http.client
@@ -27,7 +27,7 @@ QUIET_S = 0.15
 
 @dataclass
 class Wan:
-    """A running relay."""
+    """A running relay process, its port, and the port of its control API."""
 
     process: subprocess.Popen[str]
     port: int
@@ -67,7 +67,7 @@ def round_trip_s(client: socket.socket) -> float:
 
 
 def quietest(measure: Callable[[], float], batches: int = BATCHES) -> float:
-    """The least median of a batch: other load on the machine only ever adds."""
+    """The lowest median of several batches, because other load on the machine can only add time."""
     return min(statistics.median(measure() for _ in range(PINGS)) for _ in range(batches))
 
 
@@ -79,7 +79,7 @@ def receive(client: socket.socket, size: int) -> bytes:
 
 
 def silent(client: socket.socket) -> bool:
-    """Nothing comes, not even an end, for a while."""
+    """Whether nothing arrives for QUIET_S, not even the end."""
     client.settimeout(QUIET_S)
     try:
         return client.recv(1) is None
@@ -94,7 +94,7 @@ def stop(relay: Wan) -> None:
     assert relay.process.wait(WAIT_S) == 0
 
 
-def read_truth(path: Path) -> list[dict[str, Any]]:
+def read_record(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
@@ -108,5 +108,5 @@ def is_reset(client: socket.socket) -> bool:
 def wait_until(fact: Callable[[], Any]) -> None:
     end = time.monotonic() + WAIT_S
     while not fact():
-        assert time.monotonic() < end, "not within the wait"
+        assert time.monotonic() < end, f"not within {WAIT_S} s"
         time.sleep(0.01)

@@ -1,4 +1,4 @@
-"""Virtual time, and runners that live in it: what happens when is the test's to say, and nothing sleeps."""
+"""Virtual time for unit tests, and runners that work in it: the test decides what happens when."""
 
 import heapq
 import itertools
@@ -13,7 +13,7 @@ from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, E
 
 
 class VirtualClock:
-    """Time passes only where somebody waits, from one planned happening to the next."""
+    """Time passes only while a caller waits, from one planned event to the next."""
 
     def __init__(self) -> None:
         self._now_s = 0.0
@@ -31,14 +31,14 @@ class VirtualClock:
         self.waits.append(timeout_s)
         until_s = float("inf") if timeout_s is None else self._now_s + timeout_s
         while not any(run.done() for run in pending):
-            assert self._plans or timeout_s is not None, "waits for ever"
+            assert self._plans or timeout_s is not None, "waits forever"
             if not self._plans or self._plans[0][0] > until_s:
                 self._now_s = until_s
                 return
             self._step()
 
     def run_out(self) -> None:
-        """Let everything happen that is planned."""
+        """Make all planned events happen."""
         while self._plans:
             self._step()
 
@@ -49,10 +49,10 @@ class VirtualClock:
 
 
 class VirtualRunner:
-    """Runs each task for as long as `takes` says, in virtual time; then its future gets what `ends` says.
+    """Runs each task for `takes` seconds of virtual time; None means that there is never an answer.
 
-    As the real ones: a server's run can be given up, and is at the end of its budget; one onboard goes on.
-    `takes` None: no answer ever comes.
+    As with the real runners, a run on a server is cancelled on request or at the end of its budget, and a run
+    onboard continues to its end.
     """
 
     def __init__(self, site: str, clock: VirtualClock, takes: float | None = 0.1) -> None:
@@ -61,9 +61,8 @@ class VirtualRunner:
         self.failure: OffloadError | None = None
         self.fields: dict[str, Any] = {}
         self.measured = UNMEASURED
-        self.scripts: deque[tuple[float | None, OffloadError | None]] = (
-            deque()
-        )  # of the next tasks, before these
+        # `takes` and `failure` of the next tasks; after them, those above count.
+        self.scripts: deque[tuple[float | None, OffloadError | None]] = deque()
         self.tasks: list[Task] = []
         self.cancelled: list[Task] = []
         self.hurried_s: list[float] = []

@@ -10,8 +10,8 @@ from typing import Any
 from offboard.loadgen.compare.compare_settings import CompareConfig, split_strategy
 from offboard.loadgen.compare.comparison_table import comparison_table
 from offboard.loadgen.scenario.scenario import Scenario
-from offboard.loadgen.simulation.batch import Batch
-from offboard.loadgen.simulation.world import check_simulated
+from offboard.loadgen.simulation.simulated_testbed import check_simulated
+from offboard.loadgen.simulation.simulation_pool import SimulationPool
 from offboard.loadgen.table.table_formats import Heading, Table, render
 
 ABOUT = "time over oracle of each policy"
@@ -22,8 +22,8 @@ def simulated(scenarios: Sequence[Scenario], config: CompareConfig) -> str:
     """All tables, as text in the chosen format."""
     for scenario in scenarios:
         check_simulated(scenario)
-    with Batch(config.jobs) as batch:
-        tables = [_table(scenario, config, batch) for scenario in scenarios]
+    with SimulationPool(config.jobs) as pool:
+        tables = [_table(scenario, config, pool) for scenario in scenarios]
     if len(tables) == 1:
         return render(tables, config.format)
     summary = summary_table(_over_oracle(scenarios, tables, config.policies), _caption(config))
@@ -58,16 +58,16 @@ def _mean_and_worst(values: Sequence[float | None]) -> tuple[Any, Any]:
     return (sum(there) / len(there), max(there)) if there else (None, None)
 
 
-def _table(scenario: Scenario, config: CompareConfig, batch: Batch) -> Table:
+def _table(scenario: Scenario, config: CompareConfig, pool: SimulationPool) -> Table:
     strategies = {
         name: dict(zip(("policy", "predictor"), split_strategy(name), strict=True))
         for name in config.policies
     }
     seeds = [scenario.changed(seed=scenario.seed + n) for n in range(config.seeds)]
-    played = batch.play(seeds, strategies)
+    played = pool.play(seeds, strategies)
     compared = scenario.compared()
     runs = {name: [run.of(compared).between(config.from_task) for run in played[name]] for name in played}
-    return comparison_table(scenario, config, runs, batch.map)
+    return comparison_table(scenario, config, runs, pool.map)
 
 
 def _over_oracle(

@@ -1,1 +1,1 @@
-"""The relay between robot and cloud: sockets, control, and record."""
+"""The relay between robot and cloud: its link model, its sockets, and the APIs that control it."""

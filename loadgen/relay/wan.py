@@ -12,13 +12,14 @@ from pathlib import Path
 from offboard.common.config import setting
 from offboard.common.errors import ConfigError
 from offboard.common.security.guard import LOOPBACK, OPEN_REMEDY, on_loopback, read_token, warn_each_minute
-from offboard.loadgen.relay.http_control import ControlServer, control_app
-from offboard.loadgen.relay.link.link import CHUNK_BYTES
+from offboard.loadgen.relay.control_api import ControlServer, control_app
+from offboard.loadgen.relay.link.bandwidth import CHUNK_BYTES
 from offboard.loadgen.relay.link.link_settings import LinkFlags
-from offboard.loadgen.relay.schedule import Schedule, read_schedule
-from offboard.loadgen.relay.tcp.endpoint import BACKLOG, address, bind, name_of
-from offboard.loadgen.relay.tcp.link_record import Truth
-from offboard.loadgen.relay.tcp.relay import PreciseSelector, Relay
+from offboard.loadgen.relay.link_schedule import Schedule, read_schedule
+from offboard.loadgen.relay.tcp.link_record import LinkRecord
+from offboard.loadgen.relay.tcp.precise_selector import PreciseSelector
+from offboard.loadgen.relay.tcp.relay import Relay
+from offboard.loadgen.relay.tcp.tcp_address import BACKLOG, address, bind, name_of
 from offboard.loadgen.relay.toxiproxy.proxies import Proxies, RelaySettings
 from offboard.loadgen.relay.toxiproxy.toxiproxy_api import toxiproxy_app
 
@@ -123,14 +124,14 @@ async def _serve(config: WanConfig) -> None:
         http = sockets.enter_context(bind("--http", config.http))
         loop = asyncio.get_running_loop()
         events = () if config.schedule is None else read_schedule(config.schedule, config.link)
-        truth = None if config.truth is None else Truth(config.truth, loop.time())
+        record = None if config.truth is None else LinkRecord(config.truth, loop.time())
         relay = Relay(
             address("--to", config.to),
             config.link,
             seed=config.seed,
             connections_max=config.connections_max,
             buffer_bytes=config.buffer_bytes,
-            truth=truth,
+            record=record,
         )
         schedule = Schedule(relay)
         app = control_app(
@@ -164,6 +165,6 @@ async def _serve(config: WanConfig) -> None:
         schedule.stop()
         relay.abort()
         proxies.close()
-        if truth is not None:
+        if record is not None:
             await relay.ended(END_S)
-            truth.close(loop.time())
+            record.close(loop.time())

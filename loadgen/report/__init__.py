@@ -1,1 +1,1 @@
-"""Charts and pages of a run."""
+"""Charts and the HTML page of a run."""

@@ -1,4 +1,7 @@
-"""What the charts of a report show, as plain numbers; how they look is the business of `charts`."""
+"""The numbers that the charts of a report show.
+
+How they are drawn is left to `charts.py`.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,9 +15,9 @@ from offboard.loadgen.table.measured_rows import Column, Rows
 from offboard.loadgen.table.predictor_evaluation import Evaluation
 from offboard.loadgen.table.table_two_figures import Score, Scored, Sides
 
-POINTS_MAX = 1000  # drawn of one series; more make the page heavy and show nothing new
-SHARE_TASKS = 20  # over which the share of the cloud is taken; half of a short run, a part of a long one
-SHARE_PARTS = 50  # of a long run
+POINTS_MAX = 1000  # points of one series that are drawn; more make the page large and show nothing new
+SHARE_TASKS = 20  # the share of the cloud is taken over this number of tasks,
+SHARE_PARTS = 50  # or over one part in 50 of a long run; over half of a short run
 
 S = TypeVar("S", float, Column)
 Picks = npt.NDArray[np.intp]
@@ -22,7 +25,7 @@ Picks = npt.NDArray[np.intp]
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """Seconds on size by least squares, through (`mean_size`, `mean_seconds`)."""
+    """Seconds as a linear function of size, through (`mean_size`, `mean_seconds`)."""
 
     slope: float
     mean_size: float
@@ -34,9 +37,9 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """The rows to draw, and the lines over all of them, between the least and the greatest size.
+    """The rows to draw, and the lines that fit all rows, from the lowest to the highest size.
 
-    `crossing`: the size at which the two lines meet, None where they never do.
+    `crossing` is the size at which the lines cross; None means that they are parallel.
     """
 
     rows: Rows
@@ -53,10 +56,11 @@ class Times:
 
 @dataclass(frozen=True, slots=True)
 class Decisions:
-    """What `policy` did with tasks in order: their number, seconds and site, as many as are drawn of `of`.
+    """What `policy` decided: number, seconds and site of the tasks to draw, in order.
 
-    `share_percent` is the share of the cloud among the latest `over` tasks; `best_percent` that of the
-    oracle, None where nobody knows the other site's time.
+    - `of`: the number of all tasks.
+    - `share_percent`: the share of the cloud among the latest `over` tasks.
+    - `best_percent`: the same share for the oracle; None where only the time of one site is known.
     """
 
     policy: str
@@ -71,7 +75,7 @@ class Decisions:
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A 95 % interval of the accuracy with one window, percent."""
+    """The 95 % interval of the accuracy with one window, in percent."""
 
     low: float
     high: float
@@ -79,7 +83,7 @@ class Interval:
 
 @dataclass(frozen=True, slots=True)
 class Accuracies:
-    """Lines with an accuracy, the first predictor's intervals by window, and the lines of constant rules."""
+    """The scores of all predictors, the intervals of the first one by window, and the constant policies."""
 
     scores: Sequence[Score]
     intervals: Mapping[str, Interval]
@@ -87,17 +91,22 @@ class Accuracies:
 
 
 def times(rows: Rows, seed: int) -> Times:
-    """Of at least one row."""
+    """The chart of execution times; there must be at least one row."""
     picks = thin(len(rows), seed)
     onboard, cloud = fit(rows.size, rows.onboard_s), fit(rows.size, rows.cloud_s)
     shown = Rows(rows.size[picks], rows.onboard_s[picks], rows.cloud_s[picks])
     return Times(
-        shown, float(rows.size.min()), float(rows.size.max()), onboard, cloud, crossing(onboard, cloud)
+        rows=shown,
+        low=float(rows.size.min()),
+        high=float(rows.size.max()),
+        onboard=onboard,
+        cloud=cloud,
+        crossing=crossing(onboard, cloud),
     )
 
 
 def fit(size: Column, seconds: Column) -> Line:
-    """Least squares over all rows; where all sizes are equal the slope is 0."""
+    """The least-squares line; its slope is 0 if all sizes are equal."""
     mean_size, mean_seconds = float(size.mean()), float(seconds.mean())
     if np.ptp(size) == 0:
         return Line(0.0, float(size[0]), mean_seconds)
@@ -108,7 +117,7 @@ def fit(size: Column, seconds: Column) -> Line:
 
 
 def crossing(onboard: Line, cloud: Line) -> float | None:
-    """The size at which two lines over the same sizes meet; None where they are parallel."""
+    """The size at which two lines over the same sizes cross; None if they are parallel."""
     slope = onboard.slope - cloud.slope
     if slope == 0:
         return None
@@ -119,24 +128,27 @@ def crossing(onboard: Line, cloud: Line) -> float | None:
 def decisions(
     policy: str, seconds: Column, to_cloud: Sides, *, first: int, seed: int, best: Sides | None = None
 ) -> Decisions:
-    """Of tasks numbered from `first`; `best`: which of them were truly faster in the cloud."""
+    """The chart of decisions.
+
+    Tasks are numbered from `first`. `best` says which tasks were really faster in the cloud.
+    """
     count = len(seconds)
     over = min(max(SHARE_TASKS, count // SHARE_PARTS), max(1, count // 2))
     picks = thin(count, seed)
     return Decisions(
-        policy,
-        picks + first,
-        seconds[picks],
-        to_cloud[picks],
-        share_percent(to_cloud, over)[picks],
-        None if best is None else share_percent(best, over)[picks],
-        over,
-        count,
+        policy=policy,
+        number=picks + first,
+        seconds=seconds[picks],
+        to_cloud=to_cloud[picks],
+        share_percent=share_percent(to_cloud, over)[picks],
+        best_percent=None if best is None else share_percent(best, over)[picks],
+        over=over,
+        of=count,
     )
 
 
 def share_percent(sides: Sides, over: int) -> Column:
-    """Share of the cloud among each task and those before it, `over` in all; NaN for the first few."""
+    """For each task, the share of the cloud among the latest `over` tasks; NaN before there are that many."""
     total = np.cumsum(sides, dtype=np.float64)
     total[over:] -= total[:-over].copy()
     total[: over - 1] = np.nan
@@ -145,7 +157,7 @@ def share_percent(sides: Sides, over: int) -> Column:
 
 
 def ecdf(seconds: Column) -> tuple[Column, Column]:
-    """Sorted times, and the percentage of tasks that took no longer; the first step starts at 0 %."""
+    """Sorted times, and the percentage of tasks that took at most this time; the first step starts at 0 %."""
     values = np.sort(seconds)
     ranks = np.unique(np.linspace(0, len(values) - 1, min(len(values), POINTS_MAX)).round().astype(np.intp))
     return np.append(values[0], values[ranks]), np.append(0.0, 100 * (ranks + 1) / len(values))
@@ -154,7 +166,7 @@ def ecdf(seconds: Column) -> tuple[Column, Column]:
 def accuracy_intervals(
     evaluation: Evaluation, scores: Iterable[Score], feedback: str, seed: int
 ) -> dict[str, Interval]:
-    """By window, for the predictor and windows of `scores`; the resamples are those of `loadgen table`."""
+    """The interval of each score, by window, from the same resamples as in `loadgen table`."""
     found: dict[str, Interval] = {}
     for line in scores:
         scored = evaluation.predictions(line.predictor, line.window, feedback)
@@ -165,7 +177,7 @@ def accuracy_intervals(
 
 
 def thin(count: int, seed: int) -> Picks:
-    """Which of `count` points to draw, in order: at random one of each of `POINTS_MAX` equal parts."""
+    """Which of `count` points to draw, in order: a random one from each of `POINTS_MAX` equal parts."""
     if count <= POINTS_MAX:
         return np.arange(count)
     edges = np.linspace(0, count, POINTS_MAX + 1).astype(np.intp)
@@ -173,7 +185,7 @@ def thin(count: int, seed: int) -> Picks:
 
 
 def _accuracy_interval(scored: Scored, seed: int) -> Interval | None:
-    """None: too few rows."""
+    """The interval of the accuracy; None if there are too few rows."""
 
     def accuracy(picks: Picks) -> dict[str, Column]:
         return {"accuracy_percent": 100 * right[picks].mean(-1)}

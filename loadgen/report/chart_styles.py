@@ -1,6 +1,6 @@
-"""How sites, policies and predictors look in charts: the same everywhere, told apart in colour and in grey.
+"""The look of sites, policies and predictors in charts, which can be told apart in colour and in grey.
 
-Drawing with them is the business of `charts`.
+Drawing is left to `charts.py`.
 """
 
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 PAPER = "paper"  # the published rule
 
-STYLE: dict[str, Any] = {  # of matplotlib
+STYLE: dict[str, Any] = {  # settings of matplotlib
     "axes.axisbelow": True,
     "axes.edgecolor": "#555555",
     "axes.grid": True,
@@ -20,7 +20,7 @@ STYLE: dict[str, Any] = {  # of matplotlib
     "axes.labelsize": 9.5,
     "axes.spines.right": False,
     "axes.spines.top": False,
-    "font.sans-serif": ["DejaVu Sans"],  # comes with matplotlib: the same layout everywhere
+    "font.sans-serif": ["DejaVu Sans"],  # is part of matplotlib, so the layout is the same everywhere
     "font.size": 9,
     "grid.color": "#e4e4e4",
     "grid.linewidth": 0.6,
@@ -30,7 +30,7 @@ STYLE: dict[str, Any] = {  # of matplotlib
     "lines.linewidth": 1.8,
     "lines.markersize": 4.5,
     "svg.fonttype": "none",  # text stays text
-    "svg.hashsalt": "offboard",  # the same ids every time
+    "svg.hashsalt": "offboard",  # the same ids in every report
     "text.parse_math": False,
     "xtick.color": "#555555",
     "xtick.labelcolor": "#222222",
@@ -41,14 +41,15 @@ STYLE: dict[str, Any] = {  # of matplotlib
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """A colour, dashes and a marker, as matplotlib takes them."""
+    """A colour, a line style and a marker, in the notation of matplotlib."""
 
     colour: str
     line: Any = "-"
     marker: str = ""
 
 
-# Told apart by colour-blind readers, at 3:1 or more against white; in grey the dashes and markers tell.
+# Colour-blind readers can tell the colours apart, and they have a contrast of at least 3:1 to white.
+# In grey, dashes and markers make the difference.
 LOOKS = {
     ONBOARD: Look("#d55e00", "--", "^"),
     CLOUD: Look("#004488", "-.", "o"),
@@ -64,14 +65,14 @@ FURTHER_LOOKS = (
     Look("#a06a00", (0, (8, 1, 2, 1))),
     Look("#6650a4", (0, (4, 1, 2, 1))),
 )
-PRINTED = Look("#666666", "--", "D")  # the paper's own figures
-NEUTRAL = Look("#444444", "-", "s")  # the key of what is drawn in several colours
+PRINTED = Look("#666666", "--", "D")  # the figures in the paper
+NEUTRAL = Look("#444444", "-", "s")  # in the legend, for series that are drawn in several colours
 
-_MARKERS = "sovPXD<>^"  # of predictors
+_MARKERS = "sovPXD<>^"  # for predictors
 
 
 def policy_look(name: str) -> Look:
-    """The same look for the same policy in every report."""
+    """The look of a policy, which is the same in every report."""
     if name in LOOKS:
         return LOOKS[name]
     further = [other for other in policies.names() if other not in LOOKS]
@@ -79,7 +80,7 @@ def policy_look(name: str) -> Look:
 
 
 def predictor_look(look: Look, at: int, count: int) -> Look:
-    """Of the `at`th of `count` predictors: a marker of its own, and a tint; the first has the full colour."""
+    """The look of predictor `at` of `count`: a marker and a tint; the first one has the full colour."""
     white = 0.55 * at / max(1, count - 1)
     parts = (int(look.colour[start : start + 2], 16) for start in (1, 3, 5))
     tint = "".join(f"{round((1 - white) * part + white * 255):02x}" for part in parts)

@@ -1,14 +1,16 @@
-"""Everything that a report says of one file of measured times, computed once."""
+"""The figures of a report on one trace or CSV file, each computed once.
+
+Captions and charts are left to `captions.py` and `charts.py`.
+"""
 
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from offboard.loadgen.report import chart_data as series
+from offboard.loadgen.report import chart_data
 from offboard.loadgen.report.chart_data import Accuracies, Decisions, Times
-from offboard.loadgen.table import replay
-from offboard.loadgen.table import table_two as evaluate
+from offboard.loadgen.table import replay, table_two
 from offboard.loadgen.table.measured_rows import Column, read_lived
 from offboard.loadgen.table.measurement_notes import read_noted
 from offboard.loadgen.table.predictor_evaluation import Evaluation
@@ -19,9 +21,10 @@ from offboard.loadgen.table.table_two_figures import Score, Sides
 
 
 class Findings:
-    """Of `source`, with the predictors of `table` and the policies, predictor, window and seed of `replay`.
+    """The figures of `source`.
 
-    `feedback` of `replay` is the mode of all but `evaluated`, which holds a table of each mode of `table`.
+    `table` names the predictors; `replay` names the policies, and their predictor, window, feedback and seed.
+    `evaluated` holds a table for each feedback mode of `table`; everything else has the mode of `replay`.
     """
 
     def __init__(self, source: Path, table: TableConfig, replay: ReplayConfig) -> None:
@@ -34,17 +37,17 @@ class Findings:
 
     @cached_property
     def times(self) -> Times | None:
-        """None: no task ran on both sites."""
-        return series.times(self.rows, self.settings.seed) if len(self.rows) else None
+        """The chart of execution times; None if no task ran on both sites."""
+        return chart_data.times(self.rows, self.settings.seed) if len(self.rows) else None
 
     @cached_property
     def evaluated(self) -> list[Table]:
-        """Table II; none where no task ran on both sites."""
-        return evaluate.tables(self._source, self.rows, self._table) if len(self.rows) else []
+        """Table II; no tables if no task ran on both sites."""
+        return table_two.tables(self._source, self.rows, self._table) if len(self.rows) else []
 
     @property
     def scores(self) -> list[Score]:
-        """The lines of Table II with predictions, and then those of rules that predict nothing."""
+        """The rows of Table II that have a score: first the predictors, then the constant policies."""
         wanted = self.settings.feedback
         lines = [
             line for table in self.evaluated if table.about["feedback"] == wanted for line in table.lines
@@ -53,32 +56,32 @@ class Findings:
 
     @cached_property
     def accuracies(self) -> Accuracies | None:
-        """None: no window leaves a row to predict."""
+        """The chart of accuracy; None if no window leaves a row to predict."""
         settings = self.settings
         predicted = [score for score in self.scores if score.predictor]
         if not predicted:
             return None
         own = [score for score in predicted if score.predictor == settings.predictor]
         evaluation = Evaluation(self.rows, self._table)
-        intervals = series.accuracy_intervals(evaluation, own, settings.feedback, settings.seed)
+        intervals = chart_data.accuracy_intervals(evaluation, own, settings.feedback, settings.seed)
         return Accuracies(predicted, intervals, [score for score in self.scores if not score.predictor])
 
     @cached_property
     def replayed(self) -> Table:
-        """The figures of each policy, and of the run as it is recorded."""
+        """The figures of each policy, and of the run as recorded."""
         (table,) = replay.tables(self._source, self.settings)
         return table
 
     @cached_property
     def decisions(self) -> Decisions | None:
-        """Those recorded, or else those of the first policy; None where there are neither."""
+        """The recorded decisions, or else those of the first policy; None if there are neither."""
         settings, lived = self.settings, self.lived
         if len(lived.waited_s):
-            return series.decisions(RECORDED, lived.waited_s, lived.to_cloud, first=1, seed=settings.seed)
+            return chart_data.decisions(RECORDED, lived.waited_s, lived.to_cloud, first=1, seed=settings.seed)
         if not len(self.scored):
             return None
         policy = settings.policies[0]
-        return series.decisions(
+        return chart_data.decisions(
             policy,
             self._spent_s(self._to_cloud[policy]),
             self._to_cloud[policy],
@@ -89,13 +92,13 @@ class Findings:
 
     @property
     def spent_s(self) -> dict[str, Column]:
-        """By policy, the times of the rows after the warm-up; the run as recorded has other tasks."""
+        """The times of the rows after the warm-up, by policy; the run as recorded has other tasks."""
         found = {policy: self._spent_s(to_cloud) for policy, to_cloud in self._to_cloud.items()}
         return found | ({RECORDED: self.lived.waited_s} if len(self.lived.waited_s) else {})
 
     @cached_property
     def _to_cloud(self) -> dict[str, Sides]:
-        """By policy, where each row after the warm-up was answered; nothing where there are none."""
+        """Which rows after the warm-up went to the cloud, by policy; empty if there are no such rows."""
         if not len(self.scored):
             return {}
         settings = self.settings

@@ -1,1 +1,1 @@
-"""Scenarios in virtual time, with the robot's own `Offloader`."""
+"""Runs scenarios in virtual time, with the robot's own `Offloader`."""

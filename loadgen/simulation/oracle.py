@@ -1,46 +1,53 @@
-"""What a site would truly take for a task that was sent there now: of oracles, not of any policy."""
+"""The oracle: what each site would really take for a task that starts now. No policy knows it."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
-from offboard.loadgen.simulation.cloud import TASK
-from offboard.loadgen.simulation.model.clock import VirtualClock
-from offboard.loadgen.simulation.model.processor import Processor
-from offboard.loadgen.simulation.model.robot_connection import Connection
-from offboard.loadgen.simulation.model.server import Server
-from offboard.loadgen.simulation.model.true_costs import Truth
+from offboard.loadgen.simulation.model.simulated_connection import SimulatedConnection
+from offboard.loadgen.simulation.model.simulated_cpu import SimulatedCpu
+from offboard.loadgen.simulation.model.simulated_direction import Message
+from offboard.loadgen.simulation.model.simulated_server import SimulatedServer
+from offboard.loadgen.simulation.model.true_costs import TrueCosts
+from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
+from offboard.loadgen.simulation.simulated_cloud import TASK
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
-Coming = tuple[float, float]  # when a request of another robot will arrive, and its CPU seconds
+Coming = tuple[float, float]  # arrival time of the request of another robot, and its CPU seconds
 
 
-def onboard_s(robot: Processor, truth: Truth, number: int) -> float:
-    """On an idle robot, beside its hogs of now."""
-    return truth.seconds(ONBOARD, number) / robot.share(1)
+@dataclass(frozen=True, slots=True)
+class Oracle:
+    """Knows the true times of the tasks of one robot, from the models of everything that they pass.
 
+    `owner` is the name of the robot: its own requests at the server are left out of the queue.
+    """
 
-def cloud_s(
-    clock: VirtualClock,
-    connection: Connection,
-    server: Server,
-    robot: Processor,
-    truth: Truth,
-    number: int,
-    *,
-    coming: Iterable[Coming],
-    without: str,
-) -> float | None:
-    """By link, server and queue as they are now, the queue without what robot `without` has there; None for
-    never. `coming` are the requests that are on their way."""
-    speed = server.processor.share(1)
-    if not (connection.up and server.up and speed):
-        return None
-    asked, now_s = truth.asked(number), clock.now_s()
-    sending_s = truth.cost.sending_s / 2 / robot.share(1)
-    what = f"{TASK}1"
-    arrives_s = connection.to_cloud.due_s(asked.bytes_out, what, number, now_s + sending_s)
-    if arrives_s is None:
-        return None
-    begins_s = server.processor.begins_s(arrives_s, coming, without=without)
-    ends_s = begins_s + truth.seconds(CLOUD, number) / speed
-    back_s = connection.to_robot.due_s(asked.bytes_in, what, number, ends_s)
-    return None if back_s is None else back_s + sending_s - now_s
+    clock: VirtualClock
+    connection: SimulatedConnection
+    server: SimulatedServer
+    robot: SimulatedCpu
+    costs: TrueCosts
+    owner: str
+
+    def onboard_s(self, number: int) -> float:
+        """The time onboard, if nothing else of the robot runs."""
+        return self.costs.seconds(ONBOARD, number) / self.robot.share(1)
+
+    def cloud_s(self, number: int, *, coming: Iterable[Coming]) -> float | None:
+        """The time in the cloud, if link, server and queue stay as they are now; None means no answer.
+
+        `coming` are requests of other robots that are on their way to the server.
+        """
+        speed = self.server.cpu.share(1)
+        if not (self.connection.up and self.server.up and speed):
+            return None
+        task, now_s = self.costs.task(number), self.clock.now_s()
+        sending_s = self.costs.cost.sending_s / 2 / self.robot.share(1)
+        request = Message(task.bytes_out, f"{TASK}1", number)
+        arrives_s = self.connection.to_cloud.due_s(request, now_s + sending_s)
+        if arrives_s is None:
+            return None
+        begins_s = self.server.cpu.begins_s(arrives_s, coming, without=self.owner)
+        ends_s = begins_s + self.costs.seconds(CLOUD, number) / speed
+        back_s = self.connection.to_robot.due_s(Message(task.bytes_in, f"{TASK}1", number), ends_s)
+        return None if back_s is None else back_s + sending_s - now_s

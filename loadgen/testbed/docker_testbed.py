@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, Self
 
 from offboard.common.errors import ConfigError, OffloadError
-from offboard.loadgen.relay.client import RelayClient, ask
 from offboard.loadgen.relay.link.link_settings import as_flags
+from offboard.loadgen.relay.relay_client import RelayClient, ask
 from offboard.loadgen.testbed import container_part as inside
 from offboard.loadgen.testbed.container_hogs import ContainerHogs
 from offboard.loadgen.testbed.container_output import Output

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, Self
 
 from offboard.common.errors import OffloadError
-from offboard.loadgen.relay.client import RelayClient
 from offboard.loadgen.relay.link.link_settings import as_flags
+from offboard.loadgen.relay.relay_client import RelayClient
 from offboard.loadgen.testbed.cpu_quota import Quota, hold
 from offboard.loadgen.testbed.part_process import (
     KILL_S,

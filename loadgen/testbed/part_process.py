@@ -18,7 +18,7 @@ from types import FrameType
 from typing import Any, NoReturn
 
 from offboard.common.errors import ConfigError, OffloadError
-from offboard.loadgen.relay.client import ask
+from offboard.loadgen.relay.relay_client import ask
 from offboard.loadgen.testbed.cpu_quota import Quota
 from offboard.loadgen.testbed.testbed import PART
 

@@ -1,4 +1,4 @@
-"""The machine's own Chromium, headless, and talking to nobody by itself."""
+"""The Chromium of this machine, headless and without background requests."""
 
 import shutil
 
@@ -18,7 +18,7 @@ FLAGS = (
 
 
 def find() -> str | None:
-    """Its path, None where there is none."""
+    """The path of Chromium; None if it is not installed."""
     return next((path for path in map(shutil.which, NAMES) if path), None)
 
 

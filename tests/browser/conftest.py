@@ -1,4 +1,4 @@
-"""A real browser, and reports to open in it."""
+"""A real browser, and the reports that it opens."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -18,7 +18,7 @@ from tests.unit.test_replay import trace_of
 
 
 class Opened:
-    """A page that was opened, every request it made, and everything it complained of."""
+    """An open page, with all of its requests, errors and warnings."""
 
     def __init__(self, page: Page) -> None:
         self.page = page
@@ -35,7 +35,7 @@ class Opened:
 
 @pytest.fixture(scope="session")
 def chromium_path() -> str:
-    """Chromium; without one the test is skipped, in CI it fails."""
+    """The path of Chromium; without it the test is skipped, and in CI it fails."""
     path = chromium.find()
     if path is None and os.environ.get("CI") == "true":
         pytest.fail(f"CI has no Chromium: none of {', '.join(chromium.NAMES)}")
@@ -44,9 +44,8 @@ def chromium_path() -> str:
     return path
 
 
-@pytest.fixture(
-    scope="module"
-)  # Playwright keeps an event loop running, which asyncio elsewhere would trip over
+# Not for the session: Playwright keeps an event loop running, which disturbs asyncio in other tests.
+@pytest.fixture(scope="module")
 def browser(chromium_path: str) -> Iterator[Browser]:
     with sync_playwright() as playwright:
         started = chromium.launch(playwright, chromium_path)
@@ -56,7 +55,7 @@ def browser(chromium_path: str) -> Iterator[Browser]:
 
 @pytest.fixture
 def opened(browser: Browser) -> Iterator[Callable[..., Opened]]:
-    """Opens an address in a context of its own; options are those of Playwright's `new_context`."""
+    """Factory: opens an address in a new context, with the options of Playwright's `new_context`."""
     made = []
 
     def factory(address: str, **options: Any) -> Opened:
@@ -73,7 +72,7 @@ def opened(browser: Browser) -> Iterator[Callable[..., Opened]]:
 
 @pytest.fixture(scope="module")
 def dataset_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of 300 rows of a CSV, with a predictor beside the one that decides."""
+    """The report on a CSV file of 300 rows, with one more predictor."""
     folder = tmp_path_factory.mktemp("dataset")
     (folder / "rows.csv").write_text(csv_of(THOUSAND[:300]))
     run_report(folder / "rows.csv", ReportConfig(out=folder, predictors=("recursive-least-squares",)))
@@ -82,7 +81,7 @@ def dataset_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def run_folder_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of a run: 60 tasks measured on both sites, then 40 decided."""
+    """The report on a run: 60 tasks measured on both sites, then 40 decided live."""
     folder = tmp_path_factory.mktemp("run")
     both = [
         ("pinned", "onboard", {"onboard": t_onboard, "cloud": t_cloud}, 0.5)
@@ -97,7 +96,7 @@ def run_folder_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def served(dataset_report: Path) -> Iterator[tuple[str, list[str]]]:
-    """The report's address on loopback, and the paths that were asked of the server."""
+    """The address of the report on loopback, and the paths that were requested from the server."""
     asked: list[str] = []
 
     class Handler(SimpleHTTPRequestHandler):

@@ -1,4 +1,7 @@
-"""A picture of a report, as docs/report.png: `python -m tests.browser.screenshot REPORT.html PICTURE.png`."""
+"""Makes a picture of a report: `python -m tests.browser.screenshot REPORT.html PICTURE.png`.
+
+docs/report.png is the picture of `loadgen report loadgen/datasets/paper.csv --predictors huber,lstm`.
+"""
 
 import io
 import sys
@@ -11,14 +14,14 @@ from tests.browser import chromium
 
 WIDTH = 1280
 MARGIN = 12
-COLOURS = 256  # a palette keeps the file small
+COLOURS = 256  # so that the file is small
 
 
 def shoot(report: Path, picture: Path) -> None:
-    """The page down to the end of its charts."""
+    """Save the top of the page, down to the end of its charts."""
     path = chromium.find()
     if path is None:
-        sys.exit(f"none of {', '.join(chromium.NAMES)} is installed")
+        sys.exit(f"this needs one of {', '.join(chromium.NAMES)}")
     with sync_playwright() as playwright:
         browser = chromium.launch(playwright, path)
         page = browser.new_page(viewport={"width": WIDTH, "height": 800}, color_scheme="light")

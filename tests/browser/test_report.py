@@ -1,4 +1,4 @@
-"""`loadgen report`, opened in a real browser."""
+"""The page of `loadgen report` in a real browser."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,11 +16,11 @@ Open = Callable[..., Opened]
 
 CHARTS = ("times", "decisions", "errors", "accuracy", "ecdf")
 PHONE, DESKTOP = {"width": 360, "height": 740}, {"width": 1280, "height": 800}
-LETTERS_PX = 7.5  # least height of a chart's letters on a phone
+LETTERS_PX = 7.5  # smallest letters of a chart on a phone
 CONTRAST = 4.5  # WCAG 2.2, level AA, for text
 PRESSES_MAX = 20
 
-# Marks with a name: how many are there, and how many of them can be seen inside their chart.
+# For each named series: the number of its marks, and how many of them are visible inside the chart.
 MARKS = """() => Object.fromEntries([...document.querySelectorAll('.chart svg g[id]')].map(group => {
   const chart = group.ownerSVGElement.getBoundingClientRect();
   const marks = [...group.querySelectorAll('use, path')].filter(mark => !mark.closest('defs'));
@@ -34,7 +34,7 @@ MARKS = """() => Object.fromEntries([...document.querySelectorAll('.chart svg g[
   return [group.id, [marks.length, seen.length]];
 }))"""
 
-# The least contrast of any text of the page with what lies behind it: [ratio, element].
+# The text with the lowest contrast to its background: [ratio, element].
 LEAST_CONTRAST = """() => {
   const parse = text => (text.match(/[\\d.]+/g) || []).map(Number);
   const luminance = ([r, g, b]) => [r, g, b].map(v => v / 255)
@@ -58,26 +58,26 @@ LEAST_CONTRAST = """() => {
   }).sort((one, other) => one[0] - other[0])[0];
 }"""
 
-# The least height of the letters in the charts, in pixels of the screen.
+# The height of the smallest letters in the charts, in pixels of the screen.
 LEAST_LETTERS = """() => Math.min(...[...document.querySelectorAll('.chart text')].map(text =>
   parseFloat(getComputedStyle(text).fontSize) * text.getScreenCTM().a || Infinity))"""
 
 
 def all_seen(page: Page) -> dict[str, int]:
-    """The number of marks of each named series, every one of which can be seen."""
+    """The number of marks of each named series; all of them must be visible."""
     found: dict[str, list[int]] = page.evaluate(MARKS)
     hidden = {name: counts for name, counts in found.items() if counts[0] != counts[1]}
-    assert hidden == {}, "series: marks, of which can be seen"
+    assert hidden == {}, "series: number of marks, number of visible marks"
     return {name: seen for name, (_, seen) in found.items()}
 
 
 def body_rows(page: Page) -> list[int]:
-    """Rows of each table's body."""
+    """The number of rows in the body of each table."""
     return [section.locator("tbody tr").count() for section in page.locator("section").all()]
 
 
-def test_opened_from_the_disk_it_asks_for_nothing(opened: Open, dataset_report: Path) -> None:
-    """The page is the only request; the console stays silent; no script and no picture is in it."""
+def test_a_page_from_the_disk_makes_no_requests(opened: Open, dataset_report: Path) -> None:
+    """The page itself is the only request; there are no warnings, no scripts, and no pictures."""
     report = opened(dataset_report.as_uri())
     assert report.requests == [dataset_report.as_uri()]
     assert report.complaints == []
@@ -85,8 +85,8 @@ def test_opened_from_the_disk_it_asks_for_nothing(opened: Open, dataset_report: 
     assert report.page.title() == f"Report on {dataset_report.parent / 'rows.csv'}"
 
 
-def test_served_it_asks_for_nothing_else(opened: Open, served: tuple[str, list[str]]) -> None:
-    """Over HTTP the server sees one request, the page."""
+def test_a_served_page_makes_no_further_requests(opened: Open, served: tuple[str, list[str]]) -> None:
+    """The server gets one request, for the page."""
     address, asked = served
     report = opened(address)
     assert report.requests == [address]
@@ -94,10 +94,10 @@ def test_served_it_asks_for_nothing_else(opened: Open, served: tuple[str, list[s
     assert report.complaints == []
 
 
-def test_its_policy_refuses_everything_from_outside(
+def test_the_content_security_policy_refuses_foreign_content(
     opened: Open, dataset_report: Path, tmp_path: Path
 ) -> None:
-    """A picture and a script that somebody puts into the page are refused, and the browser says so."""
+    """A picture and a script that are added to the page are refused, and the browser reports it."""
     text = dataset_report.read_text(encoding="utf-8")
     spoilt = tmp_path / "spoilt.html"
     outside = '<img src="http://127.0.0.1:9/x.png"><script>document.title = "run"</script></main>'
@@ -108,13 +108,13 @@ def test_its_policy_refuses_everything_from_outside(
 
 
 def test_every_chart_of_a_dataset_has_its_marks(opened: Open, dataset_report: Path) -> None:
-    """300 rows: two marks a row against d, 250 decisions, and every line, band and crossing can be seen."""
+    """Of 300 rows the page shows 300 points per site, 250 decisions, and every line, band and crossing."""
     page = opened(dataset_report.as_uri(), viewport=DESKTOP).page
     assert [figure.get_attribute("id") for figure in page.locator("figure").all()] == list(CHARTS)
     seen = all_seen(page)
     assert (seen["times-points-onboard"], seen["times-points-cloud"]) == (300, 300)
     assert seen["decisions-chosen-onboard"] + seen["decisions-chosen-cloud"] == 250
-    # A line, and a marker for each N: 500 of the paper's is more than the rows.
+    # A line, and a marker for each N. There are too few rows for N = 500, which only the paper has.
     windows = len(PAPER_WINDOWS) - 1
     for name in ("errors-mae-onboard-0", "errors-residual-cloud-1", "accuracy-accuracy-1"):
         assert seen[name] == 1 + windows, name
@@ -129,7 +129,7 @@ def test_every_chart_of_a_dataset_has_its_marks(opened: Open, dataset_report: Pa
 
 
 def test_every_chart_of_a_run_has_its_marks(opened: Open, run_folder_report: Path) -> None:
-    """60 measured and 40 decided tasks: the decisions are those recorded, and have a distribution."""
+    """Of 60 measured and 40 decided tasks the page shows the recorded decisions and their distribution."""
     seen = all_seen(opened(run_folder_report.as_uri(), viewport=DESKTOP).page)
     assert (seen["times-points-onboard"], seen["times-points-cloud"]) == (60, 60)
     assert (seen["decisions-chosen-onboard"], seen["decisions-chosen-cloud"]) == (20, 20)
@@ -138,8 +138,8 @@ def test_every_chart_of_a_run_has_its_marks(opened: Open, run_folder_report: Pat
 
 
 @pytest.mark.parametrize("viewport", [PHONE, DESKTOP], ids=["phone", "desktop"])
-def test_it_fits_the_screen(opened: Open, dataset_report: Path, viewport: Any) -> None:
-    """Nothing hangs over the edge of the page; charts fill their cards; their letters can be read."""
+def test_the_page_fits_the_screen(opened: Open, dataset_report: Path, viewport: Any) -> None:
+    """The page is not wider than the screen; charts fill their cards; letters are large enough."""
     page = opened(dataset_report.as_uri(), viewport=viewport).page
     assert page.evaluate("document.documentElement.scrollWidth") <= viewport["width"]
     for name in CHARTS:
@@ -153,29 +153,29 @@ def test_it_fits_the_screen(opened: Open, dataset_report: Path, viewport: Any) -
 
 
 def test_tables_have_their_rows_and_scroll_by_keyboard(opened: Open, dataset_report: Path) -> None:
-    """Replay, Table II twice, the paper's; a table wider than a phone is moved with the arrow keys."""
+    """The page has four tables; the arrow keys scroll a table that is wider than the screen of a phone."""
     page = opened(dataset_report.as_uri(), viewport=PHONE).page
-    table = 2 * len(PAPER_WINDOWS) + 3  # two predictors, three rules
+    table = 2 * len(PAPER_WINDOWS) + 3  # two predictors, three constant policies
     assert body_rows(page) == [4, table, table, len(PAPER_WINDOWS)]
     wide = page.locator("#table-2 .scroll")
     wide.focus()
-    for _ in range(PRESSES_MAX):  # the first may come before the page listens
+    for _ in range(PRESSES_MAX):  # the page may not listen yet
         page.keyboard.press("ArrowRight")
         page.wait_for_timeout(100)
         if wide.evaluate("element => element.scrollLeft") > 0:
             break
     else:
-        pytest.fail("the arrow key moves nothing")
+        pytest.fail("the arrow key does not scroll the table")
     page.wait_for_timeout(500)  # scrolling is smooth
     first = wide.locator("tbody th").first.bounding_box()
     frame = wide.bounding_box()
     assert first is not None
     assert frame is not None
-    assert first["x"] == frame["x"], "the first column stays where it is"
+    assert first["x"] == frame["x"], "the first column does not move"
 
 
-def test_a_run_has_a_line_for_what_was_recorded(opened: Open, run_folder_report: Path) -> None:
-    """The replay table of a run begins with the run itself."""
+def test_the_replay_table_of_a_run_has_a_recorded_row(opened: Open, run_folder_report: Path) -> None:
+    """The replay table of a run begins with the run as recorded."""
     page = opened(run_folder_report.as_uri()).page
     assert page.locator("#table-1 tbody th").all_inner_texts() == [
         *("as recorded", "paper", "onboard", "cloud", "oracle")
@@ -183,8 +183,8 @@ def test_a_run_has_a_line_for_what_was_recorded(opened: Open, run_folder_report:
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_text_stands_out(opened: Open, dataset_report: Path, scheme: str) -> None:
-    """Every text, in the charts too, has the contrast of WCAG AA; a dark screen gets a dark page."""
+def test_text_has_enough_contrast(opened: Open, dataset_report: Path, scheme: str) -> None:
+    """All text, also in the charts, has the contrast of WCAG AA; a dark colour scheme gives a dark page."""
     page = opened(dataset_report.as_uri(), color_scheme=scheme).page
     ratio, element = page.evaluate(LEAST_CONTRAST)
     assert ratio >= CONTRAST, element
@@ -192,8 +192,8 @@ def test_text_stands_out(opened: Open, dataset_report: Path, scheme: str) -> Non
     assert dark == (scheme == "dark")
 
 
-def test_charts_are_named_for_those_who_do_not_see_them(opened: Open, dataset_report: Path) -> None:
-    """The page has a language and one main heading; each chart is a picture with a name."""
+def test_charts_have_names_for_screen_readers(opened: Open, dataset_report: Path) -> None:
+    """The page has a language and one main heading, and each chart is an image with a name."""
     page = opened(dataset_report.as_uri()).page
     assert page.locator("html").get_attribute("lang") == "en"
     assert page.locator("h1").count() == 1

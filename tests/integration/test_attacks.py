@@ -16,19 +16,10 @@ import pytest
 import zmq
 
 from benchmarks import attacks
-from benchmarks.attackers import (
-    ATTACKS,
-    IDLE,
-    PLAIN_GREETING,
-    READY,
-    Target,
-    bombs,
-    curve_greeting,
-    dealer,
-    mutate,
-    request,
-    valid_messages,
-)
+from benchmarks.attack_connections import IDLE, PLAIN_GREETING, READY, curve_greeting
+from benchmarks.attack_messages import bombs, mutate, request, valid_messages
+from benchmarks.attack_target import Target, dealer
+from benchmarks.attackers import ATTACKS
 from benchmarks.keyring import Keys
 from offboard.cloud_server.rate_limit import CUT_OFF_S
 from offboard.cloud_server.server import HANDSHAKE_S

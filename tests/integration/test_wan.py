@@ -1,4 +1,4 @@
-"""The relay as a process of its own: what its link does to real sockets, and how it is changed live."""
+"""The relay as a process: what the link does to real sockets, and how it is changed while it runs."""
 
 import contextlib
 import json
@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from offboard.loadgen.relay.http_control import BODY_BYTES_MAX
-from offboard.loadgen.relay.link.jitter import SAMPLES_MAX
-from offboard.loadgen.relay.schedule import EVENTS_MAX
+from offboard.loadgen.relay.control_api import BODY_BYTES_MAX
+from offboard.loadgen.relay.link.delay_samples import SAMPLES_MAX
+from offboard.loadgen.relay.link_schedule import EVENTS_MAX
 from offboard.loadgen.relay.wan import WanConfig
 from tests.relays import QUIET_S, WAIT_S, WAN, echo, quietest, receive, round_trip_s, silent, wait_until
 
@@ -23,16 +23,18 @@ pytestmark = pytest.mark.integration
 
 
 def test_delay_is_added_to_each_direction(cloud: Any, wan: Any) -> None:
-    """15 ms each way make a round trip of 30 ms, at most 1.5 ms more at the median."""
+    """With 15 ms in each direction the median round trip takes 30 to 31.5 ms."""
     with wan(cloud(echo), "--delay-ms", "15").connect() as client:
         median_ms = 1e3 * quietest(lambda: round_trip_s(client))
     print(f"round trip {median_ms:.3f} ms")
     assert 30.0 <= median_ms <= 31.5
 
 
-def test_a_reply_of_several_chunks_is_not_held(cloud: Any, wan: Any) -> None:
-    """Over the default link 20 kB take 30.4 ms, at most 1.5 ms more at the median: their last bytes do not
-    wait for an acknowledgement of the first, which takes 40 ms."""
+def test_a_reply_of_several_chunks_is_not_delayed(cloud: Any, wan: Any) -> None:
+    """Over the default link a reply of 20 kB takes 30.4 to 31.9 ms at the median.
+
+    Its last bytes do not wait for the acknowledgement of the first ones, which would take 40 ms.
+    """
     size = 20_000
 
     def reply(connection: socket.socket) -> None:
@@ -52,9 +54,11 @@ def test_a_reply_of_several_chunks_is_not_held(cloud: Any, wan: Any) -> None:
     assert 30.4 <= median_ms <= 31.9
 
 
-def test_no_conditions_add_next_to_nothing(cloud: Any, wan: Any) -> None:
-    """Without conditions the relay itself adds less than 0.25 ms to the median round trip, both measured in
-    turns where they are quietest."""
+def test_the_relay_itself_adds_little_time(cloud: Any, wan: Any) -> None:
+    """Without conditions the relay adds less than 0.25 ms to the median round trip.
+
+    Direct and relayed connections are measured in turns, and the lowest median of each counts.
+    """
     port = cloud(echo)
     relay = wan(port, "--delay-ms", "0", "--bandwidth-mbps", "0")
     with relay.connect() as relayed, socket.create_connection(("127.0.0.1", port)) as direct:
@@ -67,8 +71,8 @@ def test_no_conditions_add_next_to_nothing(cloud: Any, wan: Any) -> None:
     assert 0 < relayed_ms - direct_ms < 0.25
 
 
-def test_bandwidth_is_kept(cloud: Any, wan: Any) -> None:
-    """5 MB at 20 Mbps take 2.0 s, plus or minus 5 %."""
+def test_the_bandwidth_is_limited(cloud: Any, wan: Any) -> None:
+    """At 20 Mbps 5 MB take 2.0 s, plus or minus 5 %."""
     size = 5_000_000
     taken_s: list[float] = []
 
@@ -85,8 +89,8 @@ def test_bandwidth_is_kept(cloud: Any, wan: Any) -> None:
     assert taken_s[0] == pytest.approx(2.0, rel=0.05)
 
 
-def test_large_streams_cross_whole_with_bounded_buffers(cloud: Any, wan: Any) -> None:
-    """20 MB through buffers of 64 KiB come back byte for byte, and in order, with jitter on."""
+def test_large_streams_arrive_complete_through_small_buffers(cloud: Any, wan: Any) -> None:
+    """With jitter and buffers of 64 KiB, 20 MB come back byte for byte and in order."""
     relay = wan(
         cloud(echo), "--delay-ms", "1", "--jitter-ms", "1", "--buffer-bytes", "65536", "--bandwidth-mbps", "0"
     )
@@ -99,7 +103,7 @@ def test_large_streams_cross_whole_with_bounded_buffers(cloud: Any, wan: Any) ->
 
 
 def test_a_slow_reader_gets_every_byte(cloud: Any, wan: Any) -> None:
-    """20 MB without conditions, more than the sockets hold, arrive byte for byte where reading lags."""
+    """A cloud that reads slowly gets 20 MB byte for byte, which is more than the sockets can hold."""
     got = bytearray()
 
     def read_slowly(connection: socket.socket) -> None:
@@ -116,7 +120,7 @@ def test_a_slow_reader_gets_every_byte(cloud: Any, wan: Any) -> None:
 
 
 def test_a_reader_that_stops_makes_the_sender_wait(cloud: Any, wan: Any) -> None:
-    """With a cloud that does not read, a sender is stopped after the buffers, not taken in without bound."""
+    """If the cloud does not read, the sender must wait as soon as the buffers are full."""
     go_on = threading.Event()
     relay = wan(cloud(lambda _: go_on.wait(WAIT_S)), "--delay-ms", "0", "--buffer-bytes", "65536")
     with relay.connect() as client:
@@ -126,11 +130,11 @@ def test_a_reader_that_stops_makes_the_sender_wait(cloud: Any, wan: Any) -> None
             while sent < 100_000_000:
                 sent += client.send(bytes(65536))
         go_on.set()
-    assert 65536 <= sent < 50_000_000  # kernel buffers of four sockets, and ours
+    assert 65536 <= sent < 50_000_000  # the kernel buffers of four sockets, and those of the relay
 
 
-def test_what_a_closing_side_had_sent_is_delivered(cloud: Any, wan: Any) -> None:
-    """A cloud that answers and closes at once: the answer arrives after its delay, then the end."""
+def test_bytes_before_a_close_are_delivered(cloud: Any, wan: Any) -> None:
+    """If the cloud answers and closes at once, the answer arrives after the delay, then the end."""
     relay = wan(cloud(lambda connection: connection.sendall(b"bye")), "--delay-ms", "40")
     with relay.connect() as client:
         start = time.perf_counter()
@@ -141,7 +145,7 @@ def test_what_a_closing_side_had_sent_is_delivered(cloud: Any, wan: Any) -> None
 
 
 def test_a_client_that_closes_ends_the_cloud_side(cloud: Any, wan: Any) -> None:
-    """The cloud gets all bytes of a client that sent and closed, then the end."""
+    """The cloud gets all bytes of a client that has closed, then the end."""
     got: list[bytes] = []
     relay = wan(cloud(lambda connection: got.append(receive(connection, 1 << 30))), "--delay-ms", "20")
     with relay.connect() as client:
@@ -152,15 +156,15 @@ def test_a_client_that_closes_ends_the_cloud_side(cloud: Any, wan: Any) -> None:
 
 
 def test_a_refusing_cloud_closes_the_client_at_once(wan: Any) -> None:
-    """When nobody listens in the cloud the client's connection ends, so that it connects again."""
+    """If nobody listens in the cloud, the connection of the client ends, so that it can connect again."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         nobody = taken.getsockname()[1]
     with wan(nobody).connect() as client, contextlib.suppress(ConnectionResetError):
         assert client.recv(1) == b""
 
 
-def test_one_connection_too_many_is_closed(cloud: Any, wan: Any) -> None:
-    """Beyond the limit a new client is closed, the ones before go on."""
+def test_a_connection_beyond_the_limit_is_closed(cloud: Any, wan: Any) -> None:
+    """The new connection is closed, and the earlier ones continue."""
     relay = wan(cloud(echo), "--connections-max", "1", "--delay-ms", "0")
     with relay.connect() as first, relay.connect() as second:
         assert second.recv(1) == b""
@@ -169,7 +173,7 @@ def test_one_connection_too_many_is_closed(cloud: Any, wan: Any) -> None:
 
 
 def test_an_outage_is_silence(cloud: Any, wan: Any) -> None:
-    """In an outage open and new connections hear nothing; what was sent is delivered afterwards."""
+    """In an outage open and new connections receive nothing; their bytes are delivered after it."""
     relay = wan(cloud(echo), "--delay-ms", "5")
     with relay.connect() as old:
         round_trip_s(old)
@@ -184,8 +188,8 @@ def test_an_outage_is_silence(cloud: Any, wan: Any) -> None:
             assert receive(new, 4) == b"new!"
 
 
-def test_an_outage_can_be_one_way(cloud: Any, wan: Any) -> None:
-    """With only the way down out, the cloud still hears the robot, which hears nothing."""
+def test_an_outage_can_be_in_one_direction(cloud: Any, wan: Any) -> None:
+    """With an outage from cloud to robot, the cloud still receives, and the robot receives nothing."""
     got: list[bytes] = []
 
     def answer(connection: socket.socket) -> None:
@@ -204,8 +208,8 @@ def test_an_outage_can_be_one_way(cloud: Any, wan: Any) -> None:
         assert receive(client, 4) == b"more"
 
 
-def test_a_changed_delay_holds_at_once(cloud: Any, wan: Any) -> None:
-    """A delay changed while a connection is open shows in its next round trips."""
+def test_a_new_delay_applies_at_once(cloud: Any, wan: Any) -> None:
+    """The next round trip of an open connection has the new delay."""
     relay = wan(cloud(echo), "--delay-ms", "0")
     with relay.connect() as client:
         assert quietest(lambda: round_trip_s(client), 4) == pytest.approx(0, abs=0.01)
@@ -226,8 +230,8 @@ def test_a_changed_delay_holds_at_once(cloud: Any, wan: Any) -> None:
         ("{", "body: not JSON"),
     ],
 )
-def test_a_bad_change_is_refused(wan: Any, body: Any, message: str) -> None:
-    """An unknown condition or a bad value is a 422 that says which and why, and changes nothing."""
+def test_a_wrong_change_is_refused(wan: Any, body: Any, message: str) -> None:
+    """An unknown condition or a wrong value gets a 422 that names it, and changes nothing."""
     relay = wan(1)
     before = relay.ask("GET", "/link")
     status, reply = relay.ask("PUT", "/link", body)
@@ -237,18 +241,18 @@ def test_a_bad_change_is_refused(wan: Any, body: Any, message: str) -> None:
 
 
 @pytest.mark.parametrize(("method", "path"), [("PUT", "/link"), ("POST", "/schedule")])
-def test_a_body_beyond_the_bound_is_refused(wan: Any, method: str, path: str) -> None:
-    """One byte too many is a 413 that names the bound, and changes nothing; as many as that are read."""
+def test_a_long_request_body_is_refused(wan: Any, method: str, path: str) -> None:
+    """A body that is one byte too long gets a 413 that names the bound; the longest allowed body is read."""
     relay = wan(1)
     before = relay.ask("GET", path)
     assert relay.ask(method, path, " " * (BODY_BYTES_MAX - 2) + "{}")[0] == 200
     status, reply = relay.ask(method, path, " " * (BODY_BYTES_MAX - 1) + "{}")
-    assert (status, reply) == (413, {"detail": "body: 4194304 bytes is the most"})
+    assert (status, reply) == (413, {"detail": "body: longer than 4194304 bytes"})
     assert relay.ask("GET", path) == before
 
 
-def test_the_largest_samples_and_schedule_fit(wan: Any) -> None:
-    """As many delays of each direction, and as many events, as are allowed; one event more is refused."""
+def test_the_longest_samples_and_schedule_are_accepted(wan: Any) -> None:
+    """The API takes the largest allowed number of delays and of events, and refuses one more event."""
     relay = wan(1)
     samples = [1 + n / 3 for n in range(SAMPLES_MAX)]
     link = relay.change(up={"samples": samples}, down={"samples": samples})
@@ -257,11 +261,11 @@ def test_the_largest_samples_and_schedule_fit(wan: Any) -> None:
     assert relay.ask("POST", "/schedule", {"event": events})[0] == 200
     status, reply = relay.ask("POST", "/schedule", {"event": [*events, {"at_s": 1}]})
     assert status == 422
-    assert reply["detail"] == "schedule: 10001 events, at most 10000 are allowed"
+    assert reply["detail"] == "schedule: 10001 events; at most 10000 are allowed"
 
 
 def test_the_api_describes_itself(wan: Any) -> None:
-    """/health answers, and OpenAPI knows /link and its conditions."""
+    """/health answers, and the OpenAPI description has /link and its conditions."""
     relay = wan(1)
     assert relay.ask("GET", "/health") == (200, {"status": "ok", "insecure": False})
     schema = relay.ask("GET", "/openapi.json")[1]
@@ -271,7 +275,7 @@ def test_the_api_describes_itself(wan: Any) -> None:
 
 @pytest.mark.parametrize("stop", [signal.SIGTERM, signal.SIGINT])
 def test_signals_end_the_relay(cloud: Any, wan: Any, stop: signal.Signals) -> None:
-    """SIGTERM and Ctrl-C end it with exit code 0, with a connection open too."""
+    """SIGTERM and Ctrl-C end the relay with exit code 0, also while a connection is open."""
     relay = wan(cloud(echo))
     with relay.connect() as client:
         round_trip_s(client)
@@ -281,7 +285,7 @@ def test_signals_end_the_relay(cloud: Any, wan: Any, stop: signal.Signals) -> No
 
 @pytest.mark.parametrize("flag", ["--listen", "--http"])
 def test_a_port_in_use_is_a_mistake_of_the_user(flag: str) -> None:
-    """A port that is taken: one line that names the flag and the port, exit code 2."""
+    """A port that is in use gives exit code 2 and one line that names the flag and the port."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         endpoint = f"127.0.0.1:{taken.getsockname()[1]}"
         command = [
@@ -300,8 +304,8 @@ def test_a_port_in_use_is_a_mistake_of_the_user(flag: str) -> None:
     assert done.stderr == f"wan: {flag}: cannot listen on {endpoint}: Address already in use\n"
 
 
-def test_a_host_that_does_not_exist_is_a_mistake_of_the_user() -> None:
-    """A host name nobody knows: one line with the flag and the reason, exit code 2."""
+def test_an_unknown_host_is_a_mistake_of_the_user() -> None:
+    """An unknown host name gives exit code 2 and one line with the flag and the reason."""
     command = [sys.executable, "-c", WAN, "--listen", "no-such-host.invalid:1"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S)
     assert done.returncode == 2
@@ -309,8 +313,8 @@ def test_a_host_that_does_not_exist_is_a_mistake_of_the_user() -> None:
     assert done.stderr.count("\n") == 1
 
 
-def test_idle_relay_is_idle(cloud: Any, wan: Any) -> None:
-    """With an open, quiet connection the relay takes at most 3 % of a CPU."""
+def test_an_idle_relay_uses_little_cpu(cloud: Any, wan: Any) -> None:
+    """With one idle connection the relay uses at most 3 % of a CPU."""
     relay = wan(cloud(echo))
     with relay.connect() as client:
         round_trip_s(client)
@@ -322,8 +326,8 @@ def test_idle_relay_is_idle(cloud: Any, wan: Any) -> None:
     assert used == pytest.approx(0, abs=0.03)
 
 
-def test_defaults_are_those_of_the_paper() -> None:
-    """15 ms each way and 400 Mbps, both directions."""
+def test_the_default_link_is_that_of_the_paper() -> None:
+    """The default is 15 ms and 400 Mbps in each direction."""
     link = WanConfig().link
     assert link.up == link.down
     assert (link.up.delay_ms, link.up.jitter_ms, link.up.bandwidth_mbps) == (15, 0, 400)

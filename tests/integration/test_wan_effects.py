@@ -1,4 +1,4 @@
-"""What the relay's further effects do to real sockets, and its schedule."""
+"""Hang, reset, truncation, loss, samples and schedules of the relay, on real sockets."""
 
 import contextlib
 import socket
@@ -19,7 +19,7 @@ from tests.relays import (
     echo,
     is_reset,
     quietest,
-    read_truth,
+    read_record,
     receive,
     round_trip_s,
     silent,
@@ -32,10 +32,10 @@ pytestmark = pytest.mark.integration
 BARE = ("--delay-ms", "0", "--bandwidth-mbps", "0")
 
 
-def test_a_hung_cloud_takes_everything_and_says_nothing(cloud: Any, wan: Any) -> None:
-    """Old and new connections are open, take more than any buffer, hear nothing; the cloud hears nothing new.
+def test_a_hanging_cloud_reads_everything_and_answers_nothing(cloud: Any, wan: Any) -> None:
+    """In a hang, old and new connections take more bytes than any buffer, and receive nothing.
 
-    When it wakes, connections that lost bytes are reset, one that lost none goes on, new ones work.
+    After it, connections that lost bytes are reset, a connection that lost none continues, and new ones work.
     """
     heard: list[bytes] = []
 
@@ -51,7 +51,7 @@ def test_a_hung_cloud_takes_everything_and_says_nothing(cloud: Any, wan: Any) ->
         relay.change(hang=True)
         with relay.connect() as new:
             for client in (old, new):
-                client.sendall(bytes(30_000_000))  # returns: it is read and lost
+                client.sendall(bytes(30_000_000))  # returns, because the relay reads and drops the bytes
                 assert silent(client)
             assert heard == [b"ping", b"ping"]
             relay.change(hang=False)
@@ -62,8 +62,8 @@ def test_a_hung_cloud_takes_everything_and_says_nothing(cloud: Any, wan: Any) ->
             round_trip_s(after)
 
 
-def test_a_hang_can_be_one_way(cloud: Any, wan: Any) -> None:
-    """With only the way down hung the cloud hears the robot; its answer is lost."""
+def test_a_hang_can_be_in_one_direction(cloud: Any, wan: Any) -> None:
+    """With a hang from cloud to robot, the cloud receives the request, and its answer is lost."""
     heard: list[bytes] = []
 
     def talk(connection: socket.socket) -> None:
@@ -81,7 +81,7 @@ def test_a_hang_can_be_one_way(cloud: Any, wan: Any) -> None:
 
 
 def test_connections_are_reset_after_a_time(cloud: Any, wan: Any) -> None:
-    """With reset_after_ms both sides see ECONNRESET, not before the time and at most 100 ms after it."""
+    """With reset_after_ms both sides get ECONNRESET, at this time or up to 100 ms later."""
     ends: list[bool] = []
 
     def talk(connection: socket.socket) -> None:
@@ -98,7 +98,7 @@ def test_connections_are_reset_after_a_time(cloud: Any, wan: Any) -> None:
 
 
 def test_the_time_of_a_reset_counts_from_the_change(cloud: Any, wan: Any) -> None:
-    """Set on an open connection, it is reset so long after the change; in an outage after its end."""
+    """The time of a reset starts when it is set; in an outage the reset comes after its end."""
     relay = wan(cloud(echo), *BARE)
     with relay.connect() as client:
         round_trip_s(client)
@@ -108,8 +108,8 @@ def test_the_time_of_a_reset_counts_from_the_change(cloud: Any, wan: Any) -> Non
         assert is_reset(client)
 
 
-def test_reset_now(cloud: Any, wan: Any) -> None:
-    """POST /reset resets every open connection, once: a new one works."""
+def test_a_reset_over_http(cloud: Any, wan: Any) -> None:
+    """POST /reset resets every open connection; a new connection works."""
     relay = wan(cloud(echo), *BARE)
     with relay.connect() as first, relay.connect() as second:
         round_trip_s(first)
@@ -122,8 +122,8 @@ def test_reset_now(cloud: Any, wan: Any) -> None:
 
 
 @pytest.mark.parametrize("size", [1, SEGMENT_BYTES, 100_001])
-def test_a_stream_is_truncated_at_the_byte(cloud: Any, wan: Any, size: int) -> None:
-    """The cloud gets exactly so many bytes, then the end; the client's connection is closed."""
+def test_a_request_is_truncated_at_the_exact_byte(cloud: Any, wan: Any, size: int) -> None:
+    """The cloud gets exactly `size` bytes, then the end, and the connection of the client is closed."""
     got: list[bytes] = []
     relay = wan(
         cloud(lambda connection: got.append(receive(connection, 1 << 30))),
@@ -139,8 +139,8 @@ def test_a_stream_is_truncated_at_the_byte(cloud: Any, wan: Any, size: int) -> N
     wait_until(lambda: relay.ask("GET", "/link")[1]["connections"] == 0)
 
 
-def test_an_answer_is_truncated_at_the_byte(cloud: Any, wan: Any) -> None:
-    """On the way down too: the client gets exactly so many bytes of each connection."""
+def test_an_answer_is_truncated_at_the_exact_byte(cloud: Any, wan: Any) -> None:
+    """The client gets exactly 7 bytes of each connection."""
     relay = wan(cloud(echo), *BARE, "--down-truncate-bytes", "7")
     for _ in range(2):
         with relay.connect() as client:
@@ -150,8 +150,8 @@ def test_an_answer_is_truncated_at_the_byte(cloud: Any, wan: Any) -> None:
             assert receive(client, 9) == b"pon"
 
 
-def test_the_end_comes_late(cloud: Any, wan: Any) -> None:
-    """With slow_close_ms the last bytes come as ever, the end 300 ms later, at most 100 ms more."""
+def test_a_slow_close_delays_the_end(cloud: Any, wan: Any) -> None:
+    """With a slow_close_ms of 300, the bytes come at once, and the end 300 to 400 ms later."""
     relay = wan(cloud(lambda connection: connection.sendall(b"bye")), *BARE, "--slow-close-ms", "300")
     with relay.connect() as client:
         assert receive(client, 3) == b"bye"
@@ -162,8 +162,8 @@ def test_the_end_comes_late(cloud: Any, wan: Any) -> None:
     assert 0.29 <= taken_s <= 0.4  # the end was sent a moment before the bytes were received here
 
 
-def test_a_lost_segment_is_a_stall(cloud: Any, wan: Any) -> None:
-    """With all segments lost the first answer takes all six timers both ways; it does come."""
+def test_a_lost_segment_stalls_the_connection(cloud: Any, wan: Any) -> None:
+    """If all segments are lost, the first answer comes after six retransmissions in each direction."""
     relay = wan(cloud(echo), *BARE, "--loss", "1", "--stall-ms", "2")
     with relay.connect() as client:
         first_ms = 1e3 * round_trip_s(client)
@@ -173,8 +173,8 @@ def test_a_lost_segment_is_a_stall(cloud: Any, wan: Any) -> None:
     assert later_ms <= 20  # the same segment is lost once
 
 
-def test_lost_segments_do_not_change_the_bytes(cloud: Any, wan: Any) -> None:
-    """3 MB with loss in bursts, correlated jitter and small buffers come back byte for byte."""
+def test_loss_does_not_change_the_bytes(cloud: Any, wan: Any) -> None:
+    """With bursts of loss, correlated jitter and small buffers, 3 MB come back byte for byte."""
     flags = ("--loss", "0.02", "--loss-burst", "5", "--stall-ms", "1", "--jitter-ms", "0.2")
     relay = wan(cloud(echo), *BARE, *flags, "--correlation", "0.5", "--buffer-bytes", "65536")
     data = b"".join(n.to_bytes(4, "big") for n in range(750_000))
@@ -185,9 +185,11 @@ def test_lost_segments_do_not_change_the_bytes(cloud: Any, wan: Any) -> None:
         sender.join()
 
 
-def test_segments_are_not_held_for_an_acknowledgement(cloud: Any, wan: Any) -> None:
-    """Of messages of two segments that come apart the second comes when due: with 5 ms +- 4 ms one way the
-    median round trip is some 7 ms; with Nagle's algorithm it would wait 40 ms for the first one's ACK."""
+def test_segments_do_not_wait_for_an_acknowledgement(cloud: Any, wan: Any) -> None:
+    """With a delay of 5 ms +- 4 ms in one direction, messages of two segments take about 7 ms at the median.
+
+    With Nagle's algorithm the second segment would wait 40 ms for the acknowledgement of the first one.
+    """
     shape = ("--down-delay-ms", "5", "--down-jitter-ms", "4", "--distribution", "uniform")
     message = bytes(2000)
     with wan(cloud(echo), *BARE, *shape).connect() as client:
@@ -204,7 +206,7 @@ def test_segments_are_not_held_for_an_acknowledgement(cloud: Any, wan: Any) -> N
 
 
 def test_samples_over_http(cloud: Any, wan: Any) -> None:
-    """A list of delays put on an open connection is drawn from at once; the link shows how many there are."""
+    """Measured delays apply to an open connection at once, and the link shows how many there are."""
     relay = wan(cloud(echo), *BARE)
     with relay.connect() as client:
         round_trip_s(client)
@@ -217,8 +219,8 @@ def test_samples_over_http(cloud: Any, wan: Any) -> None:
     assert (status, reply) == (422, {"detail": "up.samples: -1.0 is not a number from 0 to 60000"})
 
 
-def test_a_schedule_fires_in_order(cloud: Any, wan: Any, tmp_path: Path) -> None:
-    """Events of a file come in order of time, each at most 100 ms late, and GET /schedule counts them."""
+def test_a_schedule_is_played_in_order(cloud: Any, wan: Any, tmp_path: Path) -> None:
+    """The events of a file are played in order of time, at most 100 ms late; GET /schedule counts them."""
     file = tmp_path / "events.toml"
     file.write_text(
         "[[event]]\nat_s = 0.4\ndelay_ms = 3\n[[event]]\nat_s = 0.2\nup = {delay_ms = 2}\n"
@@ -230,18 +232,18 @@ def test_a_schedule_fires_in_order(cloud: Any, wan: Any, tmp_path: Path) -> None
         assert is_reset(client)
     wait_until(lambda: relay.ask("GET", "/schedule")[1]["done"] == 3)
     stop(relay)
-    found = [line for line in read_truth(truth) if line["what"] == "conditions"]
+    found = [line for line in read_record(truth) if line["what"] == "conditions"]
     shown = [(line["by"], line["up"]["delay_ms"], line["down"]["delay_ms"]) for line in found]
     assert shown == [("flag", 0, 0), ("schedule", 2, 0), ("schedule", 3, 3)]
     gaps_s = [found[1]["at_s"], found[2]["at_s"]]
-    print(f"fired at {gaps_s}")
-    start_s = gaps_s[0] - 0.2  # the schedule starts when the relay is ready, the truth a moment before
+    print(f"played at {gaps_s}")
+    start_s = gaps_s[0] - 0.2  # the schedule starts when the relay is ready, the record a moment earlier
     assert 0 <= start_s <= 1
     assert gaps_s[1] - start_s == pytest.approx(0.4, abs=0.1)
 
 
 def test_a_schedule_over_http(cloud: Any, wan: Any) -> None:
-    """POST plays events, GET shows them, DELETE forgets those left; a bad one is named."""
+    """POST plays events, GET shows them, DELETE forgets them; a wrong event is named."""
     relay = wan(cloud(echo), *BARE)
     events = [{"at_s": 0, "up": {"delay_ms": 4}}, {"at_s": 500, "hang": True}]
     status, reply = relay.ask("POST", "/schedule", {"event": events[::-1]})
@@ -261,8 +263,8 @@ def test_a_schedule_over_http(cloud: Any, wan: Any) -> None:
         ("--samples", "1\n2\nfast\n", ":3: 'fast' is not a delay in ms from 0 to 60000"),
     ],
 )
-def test_a_bad_file_is_a_mistake_of_the_user(tmp_path: Path, flag: str, text: str, message: str) -> None:
-    """A file that is wrong: one line with file, line and value, exit code 2."""
+def test_a_wrong_file_is_a_mistake_of_the_user(tmp_path: Path, flag: str, text: str, message: str) -> None:
+    """A wrong file gives exit code 2 and one line with the file, the line and the value."""
     file = tmp_path / "file"
     file.write_text(text)
     command = [sys.executable, "-c", WAN, "--listen", "127.0.0.1:0", "--http", "127.0.0.1:0", flag, str(file)]

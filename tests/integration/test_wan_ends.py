@@ -1,4 +1,4 @@
-"""How connections of the relay end: half-closed, left in a hang or an outage, reset; who gets their slot."""
+"""How connections of the relay end: half-closed, abandoned or reset, and who gets their slot."""
 
 import asyncio
 import contextlib
@@ -17,7 +17,7 @@ from tests.relays import WAIT_S, echo, is_reset, receive, round_trip_s, silent, 
 pytestmark = pytest.mark.integration
 
 BARE = ("--delay-ms", "0", "--bandwidth-mbps", "0")
-RST_AT_CLOSE = struct.pack("ii", 1, 0)  # SO_LINGER on, of no seconds
+RST_AT_CLOSE = struct.pack("ii", 1, 0)  # SO_LINGER: on, 0 seconds
 
 
 def connections(relay: Any) -> int:
@@ -30,8 +30,8 @@ def leave(client: socket.socket) -> None:
     client.close()
 
 
-def test_a_client_that_closes_its_half_hears_the_answer(cloud: Any, wan: Any) -> None:
-    """The cloud hears the end, and then says 3 MB, which arrive whole, with small buffers and a delay."""
+def test_a_client_that_closes_its_half_gets_the_answer(cloud: Any, wan: Any) -> None:
+    """The cloud receives the end and then sends 3 MB, which arrive complete through small buffers."""
     data = b"".join(n.to_bytes(4, "big") for n in range(750_000))
 
     def talk(connection: socket.socket) -> None:
@@ -47,8 +47,8 @@ def test_a_client_that_closes_its_half_hears_the_answer(cloud: Any, wan: Any) ->
     wait_until(lambda: connections(relay) == 0)
 
 
-def test_a_cloud_that_closes_its_half_still_hears(cloud: Any, wan: Any) -> None:
-    """The client hears the end after the cloud's words, and what it says then arrives; then both close."""
+def test_a_cloud_that_closes_its_half_still_receives(cloud: Any, wan: Any) -> None:
+    """The client gets the bytes and the end of the cloud, and its own bytes still arrive; then both close."""
     heard: list[bytes] = []
 
     def talk(connection: socket.socket) -> None:
@@ -65,7 +65,7 @@ def test_a_cloud_that_closes_its_half_still_hears(cloud: Any, wan: Any) -> None:
 
 
 def test_a_client_that_resets_ends_the_connection(cloud: Any, wan: Any) -> None:
-    """Also while the cloud says more than the client's socket took: the relay is not left with it."""
+    """The connection to the cloud ends, even if all buffers to the client are full."""
     ended = threading.Event()
 
     def talk(connection: socket.socket) -> None:
@@ -86,7 +86,7 @@ def test_a_client_that_resets_ends_the_connection(cloud: Any, wan: Any) -> None:
 @pytest.mark.parametrize("hang", ["hang", "up-hang", "down-hang"])
 @pytest.mark.parametrize("says", [b"", b"ping"])
 def test_a_client_that_leaves_in_a_hang_frees_its_slot(cloud: Any, wan: Any, hang: str, says: bytes) -> None:
-    """One that closes, with bytes lost or without, ends its connection while the hang lasts."""
+    """A client that closes ends its connection during the hang, whether or not bytes were lost."""
     relay = wan(cloud(echo), *BARE, "--connections-max", "1", f"--{hang}")
     for _ in range(3):
         with relay.connect() as client:
@@ -99,8 +99,8 @@ def test_a_client_that_leaves_in_a_hang_frees_its_slot(cloud: Any, wan: Any, han
         round_trip_s(client)
 
 
-def test_a_hang_that_begins_drops_an_end_under_way(cloud: Any, wan: Any) -> None:
-    """A client that had left before: its end was on its way, and is lost; so is its connection."""
+def test_a_new_hang_drops_an_end_under_way(cloud: Any, wan: Any) -> None:
+    """The end of a client that has already left is lost in the hang, and its connection is closed."""
     relay = wan(cloud(echo), "--delay-ms", "30000", "--connections-max", "1")
     relay.connect().close()
     wait_until(lambda: relay.ask("GET", "/link")[1]["accepted"] == 1)
@@ -109,8 +109,8 @@ def test_a_hang_that_begins_drops_an_end_under_way(cloud: Any, wan: Any) -> None
     wait_until(lambda: connections(relay) == 0)
 
 
-def test_a_cloud_that_ends_in_a_hang_is_silent(cloud: Any, wan: Any) -> None:
-    """With the way down hung, the client hears neither the answer nor the end, and then a reset."""
+def test_a_cloud_that_closes_in_a_hang_is_silent(cloud: Any, wan: Any) -> None:
+    """With a hang from cloud to robot, the client gets neither answer nor end, and later a reset."""
     relay = wan(cloud(lambda connection: connection.sendall(b"bye")), *BARE, "--down-hang")
     with relay.connect() as client:
         assert silent(client)
@@ -123,7 +123,7 @@ def test_a_cloud_that_ends_in_a_hang_is_silent(cloud: Any, wan: Any) -> None:
 
 @pytest.mark.parametrize("direction", ["up", "down"])
 def test_clients_that_leave_in_an_outage_make_room(cloud: Any, wan: Any, direction: str) -> None:
-    """Their connections end when their slots are needed; what those that stay said is delivered after it."""
+    """Their connections end when slots are needed; bytes of the other clients arrive after the outage."""
     relay = wan(cloud(echo), *BARE, "--connections-max", "2")
     with relay.connect() as stays:
         round_trip_s(stays)
@@ -144,7 +144,7 @@ def test_clients_that_leave_in_an_outage_make_room(cloud: Any, wan: Any, directi
             assert receive(last, 4) == b"last"
 
 
-def test_a_client_that_left_a_deaf_cloud_makes_room(cloud: Any, wan: Any) -> None:
+def test_a_client_that_left_makes_room_while_the_cloud_stays(cloud: Any, wan: Any) -> None:
     """A cloud that keeps its connections when their clients leave does not use up the slots."""
     done = threading.Event()
     ends: list[bytes] = []
@@ -161,8 +161,8 @@ def test_a_client_that_left_a_deaf_cloud_makes_room(cloud: Any, wan: Any) -> Non
     assert relay.ask("GET", "/link")[1]["refused"] == 0
 
 
-def test_who_left_with_words_under_way_keeps_the_slot(cloud: Any, wan: Any) -> None:
-    """Until they are delivered: a new client is closed instead."""
+def test_a_client_with_bytes_under_way_keeps_its_slot(cloud: Any, wan: Any) -> None:
+    """A client that has left keeps its slot until its bytes are delivered; a new client is closed."""
     got: list[bytes] = []
     relay = wan(
         cloud(lambda connection: got.append(receive(connection, 1 << 30))),
@@ -176,7 +176,7 @@ def test_who_left_with_words_under_way_keeps_the_slot(cloud: Any, wan: Any) -> N
 
 
 async def resets(host: str, port: int) -> bool:
-    """A connection to it ends by RST, maybe before it is known to be there."""
+    """Whether a connection ends by RST, maybe even before it is open."""
     try:
         reader, writer = await asyncio.open_connection(host, port)
         with contextlib.closing(writer):
@@ -185,8 +185,8 @@ async def resets(host: str, port: int) -> bool:
         return True
 
 
-def test_a_reset_before_there_is_a_socket_is_not_lost() -> None:
-    """Ordered between the accept and the socket's first turn, and while the way to the cloud is opened."""
+def test_a_reset_of_a_new_connection_is_not_lost() -> None:
+    """A reset works before the socket is set up, and while the connection to the cloud is opened."""
 
     async def play() -> list[bool]:
         found = []
@@ -212,8 +212,8 @@ def test_a_reset_before_there_is_a_socket_is_not_lost() -> None:
 
 
 @pytest.mark.parametrize("after_ms", ["1e-6", "0.05", "1"])
-def test_a_reset_that_is_due_at_once_comes(cloud: Any, wan: Any, after_ms: str) -> None:
-    """However soon after the accept it is due, every connection is reset."""
+def test_a_reset_that_is_due_at_once_is_not_lost(cloud: Any, wan: Any, after_ms: str) -> None:
+    """Every connection is reset, however soon after the accept the reset is due."""
     relay = wan(cloud(echo), *BARE, "--reset-after-ms", after_ms)
     for _ in range(20):
         with contextlib.suppress(ConnectionResetError), relay.connect() as client:

@@ -8,7 +8,7 @@ import pytest
 
 from offboard.common.command_line import load
 from offboard.common.errors import ConfigError, DataError
-from offboard.loadgen.relay.http_control import Change
+from offboard.loadgen.relay.control_api import Change
 from offboard.loadgen.relay.link.link import Link, LinkConditions
 from offboard.loadgen.relay.link.link_settings import LinkFlags, as_flags
 from offboard.loadgen.scenario.scenario_file import read_scenario
@@ -62,7 +62,7 @@ def test_samples_are_used_unless_another_distribution_is_named(tmp_path: Path) -
     assert (link.up.distribution, link.up.samples) == ("samples", (1.0, 3.0))
     assert (link.down.distribution, link.down.samples) == ("normal", ())
     assert flags("--samples", str(file), "--distribution", "uniform").link.up.distribution == "uniform"
-    with pytest.raises(ConfigError, match="samples: none are given"):
+    with pytest.raises(ConfigError, match="samples: the list is empty"):
         flags("--distribution", "samples")
 
 

@@ -9,7 +9,7 @@ from types import FrameType
 
 import pytest
 
-from benchmarks.decision import AtOnce
+from benchmarks.decision import InstantRunner
 from offboard.common.tasks import Task, task
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.offloader import Offloader
@@ -24,7 +24,7 @@ def footed(size: float) -> float:
     return size
 
 
-class Forgetful(AtOnce):
+class Forgetful(InstantRunner):
     """Late now and then, and remembers nothing."""
 
     def __init__(self, site: str) -> None:

@@ -1,4 +1,4 @@
-"""Jitter by itself: correlation that leaves the distribution alone, samples, draws by number."""
+"""Jitter: correlation that keeps the distribution, measured delays, and draws that belong to a segment."""
 
 import math
 from pathlib import Path
@@ -10,15 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from offboard.common.errors import DataError
+from offboard.loadgen.relay.link.delay_samples import SAMPLES_MAX, quantile, read_samples
 from offboard.loadgen.relay.link.draws import REPLAY_MAX, Draws, replay_from
 from offboard.loadgen.relay.link.jitter import (
     DISTRIBUTIONS,
     PARETO_SD,
     PARETO_SHAPE,
-    SAMPLES_MAX,
     Jitter,
-    quantile,
-    read_samples,
 )
 
 SEEDS = st.integers(0, 2**32)
@@ -37,7 +35,7 @@ THEORY = {
 
 @pytest.mark.parametrize("distribution", THEORY)
 def test_correlation_keeps_the_distribution(distribution: str) -> None:
-    """Every 40th of correlated draws passes the Kolmogorov-Smirnov test against the named distribution."""
+    """Every 40th correlated draw passes the Kolmogorov-Smirnov test against the named distribution."""
     jitter = Jitter("7/1/up")
     drawn = [DISTRIBUTIONS[distribution](jitter.at(n, CORRELATION)) for n in range(APART * COUNT)]
     p = scipy.stats.kstest(drawn[::APART], THEORY[distribution].cdf).pvalue
@@ -46,8 +44,8 @@ def test_correlation_keeps_the_distribution(distribution: str) -> None:
 
 
 @pytest.mark.parametrize("correlation", [0.1, 0.5, 0.9])
-def test_neighbours_correlate_as_asked(correlation: float) -> None:
-    """Normal scores at lag k correlate by correlation^k, within four standard errors (Bartlett)."""
+def test_neighbours_have_the_requested_correlation(correlation: float) -> None:
+    """Normal scores at distance k correlate by correlation^k, within four standard errors (Bartlett)."""
     jitter = Jitter("3/1/up")
     scores = scipy.stats.norm.ppf([jitter.at(n, correlation) for n in range(20_000)])
     spread = math.sqrt((1 + correlation**2) / (1 - correlation**2) / len(scores))
@@ -58,7 +56,7 @@ def test_neighbours_correlate_as_asked(correlation: float) -> None:
 
 
 def test_full_correlation_is_one_draw() -> None:
-    """At correlation 1 every segment has the draw of the first."""
+    """At correlation 1 every segment has the draw of the first segment."""
     jitter = Jitter("1/1/up")
     assert len({jitter.at(n, 1) for n in range(100)}) == 1
     assert jitter.at(100, 1) == Jitter("1/1/up").at(0)
@@ -66,7 +64,7 @@ def test_full_correlation_is_one_draw() -> None:
 
 @given(seed=SEEDS, asked=st.lists(st.tuples(st.integers(0, 3000), st.sampled_from([0, 0.3, 0.95, 1]))))
 def test_a_draw_belongs_to_its_segment(seed: int, asked: list[tuple[int, float]]) -> None:
-    """Whatever was asked before, with whatever correlation, a segment's draw is that of a fresh start."""
+    """The draw of a segment does not depend on earlier questions, or on their correlation."""
     used = Jitter(f"{seed}/1/up")
     for number, correlation in asked:
         used.at(number, correlation)
@@ -77,8 +75,8 @@ def test_a_draw_belongs_to_its_segment(seed: int, asked: list[tuple[int, float]]
 
 
 @given(seed=SEEDS, number=st.integers(0, 200_000))
-def test_skipping_is_drawing(seed: int, number: int) -> None:
-    """A number far ahead is the same as after all those before it."""
+def test_skipped_draws_change_nothing(seed: int, number: int) -> None:
+    """A segment far ahead has the same draw as if all segments before it had been drawn."""
     ahead, one_by_one = Draws(str(seed)), Draws(str(seed))
     for n in range(number % 1000):
         one_by_one.at(n)
@@ -86,7 +84,7 @@ def test_skipping_is_drawing(seed: int, number: int) -> None:
 
 
 def test_a_replay_is_bounded() -> None:
-    """Going back ends where rounding does, and at REPLAY_MAX for a memory of nearly 1."""
+    """A replay starts where earlier segments are below the rounding error, at most REPLAY_MAX back."""
     assert replay_from(1_000_000, 0) == 1_000_000
     assert replay_from(1_000_000, 0.5) == 1_000_000 - 53
     assert replay_from(1_000_000, 1 - 1e-12) == 1_000_000 - REPLAY_MAX
@@ -94,7 +92,7 @@ def test_a_replay_is_bounded() -> None:
 
 
 def test_samples_are_drawn_equally_often(tmp_path: Path) -> None:
-    """Draws of a file's delays have its empirical distribution (chi-square over the values)."""
+    """Each delay of a file is drawn equally often (chi-square test over the values)."""
     file = tmp_path / "delays"
     file.write_text("30\n5.5\n\n12\n5.5\n")
     samples = read_samples(file)
@@ -115,12 +113,12 @@ def test_samples_are_drawn_equally_often(tmp_path: Path) -> None:
         ("1\n2\n-3\n", ":3: '-3' is not a delay in ms from 0 to 60000"),
         ("nan", ":1: 'nan' is not a delay in ms from 0 to 60000"),
         ("60001", ":1: '60001' is not a delay in ms from 0 to 60000"),
-        ("\n \n", ": holds no delays"),
-        ("1\n" * (SAMPLES_MAX + 1), f":{SAMPLES_MAX + 1}: '1' is one too many, at most {SAMPLES_MAX}"),
+        ("\n \n", ": the file holds no delays"),
+        ("1\n" * (SAMPLES_MAX + 1), f":{SAMPLES_MAX + 1}: '1' is one delay too many; at most {SAMPLES_MAX}"),
     ],
 )
 def test_a_bad_file_of_samples_is_one_line(tmp_path: Path, text: str, message: str) -> None:
-    """A file that is no list of delays is refused with file, line and value."""
+    """A file that is not a list of delays is refused; the error names file, line and value."""
     file = tmp_path / "delays"
     file.write_text(text)
     with pytest.raises(DataError) as caught:
@@ -130,6 +128,6 @@ def test_a_bad_file_of_samples_is_one_line(tmp_path: Path, text: str, message: s
 
 
 def test_a_missing_file_of_samples_is_named(tmp_path: Path) -> None:
-    """A file that is not there is refused with its name."""
+    """The error names a file that does not exist."""
     with pytest.raises(DataError, match="nowhere: No such file or directory"):
         read_samples(tmp_path / "nowhere")

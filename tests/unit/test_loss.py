@@ -1,4 +1,4 @@
-"""Loss by itself: how many segments are lost, in which bursts, how often again."""
+"""Loss: how many segments are lost, in which bursts, and how often a retransmission is lost."""
 
 import itertools
 import math
@@ -26,7 +26,7 @@ def lengths(lost: list[bool]) -> list[int]:
 
 
 def test_independent_loss_is_binomial() -> None:
-    """At 2 % the lost of 100,000 segments lie within the binomial interval of 99.9 %."""
+    """At 2 % loss, the number of lost segments lies within its 99.9 % binomial interval."""
     count = sum(lost("1/1/up", SHARE, 1))
     low, high = scipy.stats.binom.interval(0.999, COUNT, SHARE)
     print(f"{count} lost, {low:.0f} to {high:.0f} expected")
@@ -34,7 +34,7 @@ def test_independent_loss_is_binomial() -> None:
 
 
 def test_independent_loss_has_no_memory() -> None:
-    """A segment after a lost one is lost as often as any other: within the binomial interval of 99.9 %."""
+    """A segment after a lost one is lost as often as any other, within the 99.9 % binomial interval."""
     found = lost("2/1/up", 0.2, 1)
     after = [now for before, now in itertools.pairwise(found) if before]
     low, high = scipy.stats.binom.interval(0.999, len(after), 0.2)
@@ -44,11 +44,11 @@ def test_independent_loss_has_no_memory() -> None:
 
 @pytest.mark.parametrize(("share", "burst"), [(SHARE, 2.0), (SHARE, 8.0), (0.3, 4.0)])
 def test_bursts_have_the_stated_share_and_mean_length(share: float, burst: float) -> None:
-    """Gilbert's two states: share and mean burst length within four standard errors of theory."""
+    """Share and mean burst length lie within four standard errors of the values of Gilbert's model."""
     found = lost("3/1/up", share, burst)
     runs = lengths(found)
     ends, begins = 1 / burst, share / burst / (1 - share)
-    memory = 1 - ends - begins  # correlation of neighbours, which widens the interval of the share
+    memory = 1 - ends - begins  # correlation of neighbours; it widens the interval of the share
     spread = math.sqrt(share * (1 - share) / COUNT * (1 + memory) / (1 - memory))
     print(f"share {sum(found) / COUNT:.4f}, mean burst {sum(runs) / len(runs):.3f} of {len(runs)}")
     assert sum(found) / COUNT == pytest.approx(share, abs=4 * spread)
@@ -57,7 +57,7 @@ def test_bursts_have_the_stated_share_and_mean_length(share: float, burst: float
 
 
 def test_a_retransmission_is_lost_with_the_same_share() -> None:
-    """Of the segments lost once, the share `loss` is lost a second time; none more often than the bound."""
+    """The share `loss` of lost segments is lost again; no segment is lost more often than the bound."""
     state = Loss("4/1/up")
     times = [found for n in range(COUNT) if (found := state.times(n, 0.3, 1))]
     again = sum(found > 1 for found in times)
@@ -69,12 +69,12 @@ def test_a_retransmission_is_lost_with_the_same_share() -> None:
 
 
 def test_the_stall_doubles() -> None:
-    """The timer starts at 200 ms and doubles: 200, 600, 1400, ... in all."""
+    """The timer starts at 200 ms and doubles, so the stalls are 200, 600, 1400 ms, and so on."""
     assert [stall_ms(times, 200.0) for times in range(4)] == [0, 200, 600, 1400]
 
 
 def test_without_loss_nothing_is_lost() -> None:
-    """At 0 no segment is lost, whatever the burst."""
+    """At a loss of 0 no segment is lost, whatever the burst length."""
     assert not any(lost("6/1/up", 0.0, 5, 1000))
 
 
@@ -82,7 +82,7 @@ def test_without_loss_nothing_is_lost() -> None:
 def test_a_loss_belongs_to_its_segment(
     seed: int, asked: list[tuple[int, tuple[float, float]]], rates: tuple[float, float]
 ) -> None:
-    """Whatever the rates were before, a segment is lost as if they had always been these."""
+    """Whether a segment is lost does not depend on earlier rates."""
     used, fresh = Loss(f"{seed}/1/up"), Loss(f"{seed}/1/up")
     for number, (loss, burst) in asked:
         used.times(number, loss, burst)

@@ -1,4 +1,4 @@
-"""Simulated scenarios: the same run each time, times that can be added up by hand, and nothing lost."""
+"""Simulated scenarios: runs that can be repeated, times that can be computed by hand, and no lost tasks."""
 
 import time
 from collections.abc import Callable
@@ -12,11 +12,11 @@ from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.outcome_figures import FIGURES
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario, shipped
-from offboard.loadgen.simulation.batch import Batch
-from offboard.loadgen.simulation.model.costs import DECIDING_CPU_S, HASH, START_S
-from offboard.loadgen.simulation.model.simulated_tasks import Tasks, find_tasks
-from offboard.loadgen.simulation.run import simulate
-from offboard.loadgen.simulation.world import check_simulated
+from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks, find_tasks
+from offboard.loadgen.simulation.model.task_costs import DECIDING_CPU_S, HASH, START_S
+from offboard.loadgen.simulation.simulated_run import simulate
+from offboard.loadgen.simulation.simulated_testbed import check_simulated
+from offboard.loadgen.simulation.simulation_pool import SimulationPool
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client.sites.cloud_socket import RECONNECT_MAX_MS
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
@@ -47,7 +47,7 @@ CLOSED = [
 
 @pytest.fixture
 def read(tmp_path: Path) -> Callable[..., Scenario]:
-    """Reads a scenario of the head above and what is given."""
+    """Reads a scenario that consists of HEAD and the given text."""
 
     def factory(text: str = "", workload: str = "", sizes: str = "uniform:1000:30000") -> Scenario:
         path = tmp_path / "small.toml"
@@ -57,8 +57,8 @@ def read(tmp_path: Path) -> Callable[..., Scenario]:
     return factory
 
 
-def tasks_of(scenario: Scenario) -> dict[str, Tasks]:
-    """Those of its robots, all alike."""
+def tasks_of(scenario: Scenario) -> dict[str, RobotTasks]:
+    """The tasks of its robots; all robots have the same workload."""
     workload = scenario.workload
     return {name: find_tasks(workload, scenario.seed, workload.tasks) for name in scenario.robots()}
 
@@ -79,24 +79,24 @@ def cloud_s(rounds: float, bytes_moved: int) -> float:
 @pytest.mark.parametrize("policy", ["paper", "hedge:probe:greedy", "thompson", "epsilon"])
 @pytest.mark.parametrize("arrivals", ["", 'arrivals = "bursts"\nrate = 12\nburst = 6'])
 def test_a_seed_gives_the_same_run(read: Callable[..., Scenario], policy: str, arrivals: str) -> None:
-    """To the bit, also with several tasks at a time; another seed gives another run."""
+    """Two runs of a seed are equal, also with several tasks at a time; another seed gives another run."""
     scenario = read("jitter_ms = 5\n", workload=arrivals)
     assert played(scenario, policy) == played(scenario, policy)
     assert played(scenario, policy) != played(scenario.changed(seed=2), policy)
 
 
 def test_the_number_of_processes_changes_nothing(read: Callable[..., Scenario]) -> None:
-    """What two of them play is what one plays."""
+    """Two processes give the same outcomes as one process."""
     seeds = [read().changed(seed=seed) for seed in (1, 2, 3)]
     strategies = {"paper": {"policy": "paper"}, "cloud": {"policy": "cloud"}}
-    with Batch(1) as one, Batch(2) as two:
+    with SimulationPool(1) as one, SimulationPool(2) as two:
         assert one.play(seeds, strategies) == two.play(seeds, strategies)
 
 
-def test_constant_policies_take_what_can_be_added_up(read: Callable[..., Scenario]) -> None:
-    """Without noise: CPU over quota onboard, and in the cloud the way there, the work, and the way back."""
+def test_times_of_constant_policies_by_hand(read: Callable[..., Scenario]) -> None:
+    """Without noise, onboard takes CPU time over quota, and the cloud takes the round trip plus the work."""
     scenario = read()
-    asked = tasks_of(scenario)[ROBOT].asked
+    asked = tasks_of(scenario)[ROBOT].tasks
     for policy, expected in (
         ("onboard", [onboard_s(one.work[ONBOARD]) for one in asked]),
         ("cloud", [cloud_s(one.work[CLOUD], one.bytes_out + one.bytes_in) for one in asked]),
@@ -105,8 +105,8 @@ def test_constant_policies_take_what_can_be_added_up(read: Callable[..., Scenari
         assert [one.response_s for one in run.answered] == pytest.approx(expected, abs=1e-9), policy
 
 
-def test_references_are_what_each_site_alone_takes(read: Callable[..., Scenario]) -> None:
-    """With noise and jitter too: the constant policies' own times are those of everybody's references."""
+def test_references_are_the_times_of_each_site_alone(read: Callable[..., Scenario]) -> None:
+    """With noise and jitter too, the references of a policy are the times of the constant policies."""
     scenario = read("jitter_ms = 5\nloss = 0.02\n")
     alone = {site: played(scenario, site) for site in ("onboard", "cloud")}
     for number, one in enumerate(played(scenario, "greedy").references):
@@ -114,20 +114,20 @@ def test_references_are_what_each_site_alone_takes(read: Callable[..., Scenario]
             assert one.seconds[site] == pytest.approx(run.answered[number].response_s, abs=1e-9)
 
 
-def test_the_figure_is_of_what_the_robot_waited(read: Callable[..., Scenario]) -> None:
-    """Mean time over mean time of the better site; a policy that measures both waits for the slower one."""
+def test_the_reference_of_the_policy_is_the_waited_time(read: Callable[..., Scenario]) -> None:
+    """A robot that measures both sites waits for the slower one, and `sent_s` says so."""
     run = played(read(workload="measure = 60"), noise=0.0)
     for answered, one in zip(run.answered, run.references, strict=True):
         assert one.sent_s == answered.response_s
         assert answered.response_s == pytest.approx(max(one.seconds.values()), abs=1e-9)
 
 
-def test_an_outage_times_out_and_ends(read: Callable[..., Scenario]) -> None:
-    """Each task waits for its timeout and runs onboard; after it the cloud answers as before."""
+def test_tasks_in_an_outage_time_out(read: Callable[..., Scenario]) -> None:
+    """In an outage a task waits for its timeout and runs onboard; after it the cloud answers again."""
     scenario = read(
         "[[event]]\nat_task = 20\nlink = {outage = true}\n[[event]]\nat_task = 24\nlink = {outage = false}\n"
     )
-    asked = tasks_of(scenario)[ROBOT].asked
+    asked = tasks_of(scenario)[ROBOT].tasks
     run = played(scenario, "cloud", noise=0.0)
     for number, one in enumerate(run.answered):
         expected = cloud_s(asked[number].work[CLOUD], asked[number].bytes_out + asked[number].bytes_in)
@@ -135,13 +135,13 @@ def test_an_outage_times_out_and_ends(read: Callable[..., Scenario]) -> None:
             assert one.sites == ("cloud", "onboard")
             expected = 0.5 + onboard_s(asked[number].work[ONBOARD])
             assert run.references[number].given_up_s["cloud"] > 0.5
-        # The server may still be at what it was sent in the outage.
+        # The server may still run the request that arrives at the end of the outage.
         behind = HASH.cpu_s(asked[20].work[CLOUD]) if number == 24 else 0.0
         assert expected - 1e-9 <= one.response_s <= expected + behind + 1e-9
 
 
-def test_a_dead_server_is_no_candidate_and_comes_back(read: Callable[..., Scenario]) -> None:
-    """What is in flight when it dies fails at once; tasks stay onboard until it is warm and connected."""
+def test_a_dead_server_is_not_used_until_it_is_back(read: Callable[..., Scenario]) -> None:
+    """A crash fails the task in flight at once; tasks run onboard until the server is warm and connected."""
     scenario = read(
         "[[event]]\nat_s = 1.0\nkill = 'cloud'\n[[event]]\nat_s = 1.5\nstart = 'cloud'\n",
         sizes="constant:30000",
@@ -159,8 +159,8 @@ def test_a_dead_server_is_no_candidate_and_comes_back(read: Callable[..., Scenar
     assert all("cloud" not in run.references[one.i].seconds for one in between)
 
 
-def test_other_robots_make_a_queue(read: Callable[..., Scenario]) -> None:
-    """Beside three others the cloud takes longer, and while they are paused as long as alone."""
+def test_other_robots_slow_the_cloud_down(read: Callable[..., Scenario]) -> None:
+    """With three other robots the cloud takes longer; while they are paused, it takes as long as alone."""
     few = {"workload": "robots = 4", "sizes": "constant:60000"}
     paused = "".join(f"[[event]]\nat_task = 0\npause = 'robot-{n}'\n" for n in (2, 3, 4))
     alone, busy, quiet = (
@@ -173,16 +173,16 @@ def test_other_robots_make_a_queue(read: Callable[..., Scenario]) -> None:
 
 
 def test_measured_tasks_run_on_both_sites(read: Callable[..., Scenario]) -> None:
-    """As the workload asks, whatever the policy."""
+    """The first `measure` tasks run on both sites, whatever the policy."""
     run = played(read(workload="measure = 4"), "onboard")
     assert [len(one.sites) for one in run.answered[:6]] == [2, 2, 2, 2, 1, 1]
 
 
-@pytest.mark.timeout(60)  # plans are truly planned, once
-def test_shipped_scenarios_play() -> None:
-    """Every one with tasks that follow each other: nothing is lost, and no rule beats the oracle by far."""
+@pytest.mark.timeout(60)  # the real planner plans every task once
+def test_all_shipped_scenarios_can_be_simulated() -> None:
+    """With closed arrivals no task is lost, and no policy is much faster than the oracle."""
     strategies = {name: {"policy": name} for name in ("paper", "hedge:probe:greedy")}
-    with Batch(1) as batch:
+    with SimulationPool(1) as batch:
         for name in CLOSED:
             scenario = read_scenario(find_scenario(name))
             check_simulated(scenario)
@@ -193,18 +193,18 @@ def test_shipped_scenarios_play() -> None:
                 assert 0.95 < over < 3, (name, policy, over)
 
 
-def test_plans_cost_what_their_planner_takes() -> None:
-    """The same tasks are less work by a faster planner, and each unit of it takes longer."""
+def test_the_cost_of_a_plan_depends_on_its_planner() -> None:
+    """A faster planner takes less CPU time for a task, although each unit of its work takes longer."""
     workload = read_scenario(find_scenario("calm")).workload
     level, quick = (find_tasks(replace(workload, planner=name), 1, 5) for name in ("dijkstra", "jps"))
-    assert [one.size for one in quick.asked] == [one.size for one in level.asked]
-    assert quick.cost.s_a_unit > level.cost.s_a_unit
-    for one, other in zip(quick.asked, level.asked, strict=True):
+    assert [one.size for one in quick.tasks] == [one.size for one in level.tasks]
+    assert quick.cost.s_per_unit > level.cost.s_per_unit
+    for one, other in zip(quick.tasks, level.tasks, strict=True):
         assert quick.cost.cpu_s(one.work[CLOUD]) < level.cost.cpu_s(other.work[CLOUD])
 
 
-def test_simulated_time_is_not_waited_for() -> None:
-    """A run takes less computing than what it plays, though it plays a robot with a tenth of a CPU."""
+def test_a_simulation_is_faster_than_real_time() -> None:
+    """Simulating a run takes less CPU time than the run lasts, though its robot has a tenth of a CPU."""
     scenario = read_scenario(find_scenario("nonlinear"))
     tasks = tasks_of(scenario)
     began_s = time.thread_time()
@@ -215,19 +215,20 @@ def test_simulated_time_is_not_waited_for() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("[[event]]\nat_task = 3\nkill = 'robot'\n", "event kill of robot is for real processes"),
-        ("[[event]]\nat_s = 3\npause = 'wan'\n", "event pause of wan is for real processes"),
-        ("truncate_bytes = 900\n", "link condition truncate_bytes = 900 is for real connections"),
-        ("[[event]]\nat_s = 3\nlink = {reset_after_ms = 50}\n", "link condition reset_after_ms = 50 is"),
+        ("[[event]]\nat_task = 3\nkill = 'robot'\n", "event kill of robot needs real processes"),
+        ("[[event]]\nat_s = 3\npause = 'wan'\n", "event pause of wan needs real processes"),
+        ("truncate_bytes = 900\n", "link condition truncate_bytes = 900 needs real connections"),
+        ("[[event]]\nat_s = 3\nlink = {reset_after_ms = 50}\n", "link condition reset_after_ms = 50 needs"),
     ],
 )
-def test_what_has_no_counterpart_is_one_line(read: Callable[..., Scenario], text: str, said: str) -> None:
+def test_what_cannot_be_simulated_is_refused(read: Callable[..., Scenario], text: str, said: str) -> None:
+    """The error names the event or the link condition that needs real processes or connections."""
     with pytest.raises(ConfigError, match=f"^scenario small cannot be simulated: {said}"):
         check_simulated(read(text))
 
 
-def test_a_task_of_unknown_cost_is_one_line(read: Callable[..., Scenario]) -> None:
-    """How long it takes would have to be made up."""
+def test_a_task_of_unknown_cost_is_refused(read: Callable[..., Scenario]) -> None:
+    """The error lists the tasks whose costs are known."""
     workload = replace(read().workload, task="tests.probes:zeros")
     with pytest.raises(ConfigError, match=r"task zeros cannot be simulated: only the costs of plan_path"):
         find_tasks(workload, 1, 3)

@@ -1,4 +1,4 @@
-"""`loadgen compare --simulate`: its tables in every format, and one line for what cannot be."""
+"""`loadgen compare --simulate`: its tables in every format, and its errors."""
 
 import csv
 import io
@@ -24,7 +24,7 @@ FEW = ("--seeds", "2", "--tasks", "40", "--from-task", "10", "--jobs", "1")
 
 @pytest.fixture
 def printed(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """What the command prints for two scenarios with these flags."""
+    """Runs the command for two scenarios with these flags; returns what it prints."""
 
     def run(*flags: str) -> str:
         assert main([*TABLES, *FEW, *flags]) == 0
@@ -34,7 +34,7 @@ def printed(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
 
 
 def test_a_table_over_all_scenarios_comes_first(printed: Callable[..., str]) -> None:
-    """A line a policy with mean, worst and every scenario; then a table of each scenario."""
+    """The summary has a row for each policy, with mean, worst and every scenario; a table of each follows."""
     tables = json.loads(printed("--format", "json"))["tables"]
     summary, *each = tables
     assert [line["policy"] for line in summary["scores"]] == ["cloud", "hedge:probe:greedy@average"]
@@ -53,8 +53,8 @@ def test_a_table_over_all_scenarios_comes_first(printed: Callable[..., str]) -> 
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_every_format_holds_it(printed: Callable[..., str], format: str) -> None:
-    """Twice the same, to the letter."""
+def test_every_format_can_be_repeated(printed: Callable[..., str], format: str) -> None:
+    """Two runs print the same text, in every format."""
     text = printed("--format", format)
     assert text == printed("--format", format)
     if format == "csv":
@@ -63,15 +63,15 @@ def test_every_format_holds_it(printed: Callable[..., str], format: str) -> None
         assert {row["scenario"] for row in csv.DictReader(io.StringIO(second))} == {"nonlinear", "heavy-tail"}
 
 
-def test_one_scenario_needs_no_summary(capsys: pytest.CaptureFixture[str]) -> None:
-    """Its own table says it all."""
+def test_one_scenario_has_no_summary(capsys: pytest.CaptureFixture[str]) -> None:
+    """For one scenario, only its own table is printed."""
     assert main(["compare", "nonlinear", "--simulate", "--policies", "onboard", "--tasks", "30"]) == 0
     out = capsys.readouterr().out
     assert out.startswith("Scenario nonlinear in simulation: 3 runs of each policy with seeds 1 to 3")
 
 
 def test_a_scenario_without_an_oracle_is_left_out_of_the_mean() -> None:
-    """Tasks that come whatever was answered have no better site each."""
+    """Open arrivals have no oracle, so their scenario has no figure and does not count in the mean."""
     table: Table = summary_table({"paper": {"calm": 1.2, "burst": None, "outage": 1.4}}, "all")
     assert "| paper | 1.300 | 1.400 | 1.200 | – | 1.400 |" in render([table], "md")  # noqa: RUF001
 
@@ -91,10 +91,10 @@ def test_a_scenario_without_an_oracle_is_left_out_of_the_mean() -> None:
         (["calm", "--simulate", "--from-task", "500"], "--from-task: 500 is not among the 120 tasks"),
     ],
 )
-def test_what_cannot_be_is_one_line(
+def test_wrong_flags_are_one_line(
     capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
 ) -> None:
-    """Exit code 2, and nothing on stdout."""
+    """A mistake of the user is one line on stderr and exit code 2; stdout stays empty."""
     assert main(["compare", *arguments]) == 2
     shown = capsys.readouterr()
     assert shown.out == ""

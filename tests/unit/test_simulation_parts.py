@@ -1,7 +1,6 @@
-"""The parts of a simulation: virtual time, a shared CPU, one way of a link, and races on them by hand."""
+"""The parts of a simulation: CPU, server, link and onboard times, and races that can be computed by hand."""
 
 from collections.abc import Callable
-from concurrent.futures import Future
 from pathlib import Path
 
 import pytest
@@ -12,14 +11,13 @@ from offboard.loadgen.relay.link.link import LinkConditions
 from offboard.loadgen.scenario.event_timeline import Event
 from offboard.loadgen.scenario.scenario import CloudPart
 from offboard.loadgen.scenario.scenario_file import read_scenario
-from offboard.loadgen.simulation.model.clock import VirtualClock
-from offboard.loadgen.simulation.model.costs import HASH
-from offboard.loadgen.simulation.model.lockstep import LockstepClock
-from offboard.loadgen.simulation.model.one_way import Way
-from offboard.loadgen.simulation.model.processor import Processor, Run
-from offboard.loadgen.simulation.model.server import Server
+from offboard.loadgen.simulation.model.simulated_cpu import Run, SimulatedCpu
+from offboard.loadgen.simulation.model.simulated_direction import Message, SimulatedDirection
+from offboard.loadgen.simulation.model.simulated_server import SimulatedServer
 from offboard.loadgen.simulation.model.simulated_tasks import find_tasks
-from offboard.loadgen.simulation.world import World
+from offboard.loadgen.simulation.model.task_costs import HASH
+from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
+from offboard.loadgen.simulation.simulated_testbed import SimulatedTestbed
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client import predictors
 from offboard.robot_client.offloader import Offloader
@@ -42,198 +40,149 @@ ONBOARD_S = HASH.cpu_s(40000) / 0.2
 CLOUD_S = HASH.sending_s / 0.2 + 0.030 + HASH.cpu_s(40000)
 
 
-def test_waiting_ends_with_the_first_future_or_the_time() -> None:
-    """Events happen in order, those of one instant as they were set, and none after the wait is over."""
-    clock, seen, done = VirtualClock(), [], Future[None]()
-    for name, due_s in (("c", 3.0), ("a", 1.0), ("b", 1.0)):
-        clock.at(due_s, lambda name=name: seen.append(name))
-    clock.at(2.0, lambda: done.set_result(None))
-    clock.wait([Future(), done], 9.0)
-    assert (clock.now_s(), seen) == (2.0, ["a", "b"])
-    clock.wait([done])
-    assert clock.now_s() == 2.0
-    clock.wait([Future()], 0.5)
-    assert (clock.now_s(), seen) == (2.5, ["a", "b"])
-    clock.pass_by(1.5)
-    assert (clock.now_s(), seen) == (4.0, ["a", "b", "c"])
-
-
-def test_askers_run_one_at_a_time_in_order() -> None:
-    """Each until it waits; those that wait for one event go on in the order in which they began."""
-    clock, seen, gate = LockstepClock(), [], Future[None]()
-
-    def asker(name: str, seconds: float) -> Callable[[], None]:
-        def ask() -> None:
-            seen.append(f"{name} at {clock.now_s():g}")
-            clock.pass_by(seconds)
-            seen.append(f"{name} at {clock.now_s():g}")
-            clock.wait([gate])
-            seen.append(f"{name} at {clock.now_s():g}")
-
-        return ask
-
-    clock.begin(asker("a", 2.0))
-    clock.begin(asker("b", 1.0))
-    clock.at(5.0, lambda: gate.set_result(None))
-    clock.pass_by(9.0)
-    assert seen == ["a at 0", "b at 0", "b at 1", "a at 2", "b at 5", "a at 5"]
-
-
-def test_what_an_asker_raises_is_raised_to_whoever_lets_time_go_by() -> None:
-    """Nothing fails unseen in a thread."""
-    clock = LockstepClock()
-
-    def ask() -> None:
-        clock.pass_by(1.0)
-        raise ValueError("seen")
-
-    clock.begin(ask)
-    with pytest.raises(ValueError, match="seen"):
-        clock.pass_by(2.0)
-
-
 def test_work_shares_the_quota_with_hogs() -> None:
-    """A second of work takes two on half a CPU; while a hog is there, twice as long."""
+    """A second of work takes 2 s on half a CPU, and twice as long while there is a hog."""
     clock, ended = VirtualClock(), []
-    processor = Processor(clock, cpus=0.5)
+    cpu = SimulatedCpu(clock, cpus=0.5)
     for _ in range(2):
-        processor.add(1.0, lambda run: ended.append((run.added_s, run.begun_s, clock.now_s())))
-    clock.at(1.0, lambda: processor.change(hogs=1))
-    clock.at(3.0, lambda: processor.change(hogs=0))
+        cpu.add(1.0, lambda run: ended.append((run.added_s, run.begun_s, clock.now_s())))
+    clock.at(1.0, lambda: cpu.change(hogs=1))
+    clock.at(3.0, lambda: cpu.change(hogs=0))
     clock.pass_by(9.0)
     assert ended == [(0.0, 0.0, pytest.approx(3.0)), (0.0, pytest.approx(3.0), pytest.approx(5.0))]
-    assert (processor.own_s, processor.others_s) == (pytest.approx(2.0), pytest.approx(0.5))
+    assert (cpu.own_s, cpu.others_s) == (pytest.approx(2.0), pytest.approx(0.5))
 
 
-def test_a_server_knows_what_hogs_take_of_its_cpu() -> None:
-    """As it reads it ten times a second, and the quota that it has then."""
+def test_a_server_measures_its_load_and_its_quota() -> None:
+    """Ten times a second the server measures what hogs take of its CPU, and its current quota."""
     clock = VirtualClock()
-    server = Server(clock, CloudPart(cpus=1.0))
+    server = SimulatedServer(clock, CloudPart(cpus=1.0))
     clock.pass_by(1.0)
     assert server.told == ServerReport(0, 0.0, 1.0)
-    server.processor.change(hogs=3, cpus=0.5)
+    server.cpu.change(hogs=3, cpus=0.5)
     clock.pass_by(2 * SERVER_EVERY_S)
     assert server.told == ServerReport(0, 1.0, 0.5)
-    server.processor.change(hogs=0, cpus=2.0)
+    server.cpu.change(hogs=0, cpus=2.0)
     clock.pass_by(2 * SERVER_EVERY_S)
     assert server.told == ServerReport(0, 0.0, 1.0)
 
 
-def test_workers_share_it_among_them_too() -> None:
-    """Two at a time on one CPU take twice as long each, the third begins then; what is paused waits."""
+def test_workers_share_the_quota() -> None:
+    """Two workers on one CPU take twice as long each; the third piece of work waits, as in a pause."""
     clock, ended = VirtualClock(), []
-    processor = Processor(clock, cpus=1.0, workers=2)
+    cpu = SimulatedCpu(clock, cpus=1.0, workers=2)
     for _ in range(3):
-        processor.add(1.0, lambda _: ended.append(clock.now_s()))
-    clock.at(0.5, lambda: processor.change(paused=True))
-    clock.at(1.5, lambda: processor.change(paused=False))
+        cpu.add(1.0, lambda _: ended.append(clock.now_s()))
+    clock.at(0.5, lambda: cpu.change(paused=True))
+    clock.at(1.5, lambda: cpu.change(paused=False))
     clock.pass_by(9.0)
     assert ended == [pytest.approx(3.0), pytest.approx(3.0), pytest.approx(4.0)]
 
 
-def test_what_is_stopped_makes_room() -> None:
-    """Half-way through the first of three tasks of 2 s, and the second one before its turn."""
+def test_stopped_work_makes_room() -> None:
+    """Of three tasks of 2 s, one is stopped after 1 s, and one before it begins; the third begins then."""
     clock, ended = VirtualClock(), dict[int, float]()
-    processor = Processor(clock, cpus=1.0)
+    cpu = SimulatedCpu(clock, cpus=1.0)
     runs = [
-        processor.add(2.0, lambda _, number=number: ended.update({number: clock.now_s()}))
-        for number in range(3)
+        cpu.add(2.0, lambda _, number=number: ended.update({number: clock.now_s()})) for number in range(3)
     ]
-    clock.at(1.0, lambda: processor.stop(runs[1]))
-    clock.at(1.0, lambda: processor.stop(runs[0]))
+    clock.at(1.0, lambda: cpu.stop(runs[1]))
+    clock.at(1.0, lambda: cpu.stop(runs[0]))
     clock.pass_by(10.0)
     assert ended == {2: pytest.approx(3.0)}
 
 
-def test_what_is_new_begins_after_what_is_here_and_comes_before_it() -> None:
-    """The line, and what arrives earlier, but not what the asker has there itself."""
+def test_new_work_begins_after_earlier_work() -> None:
+    """Earlier work is the queue and what arrives before, without the work of the robot that asks."""
     clock = VirtualClock()
-    processor = Processor(clock, cpus=1.0)
+    cpu = SimulatedCpu(clock, cpus=1.0)
 
     def nothing(_: Run) -> None:
         pass
 
-    processor.add(1.0, nothing, owner="other")
-    processor.add(2.0, nothing, owner="mine")
+    cpu.add(1.0, nothing, owner="other")
+    cpu.add(2.0, nothing, owner="mine")
     clock.pass_by(0.5)
-    assert processor.begins_s(0.6, [], without="mine") == pytest.approx(1.0)
-    assert processor.begins_s(0.6, [(0.55, 0.2), (0.7, 5.0)], without="mine") == pytest.approx(1.2)
-    assert processor.begins_s(0.6, [], without="") == pytest.approx(3.0)
+    assert cpu.begins_s(0.6, [], without="mine") == pytest.approx(1.0)
+    assert cpu.begins_s(0.6, [(0.55, 0.2), (0.7, 5.0)], without="mine") == pytest.approx(1.2)
+    assert cpu.begins_s(0.6, [], without="") == pytest.approx(3.0)
 
 
-def test_an_outage_holds_and_a_hang_swallows() -> None:
-    """What is due in an outage comes out at its end, in order; after a hang the connection is lost."""
+def test_an_outage_holds_messages_and_a_hang_loses_them() -> None:
+    """Messages come out at the end of an outage, in order; after a hang the connection is lost."""
     clock, seen = VirtualClock(), []
     plain = LinkConditions(delay_ms=100, bandwidth_mbps=0.8)
-    way = Way(clock, plain, 1, "up")
+    direction = SimulatedDirection(clock, plain, 1, "up")
     for number in range(2):
-        way.send(10_000, "m", number, lambda: seen.append(clock.now_s()))
+        direction.send(Message(10_000, "m", number), lambda: seen.append(clock.now_s()))
     clock.pass_by(0.25)
     assert seen == [pytest.approx(0.2)]  # 0.1 s at the bandwidth, 0.1 s of delay
-    way.change(LinkConditions(outage=True))
+    direction.change(LinkConditions(outage=True))
     clock.pass_by(1.0)
-    assert way.due_s(1, "m", 9, clock.now_s()) is None
-    assert way.change(plain)
+    assert direction.due_s(Message(1, "m", 9), clock.now_s()) is None
+    assert direction.change(plain)
     assert seen == [pytest.approx(0.2), pytest.approx(1.25)]
-    way.change(LinkConditions(hang=True))
-    way.send(1, "m", 3, lambda: seen.append(0.0))
+    direction.change(LinkConditions(hang=True))
+    direction.send(Message(1, "m", 3), lambda: seen.append(0.0))
     clock.pass_by(1.0)
-    assert not way.change(plain)
+    assert not direction.change(plain)
     assert len(seen) == 2
 
 
-def test_draws_are_those_of_the_message() -> None:
-    """The same message has the same jitter whatever was sent before it."""
+def test_draws_belong_to_the_message() -> None:
+    """A message has the same jitter and loss, whatever was sent before it."""
     clock, jittery = VirtualClock(), LinkConditions(delay_ms=15, jitter_ms=5, loss=0.3)
-    first, second = (Way(clock, jittery, 1, "up") for _ in range(2))
-    first.send(100_000, "m", 1, lambda: None)
-    sent_s = [way.due_s(2000, "m", 2, 7.0) for way in (first, second)]
-    assert sent_s[0] == sent_s[1]
-    assert sent_s[0] != first.due_s(2000, "m", 3, 7.0)
+    first, second = (SimulatedDirection(clock, jittery, 1, "up") for _ in range(2))
+    first.send(Message(100_000, "m", 1), lambda: None)
+    due_s = [direction.due_s(Message(2000, "m", 2), 7.0) for direction in (first, second)]
+    assert due_s[0] == due_s[1]
+    assert due_s[0] != first.due_s(Message(2000, "m", 3), 7.0)
 
 
 class Scripted:
-    """Decides as it was told."""
+    """A policy that always makes the same decision, until it gets another one."""
 
     def __init__(self, decision: Decision) -> None:
-        self._decision = decision
+        self.decision = decision
 
     def decide(self, forecast: Forecast) -> Decision:  # noqa: ARG002
-        return self._decision
+        return self.decision
 
 
 @pytest.fixture
 def race(tmp_path: Path) -> Callable[..., tuple[list[Record], float]]:
-    """The records of two tasks so decided, without noise, and how long both took."""
+    """Runs two tasks with this decision, without noise; returns their records and how long both took."""
 
     def run(decision: Decision, *events: Event) -> tuple[list[Record], float]:
         path = tmp_path / "small.toml"
         path.write_text(SMALL)
         scenario, clock = read_scenario(path), VirtualClock()
         tasks = {ROBOT: find_tasks(scenario.workload, 1, 2)}
-        world = World(scenario, tasks, clock, heartbeat_s=0.0, noise=0.0)
-        for event in events:
-            world.happen(event)
+        testbed = SimulatedTestbed(scenario, tasks, clock, heartbeat_s=0.0, noise=0.0)
         records: list[Record] = []
+        policy = Scripted(Decision("cloud", False, "", "test"))
         offload = Offloader(
-            [world.cloud, world.onboard],
-            policy=Scripted(decision),
+            [testbed.cloud, testbed.onboard],
+            policy=policy,
             predictor=lambda: predictors.make("least-squares", 5),
             observers=[records.append],
             clock=clock,
         )
-        for _ in range(10):  # enough to be allowed a second run
-            clock.pass_by(0.0)
-            offload._allowance.begin(clock.now_s())
+        for number in range(10):  # enough tasks to allow a second run
+            offload(testbed.costs.function, 40000.0, number)
+        records.clear()
+        began_s, policy.decision = clock.now_s(), decision
+        for event in events:
+            testbed.happen(event)
         for number in range(2):
-            offload(world.truth.function, 40000.0, number)
-        return records, clock.now_s()
+            offload(testbed.costs.function, 40000.0, number)
+        return records, clock.now_s() - began_s
 
     return run
 
 
 def test_a_hedge_by_hand(race: Callable[..., tuple[list[Record], float]]) -> None:
-    """The link is silent: onboard begins after the hedge's wait and answers, the cloud is given up then."""
+    """The link is silent: onboard starts after the wait of the hedge and answers; the cloud is cancelled."""
     silent = Event("link", {"outage": True})
     records, _ = race(Decision("cloud", False, "", "test", second="onboard", second_after_s=0.1), silent)
     first = records[0]
@@ -245,18 +194,18 @@ def test_a_hedge_by_hand(race: Callable[..., tuple[list[Record], float]]) -> Non
     assert onboard.seconds == pytest.approx(ONBOARD_S)
 
 
-def test_a_hedge_in_time_starts_nothing(race: Callable[..., tuple[list[Record], float]]) -> None:
-    """The cloud answers before the wait is over."""
+def test_an_early_answer_prevents_the_hedge(race: Callable[..., tuple[list[Record], float]]) -> None:
+    """The cloud answers before the wait of the hedge is over, so onboard does not start."""
     records, took_s = race(Decision("cloud", False, "", "test", second="onboard", second_after_s=0.1))
     assert [len(record.executions) for record in records] == [1, 1]
     assert took_s == pytest.approx(2 * CLOUD_S)
 
 
 def test_a_probe_by_hand(race: Callable[..., tuple[list[Record], float]]) -> None:
-    """Both begin at once, the first answer is used, and the other one's time is learnt when it ends."""
+    """Both sites start at once; the first answer is used, and the other time is learned when it is known."""
     records, _ = race(Decision("cloud", False, "", "test", second="onboard", second_after_s=0.0))
     assert CLOUD_S < ONBOARD_S < 2 * CLOUD_S
-    # Beside the run onboard, unpacking the reply takes twice as long.
+    # During the run onboard, unpacking the reply takes twice as long.
     assert records[0].waited_s == pytest.approx(CLOUD_S + HASH.sending_s / 2 / 0.2)
     assert records[0].used == "cloud"
     (late,) = records[1].late

@@ -1,4 +1,4 @@
-"""Toxiproxy's toxics: what they make of a link, what is refused, whom they strike."""
+"""Toxiproxy's toxics: the link that they make, the errors, and the connections that get them."""
 
 from typing import Any
 
@@ -51,21 +51,21 @@ NOTHING = LinkConditions(distribution="uniform")
     ],
 )
 def test_toxics_of_a_stream_make_one_link(toxics: list[Toxic], conditions: dict[str, Any]) -> None:
-    """Delays add up, the least bandwidth and the first end count; the other direction is left alone."""
+    """Delays add up; the lowest bandwidth and the first end count; the other direction is unchanged."""
     expected = LinkConditions(distribution="uniform", **conditions)
     assert link_of(toxics) == Link(up=NOTHING, down=expected)
     up = [Toxic(one.name, one.type, "upstream", 1.0, one.attributes) for one in toxics]
     assert link_of(up) == Link(up=expected, down=NOTHING)
 
 
-def test_too_much_of_a_kind_together_is_refused() -> None:
-    """Toxics that are each allowed can be more together than a link can do."""
+def test_toxics_that_exceed_a_limit_together_are_refused() -> None:
+    """Toxics that are allowed one by one are refused if their sum exceeds a limit of the link."""
     with pytest.raises(ConfigError, match=r"delay_ms: 60001.0 is not a number from 0 to 60000"):
         link_of([toxic("latency", latency=60_000), toxic("latency", latency=1)])
 
 
 def test_the_first_timeout_closes() -> None:
-    """Of several timeouts the shortest ends the connection; 0 and other types never do."""
+    """The shortest timeout ends the connection; a timeout of 0 and other types never do."""
     assert closes_after_s([]) is None
     assert closes_after_s([toxic("timeout"), toxic("reset_peer", timeout=5)]) is None
     assert closes_after_s([toxic("timeout", timeout=ms) for ms in (0, 300, 200)]) == 0.2
@@ -83,15 +83,15 @@ def test_the_first_timeout_closes() -> None:
     ],
 )
 def test_a_bad_attribute_is_refused(type: str, given: dict[str, Any], message: str) -> None:
-    """The answer names attribute, value and what is allowed, with Toxiproxy's status."""
+    """The error names attribute, value and what is allowed, with the HTTP status of Toxiproxy."""
     with pytest.raises(Refused) as refused:
         attributes(type, given)
     assert str(refused.value).startswith(f"bad request body: {message}")
     assert refused.value.status == 400
 
 
-def test_attributes_left_out_or_unknown() -> None:
-    """What is left out or null keeps its value, 0 at first; what is unknown is ignored."""
+def test_attributes_that_are_left_out_keep_their_value() -> None:
+    """An attribute that is left out or null keeps its value, at first 0; unknown attributes are ignored."""
     first = attributes("latency", {"latency": 9, "speed": 3})
     assert first == {"latency": 9, "jitter": 0}
     assert attributes("latency", {"jitter": 2, "latency": None}, first) == {"latency": 9, "jitter": 2}
@@ -107,7 +107,7 @@ def test_attributes_left_out_or_unknown() -> None:
     ],
 )
 def test_a_bad_toxic_is_refused(wrong: dict[str, Any], message: str) -> None:
-    """Type, stream and toxicity are checked."""
+    """The type, the stream and the toxicity of a toxic are checked."""
     good = {"name": "t", "type": "latency", "stream": "upstream", "toxicity": 1.0, "attributes": {}}
     Toxic(**good)
     with pytest.raises(Refused) as refused:
@@ -116,8 +116,8 @@ def test_a_bad_toxic_is_refused(wrong: dict[str, Any], message: str) -> None:
 
 
 @given(seed=st.integers(0, 2**64), type=st.sampled_from(list(ATTRIBUTES)), toxicity=st.floats(0, 1))
-def test_whom_a_toxic_strikes(seed: int, type: str, toxicity: float) -> None:
-    """All at 1, none at 0; the same again for the same seed; more toxicity strikes more, never others."""
+def test_which_connections_get_a_toxic(seed: int, type: str, toxicity: float) -> None:
+    """Toxicity 1 is all connections, 0 is none; the same seed gives the same ones; more toxicity adds."""
     given = {"bytes": 1}
     some, all_, none = (toxic(type, toxicity=share, **given) for share in (toxicity, 1.0, 0.0))
     for connection in range(20):
@@ -128,9 +128,11 @@ def test_whom_a_toxic_strikes(seed: int, type: str, toxicity: float) -> None:
         assert struck <= toxic(type, toxicity=(1 + toxicity) / 2, **given).strikes(seed, connection)
 
 
-def test_the_share_that_is_struck() -> None:
-    """Over 4,000 connections a toxicity of 0.3 strikes 30 %, within four standard errors (2.9 %), of each
-    stream its own."""
+def test_toxicity_is_the_share_of_connections() -> None:
+    """At a toxicity of 0.3, 30 % of 4,000 connections get the toxic (within four standard errors).
+
+    The streams draw independently.
+    """
     down, up = toxic("latency", toxicity=0.3), toxic("latency", "upstream", toxicity=0.3)
     struck = [(down.strikes(1, number), up.strikes(1, number)) for number in range(4000)]
     assert sum(hit for hit, _ in struck) / 4000 == pytest.approx(0.3, abs=0.029)

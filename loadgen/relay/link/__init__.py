@@ -1,1 +1,1 @@
-"""The model of a network link: delay, jitter, loss, bandwidth."""
+"""The model of a network link: delay, jitter, loss, bandwidth limit, outage."""

@@ -1,28 +1,23 @@
-"""How much later than the delay a segment comes: named distributions, measured samples, and correlation.
+"""Random delay: the named distributions, and the correlation between neighbouring segments.
 
-Pure: the draws of a segment are `draws.py`'s, what is made of them is `link.py`'s.
+Measured delays are read by `delay_samples.py`; the whole delay of a segment is put together in `delay.py`.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 from statistics import NormalDist
 
-from offboard.common.errors import DataError
 from offboard.loadgen.relay.link.draws import Draws, replay_from
-
-DELAY_MS_MAX = 60_000.0
-SAMPLES = "samples"  # the distribution that is a file, not a formula
-SAMPLES_MAX = 20_000
 
 PARETO_SHAPE = 3.0
 PARETO_SD = math.sqrt(PARETO_SHAPE / (PARETO_SHAPE - 2)) / (PARETO_SHAPE - 1)
 LOGNORMAL_SD = math.sqrt((math.e - 1) * math.e)
 _NORMAL = NormalDist()
 
-# Each maps one uniform draw in (0, 1) to a deviation; times jitter_ms it is what the delay grows by.
-# Standard deviation 1, but for constant (always late by jitter_ms) and uniform (half width 1, as netem).
-# Pareto and log-normal have the long tail of queues and radio links: never early, sometimes very late.
+# Each distribution maps a uniform draw in (0, 1) to a deviation. The deviation times jitter_ms is added to
+# the delay. The standard deviation is 1, with two exceptions: "constant" always adds jitter_ms, and
+# "uniform" has a half width of 1, as in netem. "pareto" and "lognormal" have the long tail of queues and
+# radio links: a segment is never early and sometimes very late.
 DISTRIBUTIONS: dict[str, Callable[[float], float]] = {
     "constant": lambda _: 1.0,
     "uniform": lambda u: 2 * u - 1,
@@ -33,11 +28,12 @@ DISTRIBUTIONS: dict[str, Callable[[float], float]] = {
 
 
 class Jitter:
-    """One uniform draw a segment, correlated with the draw before as far as is asked.
+    """One uniform draw for each segment, which may be correlated with the draw of the segment before.
 
-    Correlation is an AR(1) process on the normal scores of the draws (a Gaussian copula), so each draw by
-    itself stays uniform and the delays keep their distribution. netem mixes the uniform numbers themselves,
-    which narrows and bends it. The normal scores of neighbouring segments correlate by exactly this much.
+    The correlation is an AR(1) process on the normal scores of the draws (a Gaussian copula). Each draw by
+    itself stays uniform, so the delays keep their distribution; the normal scores of neighbouring segments
+    have exactly the requested correlation. netem mixes the uniform numbers instead, which changes the
+    distribution.
     """
 
     def __init__(self, origin: str) -> None:
@@ -47,7 +43,7 @@ class Jitter:
         self._score = 0.0
 
     def at(self, number: int, correlation: float = 0.0) -> float:
-        """The draw of this segment, as if the correlation had been the same from the first one on."""
+        """The draw of this segment, as if the correlation had been the same since the first segment."""
         if correlation in (0, 1):
             return self._draws.at(0 if correlation else number)
         if (number, correlation) != (self._number, self._correlation):
@@ -64,42 +60,3 @@ class Jitter:
         for n in range(first, number + 1):
             self._score = correlation * self._score + fresh * _NORMAL.inv_cdf(self._draws.at(n))
         self._number, self._correlation = number, correlation
-
-
-class Samples(tuple[float, ...]):
-    """Delays in ms that were checked, in rising order."""
-
-    __slots__ = ()
-
-
-def quantile(ordered: Sequence[float], draw: float) -> float:
-    """The value of a sample (in rising order) at a uniform draw: each value is equally likely."""
-    return ordered[min(int(draw * len(ordered)), len(ordered) - 1)]
-
-
-def read_samples(path: Path) -> Samples:
-    """Delays in ms, one a line, in rising order; DataError names file, line and value."""
-    try:
-        lines = path.read_text().split("\n")
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
-    samples: list[float] = []
-    for number, text in enumerate(lines, 1):
-        if not (text := text.strip()):
-            continue
-        if len(samples) == SAMPLES_MAX:
-            raise DataError(f"{path}:{number}: {text!r} is one too many, at most {SAMPLES_MAX} are allowed")
-        samples.append(_delay_ms(path, number, text))
-    if not samples:
-        raise DataError(f"{path}: holds no delays")
-    return Samples(sorted(samples))
-
-
-def _delay_ms(path: Path, number: int, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 <= value <= DELAY_MS_MAX:
-        raise DataError(f"{path}:{number}: {text!r} is not a delay in ms from 0 to {DELAY_MS_MAX:g}")
-    return value

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from offboard.common.config import check, setting
-from offboard.loadgen.relay.link.jitter import SAMPLES, read_samples
+from offboard.loadgen.relay.link.delay_samples import SAMPLES, read_samples
 from offboard.loadgen.relay.link.link import BOUNDS, NAMES, Link, LinkConditions
 
 LINK, FAULTS, UP, DOWN = "link", "faults", "from robot to cloud only", "from cloud to robot only"

@@ -1,24 +1,25 @@
-"""Which segments of a stream are lost, and how long TCP stalls for each.
+"""Packet loss: which segments of a byte stream are lost, and how long TCP stalls for each of them.
 
-Pure: the draws of a segment are `draws.py`'s.
+Pure. The random numbers come from `draws.py`.
 """
 
 import math
 
 from offboard.loadgen.relay.link.draws import Draws, replay_from
 
-LOSSES_MAX = (
-    6  # of one segment; the stall doubles with each, as Linux's timer does: 63 times the first at most
-)
+# Losses of one segment at most. The stall doubles with each loss, as the retransmission timer of Linux
+# does, so the longest stall is 63 times the first.
+LOSSES_MAX = 6
 LOSS_BURST_MAX = 10_000.0
 
 
 class Loss:
-    """Two states, good and lost, that a segment is in (Gilbert 1960, with all lost in the bad state).
+    """A process with two states, good and lost (Gilbert 1960; every segment of the bad state is lost).
 
-    Bursts last `burst` segments in the mean, and the share `loss` of all segments is lost. A burst of 1 is
-    independent loss, whose bursts by themselves last 1 / (1 - loss): shorter ones are not made.
-    A lost segment's retransmissions come long after the burst, so each is lost by itself with `loss`.
+    The share `loss` of all segments is lost, in bursts of `burst` segments on average. A burst of 1 means
+    independent losses. Their bursts have a mean length of 1 / (1 - loss); the process makes none shorter.
+    The retransmissions of a lost segment come long after the burst, so each of them is lost independently,
+    with probability `loss`.
     """
 
     def __init__(self, origin: str) -> None:
@@ -29,7 +30,7 @@ class Loss:
         self._lost = False
 
     def times(self, number: int, loss: float, burst: float) -> int:
-        """How often this segment is lost, 0 to LOSSES_MAX, as if the rates had always been these."""
+        """How many times this segment is lost, as if the rates had been the same since the first segment."""
         if not loss or not self._is_lost(number, loss, burst):
             return 0
         again = math.log(self._again.at(number)) / math.log(loss) if loss < 1 else LOSSES_MAX
@@ -50,5 +51,5 @@ class Loss:
 
 
 def stall_ms(times: int, first_ms: float) -> float:
-    """How much later a segment comes that was lost so often: the timer doubles each time."""
+    """How long TCP stalls for a segment that is lost `times` times: the timer doubles with each loss."""
     return first_ms * ((1 << times) - 1)

@@ -1,1 +1,1 @@
-"""The relay itself: TCP connections whose bytes pass the link model, and the record of what it did."""
+"""The TCP relay, which applies the link model to real bytes, and the record of what the link did."""

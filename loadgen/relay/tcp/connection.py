@@ -1,6 +1,6 @@
-"""One connection of the relay: a client's socket, the one to the cloud, and the two flows between them.
+"""One connection of the relay: a socket to the client, a socket to the cloud, and two forwarders.
 
-One direction of it is `flow.py`, what a link does is `link.py`; all connections together are `relay.py`'s.
+The bytes are moved by `forwarder.py`; `relay.py` accepts connections and owns the link.
 """
 
 import asyncio
@@ -9,54 +9,57 @@ import socket
 import struct
 from typing import Protocol
 
-from offboard.loadgen.relay.link.link import Link, Pipe
-from offboard.loadgen.relay.tcp.flow import Flow, ReadBuffer
-from offboard.loadgen.relay.tcp.link_record import Truth
+from offboard.loadgen.relay.link.link import Link
+from offboard.loadgen.relay.link.outage import connects, resets
+from offboard.loadgen.relay.link.pipe import Pipe
+from offboard.loadgen.relay.tcp.forwarder import Forwarder, ReadBuffer
+from offboard.loadgen.relay.tcp.link_record import LinkRecord
 
 CONNECT_S = 5.0
-RST_AT_CLOSE = struct.pack("ii", 1, 0)  # SO_LINGER on, of no seconds
+RST_AT_CLOSE = struct.pack("ii", 1, 0)  # SO_LINGER: on, 0 seconds
 
 
-class Among(Protocol):
-    """The relay, as far as its connections know it."""
+class RelayOfConnections(Protocol):
+    """The relay, as far as its connections use it."""
 
     target: tuple[str, int]
     link: Link
     seed: int
     buffer: ReadBuffer
     buffer_bytes: int
-    truth: Truth | None
+    record: LinkRecord | None
     connections: "set[Connection]"
     bytes: dict[str, int]
 
     def target_up(self) -> None:
-        """The cloud took a connection."""
+        """The cloud accepted a connection."""
 
     def target_down(self, error: OSError) -> None:
-        """The cloud took none."""
+        """The cloud accepted no connection."""
 
 
 class Connection:
-    """A client's socket, the one to the cloud that belongs to it, and the two flows between them.
+    """The socket of a client, the socket to the cloud, and the two forwarders between them.
 
-    When one side closes its half, what it had sent is still delivered, then that end; when both ends were
-    delivered both sockets are closed. When the cloud refuses, the client is closed at once. In an outage, or
-    where the cloud hangs, the client is accepted and hears nothing.
+    - One side closes its half: its bytes are still delivered, then the end. When both ends were delivered,
+      both sockets are closed.
+    - The cloud refuses the connection: the client is disconnected at once.
+    - There is an outage, or the cloud hangs: the client is accepted and receives nothing.
     """
 
-    def __init__(self, relay: Among, number: int) -> None:
+    def __init__(self, relay: RelayOfConnections, number: int) -> None:
         self._relay = relay
         self.number = number
         self.buffer = relay.buffer
         self.buffer_bytes = relay.buffer_bytes
-        self.truth = relay.truth
+        self.record = relay.record
         self._loop = asyncio.get_running_loop()
         self._how = ""
         self._aborted = self._by_rst = self._over = False
-        if self.truth is not None:
-            self.truth.opened(self._loop.time(), number)
-        self._up = Flow(self, "up", Pipe(relay.link.up, relay.seed, number, "up"))
-        self._down = Flow(self, "down", Pipe(relay.link.down, relay.seed, number, "down"))
+        if self.record is not None:
+            self.record.opened(self._loop.time(), number)
+        self._up = Forwarder(self, "up", Pipe(relay.link.up, relay.seed, number, "up"))
+        self._down = Forwarder(self, "down", Pipe(relay.link.down, relay.seed, number, "down"))
         self._passable = asyncio.Event()
         self.client = Side(self, self._up, self._down)
         self._open_sides = {self.client}
@@ -68,13 +71,13 @@ class Connection:
 
     def set_link(self, link: Link) -> None:
         before, self._link = self._link, link
-        if link.up.outage or link.down.outage or link.up.hang:
-            self._passable.clear()
-        else:
+        if connects(link):
             self._passable.set()
-        for flow, now in ((self._up, link.up), (self._down, link.down)):
-            flow.set_conditions(now)
-            if flow.swallowed and not now.hang:  # what follows a gap must not be taken for the whole
+        else:
+            self._passable.clear()
+        for forwarder, now in ((self._up, link.up), (self._down, link.down)):
+            forwarder.set_conditions(now)
+            if forwarder.swallowed and not now.hang:  # bytes are missing, so the rest must not arrive
                 self.reset("hang")
         self.settle()
         for direction in ("up", "down"):
@@ -84,14 +87,14 @@ class Connection:
 
     @property
     def left(self) -> bool:
-        """The client has closed, at least its half, and nothing that it said can reach the cloud now."""
+        """Whether the client has closed at least its half, and none of its bytes can reach the cloud now."""
         if self._up.done:
             return self._up.source_ended
         held = self._link.up.outage or (self._link.down.outage and self._up.target is None)
         return held and self._up.source is not None and _peer_closed(self._up.source)
 
     def abort(self, how: str = "closed") -> None:
-        """Close both sockets now, one that is still to come when it does."""
+        """Close both sockets now; a socket that is not open yet is closed when it opens."""
         self.because(how)
         self._aborted = True
         for transport in (self._up.source, self._up.target):
@@ -102,23 +105,24 @@ class Connection:
                 transport.abort()
 
     def reset(self, how: str = "reset") -> None:
-        """Close both sockets by RST now, one that is still to come when it does."""
+        """Close both sockets by RST now; a socket that is not open yet is closed when it opens."""
         self._by_rst = True
         self.abort(how)
 
     def because(self, how: str) -> None:
+        """Keep the reason why the connection ends; the first reason counts."""
         self._how = self._how or how
 
     def close(self) -> None:
-        """Close both sides, after what was delivered to them."""
+        """Close both sockets, after the bytes that were delivered to them."""
         for transport in (self._up.source, self._up.target):
             if transport is not None:
                 transport.close()
 
     def settle(self) -> None:
-        """End when both flows are done, or when nobody is left to wait for what a hang swallowed.
+        """End the connection when both forwarders are done, or when a client that lost bytes has left.
 
-        A client that did not end hears of a gap when the hang ends, not before: it is silence until then.
+        A client that stays is reset when the hang ends, and receives nothing until then.
         """
         over = self._up.done and self._down.done
         if not (self._up.swallowed or self._down.swallowed):
@@ -133,7 +137,7 @@ class Connection:
     def made(self, side: "Side") -> None:
         """A socket of the connection is open."""
         self._open_sides.add(side)
-        # Not from here: Python 3.11.2 undoes a pause made inside connection_made, and ignores later ones.
+        # Later, because Python 3.11.2 undoes a pause made inside connection_made, and ignores later pauses.
         self._loop.call_soon(self._begin)
 
     def lost(self, side: "Side") -> None:
@@ -150,7 +154,7 @@ class Connection:
         self._down.refresh()
 
     def _await_reset(self) -> None:
-        """Reset when it is time, in an outage not before its end: a reset is a message too."""
+        """Reset the connection when it is time, and not before the end of an outage."""
         if self._reset_timer is not None:
             self._reset_timer.cancel()
             self._reset_timer = None
@@ -159,7 +163,7 @@ class Connection:
             for direction in ("up", "down")
             if getattr(self._link, direction).reset_after_ms
         ]
-        if not times_s or self._link.up.outage or self._link.down.outage:
+        if not times_s or not resets(self._link):
             return
         if min(times_s) <= self._loop.time():
             self.reset()
@@ -178,27 +182,27 @@ class Connection:
             self.abort("refused")
 
     def _end(self) -> None:
-        self._over = self._aborted = True  # a socket to the cloud that was just opening comes and goes
+        self._over = self._aborted = True  # a socket to the cloud that opens now is closed at once
         self._relay.connections.discard(self)
         if self._reset_timer is not None:
             self._reset_timer.cancel()
-        if self.truth is not None:
+        if self.record is not None:
             self._up.drop()
             self._down.drop()
-            self.truth.closed(self._loop.time(), self.number, self._how)
+            self.record.closed(self._loop.time(), self.number, self._how)
 
 
 class Side(asyncio.BufferedProtocol):
-    """One socket of a connection: what it receives enters `incoming`; `outgoing` is delivered to it."""
+    """One socket of a connection: `incoming` forwards what it receives, `outgoing` delivers to it."""
 
-    def __init__(self, connection: Connection, incoming: Flow, outgoing: Flow) -> None:
+    def __init__(self, connection: Connection, incoming: Forwarder, outgoing: Forwarder) -> None:
         self._connection = connection
         self._incoming = incoming
         self._outgoing = outgoing
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
-        # asyncio itself does so only where the socket was made with the number of the protocol.
+        # asyncio sets TCP_NODELAY only on sockets that were created with the number of the protocol.
         transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._incoming.source = self._outgoing.target = transport
         self._connection.made(self)
@@ -211,7 +215,7 @@ class Side(asyncio.BufferedProtocol):
 
     def eof_received(self) -> bool:
         self._incoming.end()
-        return True  # asyncio must not close the socket: bytes for it may still be under way
+        return True  # asyncio must not close the socket: bytes to it may still be under way
 
     def pause_writing(self) -> None:
         self._outgoing.writable = False
@@ -227,7 +231,7 @@ class Side(asyncio.BufferedProtocol):
 
 
 def _peer_closed(transport: asyncio.Transport) -> bool:
-    """Also where bytes that came before the end were not read."""
+    """Whether the peer has closed, even if bytes before its end were not read."""
     if transport.is_closing():
         return True
     poll = select.poll()

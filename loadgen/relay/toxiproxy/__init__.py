@@ -1,1 +1,1 @@
-"""The relay under Toxiproxy's HTTP API."""
+"""Toxiproxy's HTTP API, so that its clients can control the relay."""

@@ -1,6 +1,6 @@
-"""Proxies as Toxiproxy has them: each a relay on a listening port of its own, under the toxics it was given.
+"""Toxiproxy's proxies: each is a relay with its own port and its own toxics.
 
-The relay is `toxic_relay.py`, toxics are `toxics.py`; the HTTP side is `toxiproxy.py`.
+The relay is in `toxic_relay.py`, the HTTP API in `toxiproxy_api.py`.
 """
 
 import asyncio
@@ -10,18 +10,18 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from offboard.common.errors import ConfigError
-from offboard.loadgen.relay.tcp.endpoint import BACKLOG, address, bind, name_of
+from offboard.loadgen.relay.tcp.tcp_address import BACKLOG, address, bind, name_of
 from offboard.loadgen.relay.toxiproxy.toxic_relay import ToxicRelay
 from offboard.loadgen.relay.toxiproxy.toxics import Refused, Toxic, link_of
 
 PROXIES_MAX = 64
 TOXICS_MAX = 32  # of one proxy
-LISTEN = "127.0.0.1:0"  # where a proxy listens that is not told where
+LISTEN = "127.0.0.1:0"  # default address of a proxy
 
 
 @dataclass(frozen=True, slots=True)
 class RelaySettings:
-    """What the relays of all proxies share; see `Relay`."""
+    """Settings that the relays of all proxies share; see `Relay`."""
 
     seed: int
     connections_max: int
@@ -30,7 +30,7 @@ class RelaySettings:
 
 @dataclass(frozen=True, slots=True)
 class ProxySettings:
-    """A proxy as it is asked for."""
+    """A proxy, as a request describes it."""
 
     name: str
     listen: str
@@ -49,7 +49,7 @@ class ProxySettings:
 
 
 class Proxies:
-    """All proxies by name. One change at a time: opening a listener takes turns of the loop."""
+    """All proxies by name. Changes run one at a time, because opening a listener is asynchronous."""
 
     def __init__(self, settings: RelaySettings) -> None:
         self._settings = settings
@@ -71,14 +71,14 @@ class Proxies:
             return await self._create(asked)
 
     async def populate(self, wanted: Sequence[ProxySettings]) -> list["Proxy"]:
-        """Each of these proxies exists: one that listens and leads elsewhere is replaced, others are kept."""
+        """Create these proxies; keep an existing one with the same addresses, and replace one with others."""
         async with self._changing:
             if len({asked.name for asked in wanted}) < len(wanted):
-                raise Refused("bad request body: two proxies of one name")
+                raise Refused("bad request body: two proxies have the same name")
             return [await self._create_or_keep(asked) for asked in wanted]
 
     async def update(self, name: str, changes: Mapping[str, Any]) -> "Proxy":
-        """Change some of listen, upstream and enabled; another address drops the connections."""
+        """Change listen, upstream or enabled; a new address ends the connections."""
         async with self._changing:
             proxy = self.get(name)
             await proxy.change(replace(proxy.settings, **changes))
@@ -90,7 +90,7 @@ class Proxies:
             del self._proxies[name]
 
     async def reset(self) -> None:
-        """Every proxy is enabled, none has toxics."""
+        """Enable every proxy and remove all toxics."""
         async with self._changing:
             for proxy in self._proxies.values():
                 await proxy.change(replace(proxy.settings, enabled=True))
@@ -111,7 +111,7 @@ class Proxies:
 
     async def _create(self, asked: ProxySettings) -> "Proxy":
         if len(self._proxies) >= PROXIES_MAX:
-            raise Refused(f"too many proxies: {PROXIES_MAX} is the most")
+            raise Refused(f"too many proxies: at most {PROXIES_MAX} are allowed")
         proxy = Proxy(asked, self._settings)
         await proxy.change(asked)
         self._proxies[asked.name] = proxy
@@ -119,7 +119,7 @@ class Proxies:
 
 
 class Proxy:
-    """One relay under a name. `settings` hold the real port once it has listened."""
+    """A relay with a name. Once it listens, `settings` hold its real port."""
 
     def __init__(self, asked: ProxySettings, settings: RelaySettings) -> None:
         seed = random.Random(f"{settings.seed}/{asked.name}").getrandbits(64)
@@ -129,7 +129,7 @@ class Proxy:
         self.settings = replace(asked, enabled=False)
 
     def shown(self) -> dict[str, Any]:
-        """As the API shows it."""
+        """The proxy as the API shows it."""
         return asdict(self.settings) | {"toxics": [toxic.shown() for toxic in self._relay.toxics]}
 
     @property
@@ -137,12 +137,12 @@ class Proxy:
         return self._relay.toxics
 
     def leads_as(self, asked: ProxySettings) -> bool:
-        """It listens there, as asked the first time or as it is shown, and leads to the same upstream."""
+        """Whether the proxy already has these addresses, with its requested or its real port."""
         listens = asked.listen in (self.settings.listen, self._asked_listen)
         return listens and asked.upstream == self.settings.upstream
 
     async def change(self, wanted: ProxySettings) -> None:
-        """Make it so. Where it cannot listen it is left disabled."""
+        """Apply these settings. If the proxy cannot listen, it stays disabled."""
         if not (wanted.enabled and self.leads_as(wanted)):
             self.close()
         if not self.leads_as(wanted):
@@ -153,7 +153,7 @@ class Proxy:
             await self._open()
 
     def close(self) -> None:
-        """Listen no longer, and end the connections."""
+        """Stop listening, and end the connections."""
         if self._server is not None:
             self._server.close()
             self._server = None
@@ -170,11 +170,11 @@ class Proxy:
         if any(toxic.name == other.name for other in self.toxics):
             raise Refused("toxic already exists", 409)
         if len(self.toxics) >= TOXICS_MAX:
-            raise Refused(f"too many toxics: {TOXICS_MAX} is the most of one proxy")
+            raise Refused(f"too many toxics: a proxy may have at most {TOXICS_MAX}")
         self.put((*self.toxics, toxic))
 
     def update(self, toxic: Toxic) -> None:
-        """Put it in the place of the one of its name."""
+        """Replace the toxic that has the same name."""
         self.put(toxic if toxic.name == other.name else other for other in self.toxics)
 
     def remove(self, name: str) -> None:
@@ -182,17 +182,17 @@ class Proxy:
         self.put(other for other in self.toxics if other is not gone)
 
     def put(self, toxics: Iterable[Toxic]) -> None:
-        """These toxics and no others, unless they are more than a link can do."""
+        """Replace all toxics, unless their sum exceeds the limits of a link."""
         toxics = tuple(toxics)
         try:
             link_of(toxics)
         except ConfigError as error:
-            raise Refused(f"bad request body: all toxics of a stream together: {error}") from None
+            raise Refused(f"bad request body: the toxics of a stream together: {error}") from None
         self._relay.set_toxics(toxics)
 
     async def _open(self) -> None:
         try:
-            listening = await asyncio.to_thread(bind, "listen", self.settings.listen)  # may look up a name
+            listening = await asyncio.to_thread(bind, "listen", self.settings.listen)  # may wait for DNS
         except ConfigError as error:
             raise Refused(str(error), 500) from None
         loop = asyncio.get_running_loop()

@@ -1,6 +1,6 @@
-"""A relay whose connections each have the toxics that their own draws gave them.
+"""A relay that applies toxics: each connection has those that its own random draws gave it.
 
-What toxics make of a link is `toxics.py`.
+The link conditions that toxics make are computed in `toxics.py`.
 """
 
 import asyncio
@@ -14,7 +14,7 @@ from offboard.loadgen.relay.toxiproxy.toxics import Toxic, closes_after_s, link_
 
 
 class ToxicRelay(Relay):
-    """Takes connections while `taking`, and puts `toxics` on each as it comes and whenever they change."""
+    """Accepts connections while `taking`, and applies `toxics` to new connections and after each change."""
 
     def __init__(
         self, target: tuple[str, int], *, seed: int, connections_max: int, buffer_bytes: int
@@ -24,36 +24,36 @@ class ToxicRelay(Relay):
         )
         self.taking = False
         self.toxics: tuple[Toxic, ...] = ()
-        self._struck: list[Struck] = []  # bounded as the connections are
+        self._toxic_connections: list[ToxicConnection] = []  # bounded by connections_max
 
     def accept(self) -> asyncio.BaseProtocol:
-        if not self.taking:  # the kernel had accepted it before the listener was closed
+        if not self.taking:  # the kernel had accepted the connection before the listener was closed
             return Refusal()
         protocol = super().accept()
-        for struck in [one for one in self._struck if one.connection not in self.connections]:
-            struck.forget()
-            self._struck.remove(struck)
+        for known in [one for one in self._toxic_connections if one.connection not in self.connections]:
+            known.forget()
+            self._toxic_connections.remove(known)
         for connection in self.connections:
             if connection.client is protocol:
-                self._struck.append(Struck(connection, self.seed))
-                self._struck[-1].take(self.toxics)
+                self._toxic_connections.append(ToxicConnection(connection, self.seed))
+                self._toxic_connections[-1].take(self.toxics)
         return protocol
 
     def set_toxics(self, toxics: Sequence[Toxic]) -> None:
-        """Put these toxics on every connection, open or to come, as far as its draws say."""
+        """Apply these toxics to every connection, open or new, as the draws of the connection decide."""
         self.toxics = tuple(toxics)
-        for struck in self._struck:
-            struck.take(self.toxics)
+        for known in self._toxic_connections:
+            known.take(self.toxics)
 
     def close(self) -> None:
-        """Take no connections, end those there are."""
+        """Accept no further connections, and end the open ones."""
         self.taking = False
         self.abort()
 
 
 @dataclass(slots=True, eq=False)
-class Struck:
-    """One connection, the toxics it has now, and when a timeout among them closes it."""
+class ToxicConnection:
+    """One connection, the toxics that it has now, and the timer of a timeout toxic that closes it."""
 
     connection: Connection
     seed: int
@@ -61,7 +61,10 @@ class Struck:
     end: asyncio.TimerHandle | None = None
 
     def take(self, toxics: Sequence[Toxic]) -> None:
-        """As in Toxiproxy, a timeout that is taken away closes the connection: its bytes were lost."""
+        """Replace the toxics.
+
+        As in Toxiproxy, removing a timeout toxic closes the connection, because its bytes were lost.
+        """
         before, number = self.toxics, self.connection.number
         self.toxics = tuple(toxic for toxic in toxics if toxic.strikes(self.seed, number))
         if _timeouts(before) - _timeouts(self.toxics):
@@ -72,7 +75,7 @@ class Struck:
             self._set_end(closes_after_s(self.toxics))
 
     def forget(self) -> None:
-        """The connection has ended, or shall not be closed at its time."""
+        """Cancel the timer: the connection has ended, or no timeout closes it any more."""
         if self.end is not None:
             self.end.cancel()
             self.end = None

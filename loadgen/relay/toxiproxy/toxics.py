@@ -1,6 +1,6 @@
 """Toxiproxy's toxics, and the link conditions that they make together.
 
-Pure: the relays that they act on are in `proxies.py`, the HTTP API is `toxiproxy.py`. Meanings and names:
+Pure. The relay that applies them is in `toxic_relay.py`. Names and meanings are those of
 https://github.com/Shopify/toxiproxy#toxics
 """
 
@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from offboard.common.errors import OffloadError
+from offboard.loadgen.relay.link.delay_samples import DELAY_MS_MAX
 from offboard.loadgen.relay.link.link import (
     BANDWIDTH_MBPS_MAX,
-    DELAY_MS_MAX,
     RESET_MS_MAX,
     TRUNCATE_BYTES_MAX,
     Link,
@@ -21,8 +21,8 @@ from offboard.loadgen.relay.link.link import (
 
 DIRECTIONS = {"upstream": "up", "downstream": "down"}
 KB_PER_S_MAX = BANDWIDTH_MBPS_MAX * 1e6 / 8 / 1e3
-RESET_MS_MIN = 1  # 0 would be never
-# Types with their attributes, each with its least and most; all are whole numbers, 0 if left out.
+RESET_MS_MIN = 1  # in LinkConditions, 0 means never
+# The attributes of each type, with their lowest and highest value. All are whole numbers; default 0.
 ATTRIBUTES: dict[str, dict[str, tuple[float, float]]] = {
     "latency": {"latency": (0, DELAY_MS_MAX), "jitter": (0, DELAY_MS_MAX)},
     "bandwidth": {"rate": (0, KB_PER_S_MAX)},
@@ -34,7 +34,7 @@ ATTRIBUTES: dict[str, dict[str, tuple[float, float]]] = {
 
 
 class Refused(OffloadError):
-    """A request that the Toxiproxy API cannot do: the text and HTTP status of its answer."""
+    """A request that the Toxiproxy API refuses, with the text and the HTTP status of the reply."""
 
     def __init__(self, message: str, status: int = 400) -> None:
         super().__init__(message)
@@ -43,7 +43,7 @@ class Refused(OffloadError):
 
 @dataclass(frozen=True, slots=True)
 class Toxic:
-    """One effect on one stream of a proxy's connections; `toxicity` is the share of them that get it."""
+    """One effect on one stream (direction) of a proxy; `toxicity` is the share of connections that get it."""
 
     name: str
     type: str
@@ -60,19 +60,25 @@ class Toxic:
             raise Refused(f"bad request body: toxicity: {self.toxicity!r} is not a number from 0 to 1")
 
     def shown(self) -> dict[str, Any]:
-        """As the API shows it."""
+        """The toxic as the API shows it."""
         names = ("name", "type", "stream", "toxicity", "attributes")
         return {name: getattr(self, name) for name in names}
 
     def strikes(self, seed: int, connection: int) -> bool:
-        """Whether this connection gets it: one draw, which does not depend on the toxicity."""
+        """Whether this connection gets the toxic.
+
+        The draw does not depend on the toxicity, so a higher toxicity only adds connections.
+        """
         return random.Random(f"{seed}/{connection}/{self.stream}/{self.name}").random() < self.toxicity
 
 
 def attributes(
     type: str, given: Mapping[str, Any], before: Mapping[str, int] | None = None
 ) -> dict[str, int]:
-    """All attributes of a type: those given, then those before, then 0. Toxiproxy ignores unknown ones."""
+    """All attributes of a type: the given value, or else the one before, or else 0.
+
+    Unknown attributes are ignored, as Toxiproxy does.
+    """
     known = ATTRIBUTES.get(type, {})
     values = {name: (before or {}).get(name, 0) for name in known}
     values |= {name: given[name] for name in known if given.get(name) is not None}
@@ -85,7 +91,7 @@ def attributes(
 
 
 def link_of(toxics: Iterable[Toxic]) -> Link:
-    """What these toxics make of both directions together."""
+    """The link that these toxics make together."""
     toxics = tuple(toxics)
     return Link(
         **{
@@ -96,13 +102,13 @@ def link_of(toxics: Iterable[Toxic]) -> Link:
 
 
 def closes_after_s(toxics: Iterable[Toxic]) -> float | None:
-    """How long after the timeout toxics among these began they close the connection; None is never."""
+    """After how long the timeout toxics among these close a connection; None means never."""
     times_ms = [toxic.attributes["timeout"] for toxic in toxics if toxic.type == "timeout"]
     return min((ms / 1e3 for ms in times_ms if ms), default=None)
 
 
 def _conditions(toxics: Iterable[Toxic]) -> LinkConditions:
-    """As a chain of them: delays add up, of what limits and of what ends a connection the first counts."""
+    """One direction under a chain of toxics: delays add up; the lowest limit and the first end count."""
     given: dict[tuple[str, str], list[int]] = {
         (type, name): [] for type, names in ATTRIBUTES.items() for name in names
     }
@@ -116,7 +122,7 @@ def _conditions(toxics: Iterable[Toxic]) -> LinkConditions:
         distribution="uniform",
         bandwidth_mbps=min(filter(None, given["bandwidth", "rate"]), default=0) * 8e-3,
         slow_close_ms=float(sum(given["slow_close", "delay"])),
-        hang=bool(timeouts or resets),  # both take bytes and pass none on
+        hang=bool(timeouts or resets),  # both read bytes and deliver none
         reset_after_ms=float(min((max(ms, RESET_MS_MIN) for ms in resets), default=0)),
         truncate_bytes=min(given["limit_data", "bytes"], default=0),
     )

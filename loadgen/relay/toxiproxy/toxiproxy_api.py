@@ -1,6 +1,6 @@
 """Toxiproxy's HTTP API (https://github.com/Shopify/toxiproxy#http-api), for its clients in any language.
 
-What it differs in is said in docs/operations.md. What proxies and toxics do is `proxies.py` and `toxics.py`.
+docs/operations.md lists the differences. Proxies and toxics are implemented in `proxies.py` and `toxics.py`.
 """
 
 from dataclasses import replace
@@ -20,14 +20,14 @@ try:
 except ImportError as error:
     raise MissingExtra("the relay", "bench") from error
 
-API_VERSION = "2.12.0"  # of Toxiproxy; the build after the + is ours
+API_VERSION = "2.12.0"  # of Toxiproxy; after it comes "+offboard." and our version
 BODY_BYTES_MAX = 64 << 10
 
 T = TypeVar("T")
 
 
 def toxiproxy_app(proxies: Proxies) -> FastAPI:
-    """The API over these proxies."""
+    """The API of these proxies."""
     app = FastAPI(title="Toxiproxy's API", dependencies=[Depends(_no_browser)], openapi_url=None)
     app.add_exception_handler(Refused, _refused)
     app.add_exception_handler(HTTPException, _not_here)
@@ -57,7 +57,7 @@ def _add_proxies(app: FastAPI, proxies: Proxies) -> None:
     @app.post("/populate", status_code=201)
     async def populate(request: Request) -> dict[str, Any]:
         asked = await _read(request, list[ProxyBody])
-        populated = await proxies.populate([one.settings() for one in asked])
+        populated = await proxies.populate([proxy.settings() for proxy in asked])
         return {"proxies": [proxy.shown() for proxy in populated]}
 
     @app.get("/proxies/{name}")
@@ -106,18 +106,18 @@ def _add_toxics(app: FastAPI, proxies: Proxies) -> None:
 
 
 def _everywhere(listen: Any) -> Any:
-    """`:PORT` is every address, as in Go."""
+    """As in Go, `:PORT` listens on every address."""
     return f"0.0.0.0{listen}" if isinstance(listen, str) and listen.startswith(":") else listen
 
 
 class Body(BaseModel):
-    """Toxiproxy ignores what it does not know, and takes null as left out."""
+    """A request body. As in Toxiproxy, unknown fields are ignored, and null means left out."""
 
     model_config = ConfigDict(extra="ignore", strict=True, allow_inf_nan=False)
 
 
 class ProxyBody(Body):
-    """A new proxy, or what to change of one."""
+    """A new proxy, or changes of a proxy."""
 
     name: str | None = None
     listen: Annotated[str | None, BeforeValidator(_everywhere)] = None
@@ -131,7 +131,7 @@ class ProxyBody(Body):
 
 
 class ToxicBody(Body):
-    """A new toxic, or what to change of one."""
+    """A new toxic, or changes of a toxic."""
 
     name: str | None = None
     type: str | None = None
@@ -143,10 +143,16 @@ class ToxicBody(Body):
         stream = "downstream" if self.stream is None else self.stream
         kind = self.type or ""
         name = self.name or f"{kind}_{stream}"
-        return Toxic(name, kind, stream, self._toxicity(1.0), attributes(kind, self.attributes or {}))
+        return Toxic(
+            name=name,
+            type=kind,
+            stream=stream,
+            toxicity=self._toxicity(1.0),
+            attributes=attributes(kind, self.attributes or {}),
+        )
 
     def changed(self, toxic: Toxic) -> Toxic:
-        """The same toxic with another toxicity, other attributes; the rest cannot be changed."""
+        """The toxic with a new toxicity and new attributes; name, type and stream cannot be changed."""
         new = attributes(toxic.type, self.attributes or {}, toxic.attributes)
         return replace(toxic, toxicity=self._toxicity(toxic.toxicity), attributes=new)
 
@@ -155,16 +161,16 @@ class ToxicBody(Body):
 
 
 async def _read(request: Request, shape: type[T]) -> T:
-    """The body as `shape`, whatever its content type: curl -d, Go and Ruby clients name none or another."""
+    """The body as `shape`. The content type is ignored: curl -d and the Go and Ruby clients send others."""
     body = b""
     try:
         async for chunk in request.stream():
             body += chunk
             if len(body) > BODY_BYTES_MAX:
-                raise Refused(f"request body: {BODY_BYTES_MAX} bytes is the most", 413)
+                raise Refused(f"request body: longer than {BODY_BYTES_MAX} bytes", 413)
         return TypeAdapter(shape).validate_json(body)
     except ClientDisconnect:
-        raise Refused("bad request body: it did not come whole") from None
+        raise Refused("bad request body: the client closed the connection before its end") from None
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
@@ -172,7 +178,7 @@ async def _read(request: Request, shape: type[T]) -> T:
 
 
 async def _no_browser(request: Request) -> None:
-    """No web page may command the relay: as Toxiproxy, which knows browsers by this."""
+    """Refuse browsers, as Toxiproxy does, so that no web page can control the relay."""
     if request.headers.get("user-agent", "").startswith("Mozilla/"):
         raise Refused("User agent not allowed", 403)
 
@@ -183,6 +189,6 @@ async def _refused(_request: Request, error: Exception) -> JSONResponse:
 
 
 async def _not_here(_request: Request, error: Exception) -> JSONResponse:
-    """A path or method that the API does not have."""
+    """Reply to a path or method that the API does not have."""
     assert isinstance(error, HTTPException)
     return JSONResponse({"error": error.detail, "status": error.status_code}, error.status_code)

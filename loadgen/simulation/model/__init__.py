@@ -1,1 +1,1 @@
-"""Modelled machines, links and costs, and the virtual clock."""
+"""Models of computers, links and task costs, and the virtual clock."""

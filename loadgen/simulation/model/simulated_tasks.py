@@ -1,6 +1,7 @@
-"""The tasks that a robot of a scenario asks for, with the work that each truly is.
+"""The tasks of a simulated robot, with the work that each of them really is.
 
-They are those of a real run with this seed: made by the robot's own workload, planned once by the planner.
+They are the tasks of a real run with the same seed: the workload of the robot makes them, and the real
+planner plans each of them once. What their work costs is in `true_costs.py`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,16 +12,16 @@ from offboard.common.errors import ConfigError
 from offboard.common.tasks import Kind, kind_of
 from offboard.common.wire import messages as wire
 from offboard.loadgen.scenario.scenario import Workload
-from offboard.loadgen.simulation.model.costs import COSTS, PARTS, PLANS, ROUNDS, Cost
+from offboard.loadgen.simulation.model.task_costs import COSTS, PARTS, PLANS, ROUNDS, Cost
 from offboard.robot_client.simulated.work import make_work
 
-HASH_BYTES = bytes(32)  # a value as long as the answers of offboard.loadgen.scenario.hash_tasks
-OTHERS_TASKS_MAX = 50  # tasks of each other robot, which asks for them again and again
+HASH_BYTES = bytes(32)  # as long as the answers of offboard.loadgen.scenario.hash_tasks
+OTHERS_TASKS_MAX = 50  # tasks of each other robot, which repeats them
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
-    """One task: input size, work on each site, and the bytes of its request and reply."""
+class SimulatedTask:
+    """One task: its input size, its work on each site, and the bytes of its request and reply."""
 
     size: float
     work: Mapping[str, float]
@@ -29,20 +30,24 @@ class Asked:
 
 
 @dataclass(frozen=True, slots=True)
-class Tasks:
-    """Those of one robot in their order; `told`: results say their work; `blob_bytes` go ahead once."""
+class RobotTasks:
+    """The tasks of one robot, in order.
 
-    asked: Sequence[Asked]
+    - `reports_work`: the answers say how much work the task was.
+    - `blob_bytes`: large arguments, which are sent once.
+    """
+
+    tasks: Sequence[SimulatedTask]
     cost: Cost
-    told: bool
+    reports_work: bool
     blob_bytes: int = 0
 
-    def first(self, count: int) -> "Tasks":
-        return replace(self, asked=self.asked[:count])
+    def first(self, count: int) -> "RobotTasks":
+        return replace(self, tasks=self.tasks[:count])
 
 
-def find_tasks(workload: Workload, seed: int, count: int) -> Tasks:
-    """The first `count` tasks of a robot with this seed; ConfigError where nobody knows what they cost."""
+def find_tasks(workload: Workload, seed: int, count: int) -> RobotTasks:
+    """The first `count` tasks of a robot with this seed; ConfigError if their costs are not known."""
     work = make_work(replace(workload, reference=0, alone=0).robot(seed))
     kind = kind_of(work.function)
     if kind.name not in COSTS:
@@ -51,7 +56,7 @@ def find_tasks(workload: Workload, seed: int, count: int) -> Tasks:
     if kind.warm is not None:
         kind.warm()
     blobs = wire.encode(list(work.request()), kind.types, blobs=True).blobs
-    asked = []
+    tasks = []
     for _ in range(count):
         request = work.request()
         if kind.name in ROUNDS:
@@ -59,17 +64,17 @@ def find_tasks(workload: Workload, seed: int, count: int) -> Tasks:
         else:
             answer = work.function(*request)
             units = dict.fromkeys(PARTS, kind.work_of(answer) or 0.0)
-        asked.append(_asked(kind, request, HASH_BYTES if answer is None else answer, units))
+        tasks.append(_task(kind, request, HASH_BYTES if answer is None else answer, units))
         work.advance(answer)
     blob_bytes = sum(raw.nbytes for raw in blobs.values())
     cost = PLANS[workload.planner] if kind.name == "plan_path" else COSTS[kind.name]
-    return Tasks(asked, cost, kind.work is not None, blob_bytes)
+    return RobotTasks(tasks, cost, kind.work is not None, blob_bytes)
 
 
-def _asked(kind: Kind, request: tuple[Any, ...], answer: Any, units: Mapping[str, float]) -> Asked:
-    """The bytes are those of the messages that would be sent."""
+def _task(kind: Kind, request: tuple[Any, ...], answer: Any, units: Mapping[str, float]) -> SimulatedTask:
+    """The bytes are counted on the messages that a real robot and server would send."""
     body = wire.encode(list(request), kind.types, blobs=True)
-    frames = wire.pack(wire.Request(1, kind.name, 1.0, 1, tuple(body.blobs), body.frames))
-    reply = wire.Reply(1, "ok", "", 0.0, 1.0, 0, body=wire.encode(answer, kind.types).frames, cpu_s=1.0)
+    frames = wire.pack(wire.Request(1, kind.name, 1.0, blobs=tuple(body.blobs), body=body.frames))
+    reply = wire.Reply(1, "ok", run_s=1.0, body=wire.encode(answer, kind.types).frames, cpu_s=1.0)
     size = kind.size_of(kind.bind(request, {}))
-    return Asked(size, units, wire.byte_count(frames), wire.byte_count(wire.pack(reply)))
+    return SimulatedTask(size, units, wire.byte_count(frames), wire.byte_count(wire.pack(reply)))

@@ -1,0 +1,107 @@
+"""One direction of one connection: when bytes that arrive now come out at the other end.
+
+Pure: time is an argument, and randomness comes from a seed. The sockets are in `relay/tcp`.
+"""
+
+import math
+
+from offboard.loadgen.relay.link.bandwidth import Bandwidth
+from offboard.loadgen.relay.link.delay import Delay, varies
+from offboard.loadgen.relay.link.link import SEGMENT_BYTES, LinkConditions
+from offboard.loadgen.relay.link.loss import Loss, stall_ms
+
+
+class Pipe:
+    """Computes when the bytes of one direction of one connection are due.
+
+    arrived --> [ sent at the bandwidth ] --> [ + delay + jitter + stall ] --> due, in order
+
+    Jitter and loss are drawn once for each segment of the byte stream, each from its own random numbers. So
+    a draw depends only on seed, connection, direction and segment number: not on how the stream was cut into
+    chunks, on earlier conditions, or on other effects. Messages that are smaller than a segment can therefore
+    share a draw. A lost segment stalls once, together with all of its bytes that arrived without a gap.
+
+    New `conditions` apply to later chunks.
+    """
+
+    def __init__(self, conditions: LinkConditions, seed: int, connection: int, direction: str) -> None:
+        origin = f"{seed}/{connection}/{direction}"
+        self._delay = Delay(origin)
+        self._loss = Loss(origin)
+        self._busy_until_s = -math.inf
+        self._last_due_s = -math.inf
+        self._segment_stall_ms = 0.0
+        self.taken = 0  # bytes
+        self.drawn_ms = 0.0  # delay and jitter of the segment in which the last chunk ended
+        self.stall_ms = 0.0  # longest stall of the segments of the last chunk
+        self.conditions = conditions
+
+    @property
+    def conditions(self) -> LinkConditions:
+        return self._conditions
+
+    @conditions.setter
+    def conditions(self, conditions: LinkConditions) -> None:
+        self._conditions = conditions
+        self._draws = varies(conditions) or conditions.loss > 0
+        self._bandwidth = Bandwidth(conditions.bandwidth_mbps)
+        self.bucket_bytes = SEGMENT_BYTES if self._draws else self._bandwidth.bucket_bytes
+
+    @property
+    def segment(self) -> int:
+        """Number of the segment that the next byte belongs to."""
+        return self.taken // SEGMENT_BYTES
+
+    def chunk_bytes(self, size: int) -> int:
+        """How many of the next `size` bytes travel together, as one chunk.
+
+        A chunk is one segment where each segment draws its own delay, so that a late segment does not hold
+        those before it. Else a chunk is at most one bucket of the bandwidth. Without a bandwidth limit it is
+        all `size` bytes.
+        """
+        if self.bucket_bytes is None:
+            return size
+        return min(size, self.bucket_bytes - self.taken % SEGMENT_BYTES)
+
+    def left(self, size: int) -> int:
+        """How many of the next `size` bytes come before the stream is truncated."""
+        most = self._conditions.truncate_bytes
+        return min(size, max(0, most - self.taken)) if most else size
+
+    def due(self, arrived_s: float, size: int) -> float:
+        """When the last of the next `size` bytes comes out; an outage may hold it longer.
+
+        A size of 0 is the end of the stream.
+        """
+        if arrived_s > self._busy_until_s:  # bytes after a gap were not lost with the start of the segment
+            self._segment_stall_ms = 0.0
+        sent_s = max(arrived_s, self._busy_until_s)
+        self.stall_ms = 0.0
+        if size == 0:
+            return self._end_due(sent_s)
+        due_s = self._last_due_s
+        left = size
+        while left:
+            part = min(left, SEGMENT_BYTES - self.taken % SEGMENT_BYTES) if self._draws else left
+            sent_s += self._bandwidth.sending_s(part)
+            due_s = max(due_s, sent_s + self._late_s())
+            self.taken += part
+            left -= part
+        self._busy_until_s, self._last_due_s = sent_s, due_s
+        return due_s
+
+    def _end_due(self, sent_s: float) -> float:
+        """When the end of the stream comes out: as late as the last segment, and never lost."""
+        self.drawn_ms = self._delay.at_ms(max(0, self.taken - 1) // SEGMENT_BYTES, self._conditions)
+        due_s = max(self._last_due_s, sent_s + self.drawn_ms / 1e3)
+        return due_s + self._conditions.slow_close_ms / 1e3
+
+    def _late_s(self) -> float:
+        """Delay, jitter and stall of the next part of a segment."""
+        self.drawn_ms = self._delay.at_ms(self.segment, self._conditions)
+        if self.taken % SEGMENT_BYTES == 0:
+            now = self._conditions
+            times = self._loss.times(self.segment, now.loss, now.loss_burst)
+            self._segment_stall_ms = stall_ms(times, now.stall_ms)
+        self.stall_ms = max(self.stall_ms, self._segment_stall_ms)
+        return (self.drawn_ms + self._segment_stall_ms) / 1e3

@@ -1,0 +1,78 @@
+"""The simulated runner of the site `onboard`: the computer of the robot, and the load that it measures."""
+
+import math
+from concurrent.futures import Future
+from functools import partial
+
+from offboard.common.errors import Overtaken
+from offboard.common.host.load import EVERY_S, HURRIED_S, LOADED
+from offboard.common.tasks import Kind, Task
+from offboard.loadgen.simulation.model.simulated_cpu import Run, SimulatedCpu
+from offboard.loadgen.simulation.model.simulated_load import SimulatedLoad
+from offboard.loadgen.simulation.model.true_costs import TrueCosts
+from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
+from offboard.loadgen.testbed.testbed import ROBOT
+from offboard.robot_client.sites.own_cpu import OwnCpu
+from offboard.robot_client.sites.runner import ONBOARD, Condition, Execution
+
+
+class SimulatedOnboard:
+    """Runs one task at a time on the CPU quota of the robot, as `OnboardRunner` does."""
+
+    site = ONBOARD
+
+    def __init__(self, clock: VirtualClock, cpu: SimulatedCpu, costs: TrueCosts) -> None:
+        self._clock = clock
+        self._cpu = cpu
+        self._costs = costs
+        self._runs: dict[int, tuple[Run, Future[Execution]]] = {}
+        self._load = SimulatedLoad(clock, cpu)
+        self.own_cpu = OwnCpu()
+
+    def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - onboard always exists
+        return None
+
+    def submit(self, task: Task, budget_s: float) -> "Future[Execution]":  # noqa: ARG002 - it has no limit
+        future: Future[Execution] = Future()
+        cpu_s = self._costs.cpu_s(ONBOARD, task)
+        run = self._cpu.add(cpu_s, partial(self._ended, task, cpu_s), owner=ROBOT)
+        self._runs[task.id] = run, future
+        self.own_cpu.begin()
+        return future
+
+    def cancel(self, task: Task) -> None:
+        """End the run, even if it has begun: the tasks of scenarios check often if they are cancelled."""
+        run, future = self._runs.pop(task.id, (None, None))
+        if run is not None and future is not None:
+            self._cpu.stop(run)
+            self.own_cpu.end(self._clock.now_s())
+            failure, seconds = Overtaken("another site answered first"), self._clock.now_s() - run.added_s
+            started = run.begun_s < math.inf
+            future.set_result(Execution(ONBOARD, seconds, failure=failure, censored=True, started=started))
+
+    def hurry(self) -> None:
+        self._load.share(HURRIED_S)
+
+    def condition(self) -> Condition:
+        load = self._load.share(self.own_cpu.pause_s(EVERY_S))
+        self.own_cpu.loaded = load > LOADED
+        return Condition(load=load, capacity=self._load.capacity)
+
+    def close(self) -> None:
+        pass
+
+    def _ended(self, task: Task, cpu_s: float, run: Run) -> None:
+        _, future = self._runs.pop(task.id)
+        now_s = self._clock.now_s()
+        self.own_cpu.end(now_s)
+        future.set_result(
+            Execution(
+                ONBOARD,
+                now_s - run.added_s,
+                self._costs.value(task),
+                queue_s=run.begun_s - run.added_s,
+                run_s=now_s - run.begun_s,
+                network_s=0.0,
+                cpu_s=cpu_s,
+            )
+        )

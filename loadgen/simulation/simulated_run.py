@@ -1,0 +1,196 @@
+"""One simulated run of a scenario: the real `Offloader` runs its tasks on a simulated testbed.
+
+The computers and links are in `simulated_testbed.py`; several runs at once are in `simulation_pool.py`.
+"""
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from offboard.loadgen.scenario.event_timeline import Timeline
+from offboard.loadgen.scenario.interval_coverage import intervals_of, late_seconds
+from offboard.loadgen.scenario.outcome import Answered, Outcome, Reference
+from offboard.loadgen.scenario.scenario import Scenario
+from offboard.loadgen.simulation.model.lockstep_clock import LockstepClock
+from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks
+from offboard.loadgen.simulation.simulated_testbed import SimulatedTestbed
+from offboard.loadgen.testbed.testbed import ROBOT
+from offboard.robot_client import policies, predictors
+from offboard.robot_client.offloader import BOTH, Offloader
+from offboard.robot_client.records.trace import Record, as_dict
+from offboard.robot_client.simulated.run import OwnRecord
+from offboard.robot_client.simulated.workload import CLOSED, due_instants
+from offboard.robot_client.sites import heartbeat
+from offboard.robot_client.sites.runner import CLOUD
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedReference(Reference):
+    """The time that each site alone would have taken for a task, and the time that the robot waited."""
+
+    waited_s: float
+
+    @property
+    def sent_s(self) -> float:
+        """The time that the robot waited, with hedges, probes and cancelled runs."""
+        return self.waited_s
+
+
+def simulate(scenario: Scenario, tasks: Mapping[str, RobotTasks], *, noise: float = 1.0) -> Outcome:
+    """Play the scenario to its end, and return the outcome of the first robot.
+
+    `tasks` are those of each robot by name. A `noise` of 0 removes the random part of the costs.
+    """
+    run = _Run(scenario, tasks, noise)
+    with run.offload:
+        run.play()
+    deadline_ms = scenario.workload.deadline_ms
+    return Outcome(
+        asked={ROBOT: scenario.workload.tasks},
+        answered=run.answered(),
+        references=run.references,
+        deadline_s=None if deadline_ms is None else deadline_ms / 1e3,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Ended:
+    """A task that has ended, with its line of the trace."""
+
+    number: int
+    due_s: float
+    ended_s: float
+    line: dict[str, Any]
+
+
+class _Run:
+    """The first robot at work.
+
+    Only closed arrivals have references. With open arrivals several tasks run at once, and the time of one
+    task depends on the others.
+    """
+
+    def __init__(self, scenario: Scenario, tasks: Mapping[str, RobotTasks], noise: float) -> None:
+        self._ended: list[_Ended] = []
+        self.references: list[Reference] = []
+        self._scenario = scenario
+        self._clock = LockstepClock()
+        self._timeline = Timeline(scenario.timeline())
+        self._in_flight = 0
+        self._queue: deque[tuple[int, float]] = deque()  # tasks that are due, while too many are in flight
+        name = predictor_of(scenario)
+        plain = name.removeprefix(predictors.WORK)
+        heartbeat_s = heartbeat.EVERY_S if predictors.conditional(plain) else 0.0
+        self._testbed = SimulatedTestbed(scenario, tasks, self._clock, heartbeat_s=heartbeat_s, noise=noise)
+        self._own = OwnRecord()
+        robot = scenario.robot
+        self.offload = Offloader(
+            [self._testbed.cloud, self._testbed.onboard],
+            policy=policies.make(robot.policy, scenario.seed),
+            predictor=partial(predictors.make, plain, robot.window, scenario.seed),
+            shared_work=name != plain,
+            timeout_s=robot.timeout_s,
+            observers=[self._own],
+            clock=self._clock,
+        )
+
+    def play(self) -> None:
+        for at_s in {event.at_s for event in self._timeline.left() if event.at_s is not None}:
+            self._clock.at(at_s, self._play_events)
+        self._play_events()
+        self._testbed.begin()
+        if self._scenario.workload.arrivals == CLOSED:
+            for number in range(self._scenario.workload.tasks):
+                self._offload(number, self._clock.now_s())
+        else:
+            self._play_open()
+
+    def _play_open(self) -> None:
+        """Start each task when it is due, or as soon as there are less than `in_flight` tasks in flight."""
+        workload = self._scenario.workload
+        assert workload.rate is not None, "checked when the scenario was read"
+        instants = due_instants(workload.arrivals, workload.rate, workload.burst, self._scenario.seed)
+        for number, due_s in zip(range(workload.tasks), instants, strict=False):
+            self._clock.pass_by(due_s - self._clock.now_s())
+            self._queue.append((number, due_s))
+            self._begin()
+        while self._in_flight:
+            self._clock.step(math.inf)
+
+    def _begin(self) -> None:
+        while self._queue and self._in_flight < self._scenario.workload.in_flight:
+            number, due_s = self._queue.popleft()
+            self._in_flight += 1
+            self._clock.begin(partial(self._offload_open, number, due_s))
+
+    def _offload_open(self, number: int, due_s: float) -> None:
+        self._offload(number, due_s)
+        self._in_flight -= 1
+        self._clock.at(self._clock.now_s(), self._begin)
+
+    def _play_events(self) -> None:
+        """Make all events happen that are due."""
+        for event in self._timeline.due(self._clock.now_s(), len(self._ended)):
+            self._testbed.happen(event)
+
+    def _offload(self, number: int, due_s: float) -> None:
+        costs, workload = self._testbed.costs, self._scenario.workload
+        self._clock.pass_by(self._testbed.deciding_s)
+        began_s, foreseen = self._clock.now_s(), self._testbed.foresee(number)
+        where = BOTH if number < workload.measure else None
+        self.offload(costs.function, costs.task(number).size, number, where=where)
+        record = self._own.take()
+        assert record is not None, "the offloader passes every record to its observers"
+        ended = _Ended(number, due_s, self._clock.now_s(), as_dict(record))
+        self._ended.append(ended)
+        if workload.arrivals == CLOSED:
+            self.references.append(self._reference(record, ended, began_s - due_s, foreseen))
+        self._play_events()
+
+    def answered(self) -> list[Answered]:
+        """All tasks, each with the runs that ended after the task itself."""
+        late = late_seconds(ended.line for ended in self._ended)
+        return [
+            Answered(
+                i=ended.number,
+                robot=ROBOT,
+                due_s=ended.due_s,
+                ended_s=ended.ended_s,
+                error=None,
+                answer=None,
+                chosen=ended.line["decision"]["site"],
+                both=ended.line["decision"]["both"],
+                sites=tuple(execution["site"] for execution in ended.line["executions"]),
+                intervals=intervals_of(ended.line, late),
+            )
+            for ended in self._ended
+        ]
+
+    def _reference(
+        self, record: Record, ended: _Ended, deciding_s: float, foreseen: Mapping[str, float]
+    ) -> SimulatedReference:
+        """The times of the sites alone. A cloud that would exceed the timeout counts as given up."""
+        timeout_s = self._scenario.robot.timeout_s
+        seconds = {site: deciding_s + site_s for site, site_s in foreseen.items()}
+        given_up_s = {}
+        if foreseen.get(CLOUD, 0.0) >= timeout_s:
+            given_up_s[CLOUD] = deciding_s + timeout_s
+            del seconds[CLOUD]
+        decision, waited_s = record.decision, ended.ended_s - ended.due_s
+        return SimulatedReference(
+            i=ended.number,
+            chosen=decision.site,
+            both=decision.both,
+            seconds=seconds,
+            given_up_s=given_up_s,
+            waited_s=waited_s,
+        )
+
+
+def predictor_of(scenario: Scenario) -> str:
+    """The predictor of the scenario, or else the default predictor of its policy."""
+    named = scenario.robot.predictor
+    return policies.predictor_of(scenario.robot.policy) if named is None else named
