@@ -11,7 +11,7 @@ from benchmarks.measure import Bar, Table, each_of
 from offboard.common.tasks import Kind, Task, kind_of, task
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.policies import Policy
+from offboard.robot_client.policies import Policy, Probe
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
 
 CALLS = 2_000
@@ -146,8 +146,8 @@ def _thinks(offload: Offloader) -> Callable[[int], None]:
         for n, one in enumerate(tasks[:count]):
             asked = offload._ask(one, "", {}, None, 2.0, None)
             decision = asked.decision
-            sites = [decision.site, decision.second] if decision.second_after_s == 0 else [decision.site]
-            offload._learn(asked, [ran[site][n] for site in sites if site])
+            probed = [decision.second.site] if isinstance(decision.second, Probe) else []
+            offload._learn(asked, [ran[site][n] for site in (decision.site, *probed)])
 
     return think
 

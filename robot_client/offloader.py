@@ -389,14 +389,14 @@ class Offloader:
             return self._pinned(kind, forecast, where)
         if len(forecast.sites) == 1:
             why = "; ".join(f"{site}: {why}" for site, why in absent.items()) or "no other site"
-            return Decision(ONBOARD, False, why, "none")
+            return Decision(ONBOARD, why, "none")
         decision = policy.decide(forecast)
         if decision.both and not kind.duplicate:
             # Warm-up without running twice: the site that knows least learns next.
             memory = self._memory(kind)
             heard = [site for site in forecast.sites if site not in decision.spared]
             site = min(heard, key=lambda site: (len(memory.site(site).predictor), site != ONBOARD))
-            return Decision(site, False, f"{decision.reason}; never on two sites", decision.policy)
+            return Decision(site, f"{decision.reason}; never on two sites", decision.policy)
         if decision.second is not None and not kind.duplicate:
             return replace(decision, second=None)
         return decision
@@ -438,10 +438,11 @@ class Offloader:
         self._check_where(kind, where)
         if where == BOTH:
             both = len(forecast.sites) > 1
-            return Decision(ONBOARD, both, "measured on both" if both else "only onboard was there", PINNED)
+            why = "measured on both" if both else "only onboard was there"
+            return Decision(ONBOARD, why, PINNED, both=both)
         if where not in forecast.sites:
-            return Decision(ONBOARD, False, f"pinned to {where}, which cannot take it", PINNED)
-        return Decision(where, False, "pinned by the caller", PINNED)
+            return Decision(ONBOARD, f"pinned to {where}, which cannot take it", PINNED)
+        return Decision(where, "pinned by the caller", PINNED)
 
     def _execute(self, asked: Asked, timeout_s: float, call: "Future[str] | None") -> tuple[Execution, ...]:
         decision, sites = asked.decision, asked.forecast.sites
@@ -461,9 +462,7 @@ class Offloader:
             if decision.policy != PINNED:  # measuring is the caller's choice, not the policy's
                 self._take_duplicates(len(first) - 1)
         try:
-            return race.run(
-                Plan(first, decision.second, decision.second_after_s, all=decision.both, call=call)
-            )
+            return race.run(Plan(first, decision.second, all=decision.both, call=call))
         except BaseException:  # closed meanwhile, or Ctrl-C: whatever still runs is nobody's
             with self._lock:
                 for flights in self._flights.values():

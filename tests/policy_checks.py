@@ -9,7 +9,7 @@ import random
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
-from offboard.robot_client.policies import Decision, Forecast, Outlook, Policy
+from offboard.robot_client.policies import Decision, Forecast, Hedge, Outlook, Policy
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition
 
 Make = Callable[[], Policy]
@@ -24,9 +24,10 @@ def decides_among_the_sites_of_the_forecast(make: Make) -> None:
     for forecast, decision in decisions(make(), forecasts()):
         assert decision.site in forecast.sites
         assert set(decision.spared) <= forecast.sites.keys() - {decision.site}
-        assert 0 <= decision.second_after_s < math.inf
+        if isinstance(decision.second, Hedge):
+            assert 0 < decision.second.after_s < math.inf
         if decision.second is not None:
-            assert decision.second in forecast.sites.keys() - {decision.site}
+            assert decision.second.site in forecast.sites.keys() - {decision.site}
             assert not decision.both
 
 
@@ -63,7 +64,7 @@ def starts_no_second_run_on_a_silent_site(make: Make) -> None:
     """A site whose heartbeats go unanswered is neither probed nor hedged to."""
     for forecast, decision in decisions(make(), forecasts()):
         if decision.second is not None:
-            assert not forecast.sites[decision.second].condition.silent
+            assert not forecast.sites[decision.second.site].condition.silent
 
 
 def starts_no_second_run_beyond_the_allowance(make: Make) -> None:
@@ -76,7 +77,7 @@ def decides_before_anything_is_known(make: Make) -> None:
     """Sites of which nothing was learnt yet are decided about like others."""
     for forecast, decision in decisions(make(), (unknown(one) for one in forecasts())):
         assert decision.site in forecast.sites
-        assert decision.second is None or decision.second_after_s == 0, "nothing tells when a site is late"
+        assert not isinstance(decision.second, Hedge), "nothing tells when a site is late"
 
 
 def has_a_look_at_one_forecast_only(make: Make) -> None:

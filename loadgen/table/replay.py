@@ -22,7 +22,7 @@ from offboard.loadgen.table.score import Scored, Sides
 from offboard.loadgen.table.table_two import BOTH, FULL, Asked
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.policies import Decision, Forecast, Policy
+from offboard.robot_client.policies import Decision, Forecast, Policy, Probe
 from offboard.robot_client.predictors.window import WINDOW, WINDOW_MAX
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
 
@@ -134,7 +134,7 @@ def replay(
 
 def _ran_both(decision: Decision) -> bool:
     """A probe runs both at once; a hedge waits for a time that a replayed task does not have."""
-    return decision.both or (decision.second is not None and decision.second_after_s == 0)
+    return decision.both or isinstance(decision.second, Probe)
 
 
 class _Chooser:

@@ -19,7 +19,7 @@ from offboard.robot_client.execution.placement import (
     next_start,
     takeover,
 )
-from offboard.robot_client.policies.forecast import Decision, Forecast, Outlook
+from offboard.robot_client.policies import Decision, Forecast, Outlook
 from offboard.robot_client.policies.rules import WARM_UP
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.clock import Clock
@@ -40,8 +40,8 @@ class Placed:
 
     def decide(self, forecast: Forecast) -> Decision:
         if self.site not in forecast.sites:
-            return Decision(ONBOARD, False, f"{self.reason}; {self.site} cannot take it", NAME)
-        return Decision(self.site, False, self.reason, NAME)
+            return Decision(ONBOARD, f"{self.reason}; {self.site} cannot take it", NAME)
+        return Decision(self.site, self.reason, NAME)
 
 
 Predict = Callable[[float, Mapping[str, int]], Forecast]

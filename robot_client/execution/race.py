@@ -10,20 +10,20 @@ from typing import Any
 
 from offboard.common.errors import BadValue, CloudBroken, CloudError, Overtaken, TaskError
 from offboard.common.tasks import Kind, Task
+from offboard.robot_client.policies import Hedge, Probe
 from offboard.robot_client.sites.clock import Clock
 from offboard.robot_client.sites.runner import ONBOARD, Execution, Runner
 
 
 @dataclass(slots=True)
 class Plan:
-    """`first` start at once, `second` when no answer has come after `after_s`; `all`: wait for every one.
+    """`first` start at once; `second` is a second run; `all`: wait for every one.
 
     `call`: a site that starts too once this names it.
     """
 
     first: tuple[str, ...]
-    second: str | None = None
-    after_s: float = 0.0
+    second: Probe | Hedge | None = None
     all: bool = False
     call: "Future[str] | None" = None
 
@@ -64,7 +64,7 @@ class Race:
             self._wait_for_all()
         else:
             if plan.second is not None:
-                self._start_second(plan.second, plan.after_s)
+                self._start_second(plan.second)
             self._wait_for_answer(plan.call)
         executions = {site: _finished(site, run) for site, (run, _) in self._runs.items() if run.done()}
         if ONBOARD not in self._runs and all(
@@ -75,8 +75,8 @@ class Race:
             executions[ONBOARD] = _finished(ONBOARD, self._runs[ONBOARD][0])
         for site, (run, began_s) in self._runs.items():
             if site not in executions:
-                probed = plan.second is not None and plan.after_s == 0.0
-                executions[site] = self._leave(site, run, began_s, keep=probed)
+                keep = isinstance(plan.second, Probe)
+                executions[site] = self._leave(site, run, began_s, keep=keep)
         return tuple(executions[site] for site in self._runs)
 
     def _start(self, site: str) -> None:
@@ -84,16 +84,16 @@ class Race:
         began_s = self._clock.now_s()
         self._runs[site] = self._runners[site].submit(self._task, self._timeout_s), began_s
 
-    def _start_second(self, site: str, after_s: float) -> None:
+    def _start_second(self, second: Probe | Hedge) -> None:
         late: list[str] = []
-        if after_s > 0:
+        if isinstance(second, Hedge):
             late, runs = list(self._runs), [run for run, _ in self._runs.values()]
             if not any(run.done() for run in runs):
-                self._clock.wait(runs, after_s)
+                self._clock.wait(runs, second.after_s)
             if any(run.done() for run in runs):
                 return
         if self._allowed():
-            self._start(site)
+            self._start(second.site)
         for first in late:  # after the start: a robot may be late for want of CPU
             self._runners[first].hurry()
 

@@ -13,7 +13,7 @@ from offboard.common.host.load import LOADED
 from offboard.common.tasks import Task
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.regret import RegretEstimate
-from offboard.robot_client.policies import Decision, Forecast, Outlook
+from offboard.robot_client.policies import Decision, Forecast, Outlook, Probe
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.sites.runner import ONBOARD, Execution, Runner
 
@@ -105,7 +105,8 @@ class Learning:
         outlook = asked.forecast.sites.get(site)
         if memory.conditional and outlook is not None:
             outlook = self._in_hindsight(outlook, execution)
-        beside = site != ONBOARD and decision.site == ONBOARD and (decision.both or decision.second == site)
+        also_here = decision.second is not None and decision.second.site == site
+        beside = site != ONBOARD and decision.site == ONBOARD and (decision.both or also_here)
         memory.learn(
             amount,
             execution,
@@ -116,10 +117,10 @@ class Learning:
             beside=beside,
             ahead=ahead,
         )
-        if execution.ok and decision.second is not None and decision.second_after_s == 0:
+        if execution.ok and isinstance(decision.second, Probe):
             asked.seconds[site] = execution.seconds
             if len(asked.seconds) == 2:
-                self.regret.learn(asked.seconds[decision.site], asked.seconds[decision.second])
+                self.regret.learn(asked.seconds[decision.site], asked.seconds[decision.second.site])
 
     def _held_up(self, site: str) -> bool:
         """Whether a server does not answer, or may not."""

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 from offboard.common.errors import ConfigError
 
 if TYPE_CHECKING:
-    from offboard.robot_client.policies.forecast import PINNED, Decision, Forecast, Outlook, Policy
+    from offboard.robot_client.policies.decision import PINNED, Decision, Hedge, Policy, Probe
+    from offboard.robot_client.policies.forecast import Forecast, Outlook
 
 __all__ = [
     "DEFAULT",
@@ -20,8 +21,10 @@ __all__ = [
     "PINNED",
     "Decision",
     "Forecast",
+    "Hedge",
     "Outlook",
     "Policy",
+    "Probe",
     "check_name",
     "make",
     "names",
@@ -59,7 +62,8 @@ def __getattr__(name: str) -> Any:
     """What a policy is written with; loaded where it is first asked for."""
     if name not in __all__:
         raise AttributeError(name)
-    return getattr(importlib.import_module("offboard.robot_client.policies.forecast"), name)
+    home = "forecast" if name in ("Forecast", "Outlook") else "decision"
+    return getattr(importlib.import_module(f"offboard.robot_client.policies.{home}"), name)
 
 
 def make(name: str, seed: int = 0) -> "Policy":

@@ -1,15 +1,13 @@
 """What a policy decides from, and what it decides."""
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 from offboard.robot_client.learning.intervals import Conformal
 from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition
 
 OVERDUE_SD = 2.0  # standard deviations beyond its prediction, while too few errors are known
-PINNED = "pinned"  # what stands for a policy where the caller said where to run
 
 
 @dataclass(slots=True)
@@ -71,34 +69,6 @@ class Forecast:
     def only(self, sites: Collection[str]) -> "Forecast":
         """The same with these sites alone."""
         return replace(self, sites={name: one for name, one in self.sites.items() if name in sites})
-
-
-@dataclass(slots=True)
-class Decision:
-    """Run on `site`, or on all sites but those `spared` in parallel where `both`; `why` is for people.
-
-    `second`: a site that starts too when no answer has come after `second_after_s`; the first good answer is
-    used. At 0 s it is a shadow probe, whose time is learnt to the end; later it is a hedge, and whoever
-    comes second is given up.
-    """
-
-    site: str
-    both: bool
-    why: str | Callable[[], str]  # called where somebody reads it: most decisions nobody asks about
-    policy: str
-    second: str | None = None
-    second_after_s: float = 0.0
-    spared: tuple[str, ...] = ()
-
-    @property
-    def reason(self) -> str:
-        return self.why if isinstance(self.why, str) else self.why()
-
-
-class Policy(Protocol):
-    """Called once a task, under the offloader's lock."""
-
-    def decide(self, forecast: Forecast) -> Decision: ...
 
 
 def cheapest(costs: Mapping[str, float]) -> str:

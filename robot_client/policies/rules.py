@@ -4,15 +4,8 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from random import Random
 
-from offboard.robot_client.policies.forecast import (
-    Decision,
-    Forecast,
-    Policy,
-    cheapest,
-    costs_of,
-    explain,
-    home,
-)
+from offboard.robot_client.policies.decision import Decision, Policy
+from offboard.robot_client.policies.forecast import Forecast, cheapest, costs_of, explain, home
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 WARM_UP = 6  # observations of each site before anything is compared
@@ -28,11 +21,11 @@ class Paper:
         if cold:
             # Algorithm 1, warm-up branch: both sites, until both queues are full.
             reason = f"warm-up: the window of {' and '.join(sorted(cold))} is not full"
-            return Decision(home(forecast), len(forecast.sites) > 1, reason, "paper")
+            return Decision(home(forecast), reason, "paper", both=len(forecast.sites) > 1)
         predicted = {site: outlook.predicted_s or 0.0 for site, outlook in forecast.sites.items()}
         # Eq. 1: the cloud only where it is strictly faster; a tie stays onboard.
         site = cheapest(predicted)
-        return Decision(site, False, partial(_compared, predicted, site), "paper")
+        return Decision(site, partial(_compared, predicted, site), "paper")
 
 
 class Always:
@@ -43,8 +36,8 @@ class Always:
 
     def decide(self, forecast: Forecast) -> Decision:
         if self._site in forecast.sites:
-            return Decision(self._site, False, f"always {self._site}", self._site)
-        return Decision(home(forecast), False, f"{self._site} cannot take it", self._site)
+            return Decision(self._site, f"always {self._site}", self._site)
+        return Decision(home(forecast), f"{self._site} cannot take it", self._site)
 
 
 class Greedy:
@@ -56,7 +49,7 @@ class Greedy:
         if (warming := warm_up(forecast, self.name)) is not None:
             return warming
         site = self._choose(forecast, costs_of(forecast))
-        return Decision(site, False, partial(explain, forecast, site), self.name)
+        return Decision(site, partial(explain, forecast, site), self.name)
 
     def _choose(self, forecast: Forecast, costs: dict[str, float]) -> str:  # noqa: ARG002 - leaves look at it
         return cheapest(costs)
@@ -134,7 +127,7 @@ def warm_up(forecast: Forecast, policy: str) -> Decision | None:
         return None
     reason = f"warm-up: too little is known of {' and '.join(sorted(cold))}"
     silent = tuple(site for site in forecast.sites if site not in heard)
-    return Decision(home(forecast.only(heard)), True, reason, policy, spared=silent)
+    return Decision(home(forecast.only(heard)), reason, policy, both=True, spared=silent)
 
 
 RULES: dict[str, Callable[[Random], Policy]] = {

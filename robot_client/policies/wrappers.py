@@ -4,7 +4,9 @@ import math
 from collections.abc import Callable, Collection
 from dataclasses import replace
 
-from offboard.robot_client.policies.forecast import Decision, Forecast, Outlook, Policy, cheapest
+from offboard.robot_client.policies import decision as decided
+from offboard.robot_client.policies.decision import Decision, Policy
+from offboard.robot_client.policies.forecast import Forecast, Outlook, cheapest
 from offboard.robot_client.sites.runner import ONBOARD
 
 PROBE_EVERY = 20  # tasks without news of a site
@@ -12,7 +14,7 @@ MEASURED = 2.0  # times more seldom is onboard tried: its load and its capacity 
 SELDOM_MAX = 8.0  # times more seldom, at most
 STALE = round(PROBE_EVERY * SELDOM_MAX)  # tasks without news after which every site is tried
 RESERVED = 1  # second runs that are left for hedges
-HEDGE_MIN_S = 1e-3  # a wait of 0 is a probe
+HEDGE_MIN_S = 1e-3  # that the first site always has
 BREAK_AFTER = 3  # failures in a row
 BROKEN_FOR, BROKEN_MAX = 10, 160  # tasks: after the first break, doubling, at most
 
@@ -47,9 +49,7 @@ class Probe:
                 stalest, age = site, one.age
         if not stalest:
             return decision
-        return replace(
-            decision, second=stalest, second_after_s=0.0, why=f"{decision.reason}; {stalest} is probed"
-        )
+        return replace(decision, second=decided.Probe(stalest), why=f"{decision.reason}; {stalest} is probed")
 
 
 class Hedge:
@@ -77,8 +77,8 @@ class Hedge:
         after_s = forecast.sites[decision.site].overdue_s(others[second])
         if after_s is None:
             return decision
-        after_s = max(after_s, HEDGE_MIN_S)
-        return Decision(decision.site, False, decision.why, decision.policy, second, second_after_s=after_s)
+        hedge = decided.Hedge(second, max(after_s, HEDGE_MIN_S))
+        return Decision(decision.site, decision.why, decision.policy, second=hedge)
 
 
 class Breaker:
@@ -113,7 +113,7 @@ class Budget:
         decision = _among(fit, forecast, self._inner)
         if decision.both and not _fits(forecast, forecast.sites.keys() - decision.spared):
             return replace(decision, both=False, spared=(), why=f"{decision.reason}; the caps leave one site")
-        if decision.second is not None and not _fits(forecast, {decision.site, decision.second}):
+        if decision.second is not None and not _fits(forecast, {decision.site, decision.second.site}):
             return replace(decision, second=None)
         return decision
 

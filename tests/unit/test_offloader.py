@@ -21,7 +21,7 @@ from offboard.common.errors import (
 from offboard.common.tasks import Task, task
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.policies import Decision, Forecast
+from offboard.robot_client.policies import Decision, Forecast, Probe
 from offboard.robot_client.policies.allowance import DUPLICATES, Allowance
 from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution, Runner
@@ -33,7 +33,7 @@ class Scripted:
     """Decides as it is told."""
 
     def __init__(self) -> None:
-        self.next = Decision(ONBOARD, False, "plain", "scripted")
+        self.next = Decision(ONBOARD, "plain", "scripted")
 
     def decide(self, forecast: Forecast) -> Decision:  # noqa: ARG002
         return self.next
@@ -430,14 +430,14 @@ def test_a_server_that_is_probed_beside_an_own_run_is_not_taken_for_slow(
         [home, cloud], policy=policy, predictor=lambda: predictors.make("average", 50), clock=clock
     ) as offload:
         for _ in range(30):
-            policy.next = Decision(CLOUD, False, "plain", "scripted")
+            policy.next = Decision(CLOUD, "plain", "scripted")
             offload(add_one, 2)
         cloud.takes = 0.06
         for _ in range(30):
-            policy.next = Decision(chosen, False, "probe", "scripted", second)
+            policy.next = Decision(chosen, "probe", "scripted", second=Probe(second) if second else None)
             offload(add_one, 2)
             clock.run_out()
-        policy.next = Decision(ONBOARD, False, "plain", "scripted")
+        policy.next = Decision(ONBOARD, "plain", "scripted")
         offload(add_one, 2)
         assert offload.last is not None
         found = offload.last.sites[CLOUD].predicted_s

@@ -14,7 +14,7 @@ from offboard.common.errors import CloudBroken, CloudBusy, CloudTimeout, Offload
 from offboard.common.tasks import task
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.policies import Decision, Forecast, Policy
+from offboard.robot_client.policies import Decision, Forecast, Hedge, Policy, Probe
 from offboard.robot_client.policies.allowance import DUPLICATES_MAX, Allowance
 from offboard.robot_client.predictors.least_squares import LeastSquares
 from offboard.robot_client.records.trace import Late, Record
@@ -26,11 +26,11 @@ PLAIN_S = {ONBOARD: 0.01, CLOUD: 0.02}  # of tasks without a fault
 TIMEOUT_S = 2.0
 HEDGE_S = 0.4
 
-WARM_UP = Decision(ONBOARD, True, "warm-up", "scripted")
-PROBE = Decision(ONBOARD, False, "probe", "scripted", CLOUD)
-PROBE_BACK = Decision(CLOUD, False, "probe", "scripted", ONBOARD)
-HEDGE = Decision(CLOUD, False, "hedge", "scripted", ONBOARD, HEDGE_S)
-HEDGE_AWAY = Decision(ONBOARD, False, "hedge", "scripted", CLOUD, HEDGE_S)
+WARM_UP = Decision(ONBOARD, "warm-up", "scripted", both=True)
+PROBE = Decision(ONBOARD, "probe", "scripted", second=Probe(CLOUD))
+PROBE_BACK = Decision(CLOUD, "probe", "scripted", second=Probe(ONBOARD))
+HEDGE = Decision(CLOUD, "hedge", "scripted", second=Hedge(ONBOARD, HEDGE_S))
+HEDGE_AWAY = Decision(ONBOARD, "hedge", "scripted", second=Hedge(CLOUD, HEDGE_S))
 
 BROKEN, BUSY, LATE = CloudBroken("gone"), CloudBusy("full"), CloudTimeout("late")
 FAILED = TaskFailed("ValueError: no")
@@ -47,7 +47,7 @@ class Scripted:
     """Decides as it is told."""
 
     def __init__(self) -> None:
-        self.next = Decision(ONBOARD, False, "plain", "scripted")
+        self.next = Decision(ONBOARD, "plain", "scripted")
 
     def decide(self, forecast: Forecast) -> Decision:  # noqa: ARG002
         return self.next
@@ -183,13 +183,13 @@ def test_a_fault_costs_no_answer_and_teaches_nobody_a_wrong_time(case: Case) -> 
     """Answers, records, executions, duplicates and what was learnt are those of the case, no more."""
     scene = Scene()
     sites = scene.sites
-    assert scene.ask(1, Decision(CLOUD, False, "plain", "scripted")) == 100
+    assert scene.ask(1, Decision(CLOUD, "plain", "scripted")) == 100
     sites[ONBOARD].scripts.append(case.onboard)
     sites[CLOUD].scripts.append(case.cloud)
     assert scene.ask(2, case.decision) == case.answer
     for site in sites.values():
         site.scripts.clear()
-    assert scene.ask(3, Decision(CLOUD, False, "plain", "scripted")) == 300
+    assert scene.ask(3, Decision(CLOUD, "plain", "scripted")) == 300
     scene.clock.run_out()
 
     assert [(one.size, one.waited_s >= 0) for one in scene.records] == [(1, True), (2, True), (3, True)]
@@ -231,7 +231,7 @@ def test_what_ended_late_is_in_the_next_record_with_its_own_tasks_id() -> None:
     scene.sites[CLOUD].scripts.append((0.7, OK))
     scene.ask(1, PROBE)
     scene.clock.run_out()
-    plain = Decision(ONBOARD, False, "plain", "scripted")
+    plain = Decision(ONBOARD, "plain", "scripted")
     scene.ask(2, plain)
     scene.ask(3, plain)
     first, second, third = scene.records

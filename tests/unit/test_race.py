@@ -15,6 +15,7 @@ from offboard.common.errors import (
 )
 from offboard.common.tasks import Task, kind_of, task
 from offboard.robot_client.execution.race import Plan, Race, answer_of
+from offboard.robot_client.policies import Hedge, Probe
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.virtual import VirtualClock, VirtualRunner
 
@@ -92,7 +93,7 @@ def test_all_are_waited_for_where_all_are_wanted(course: Course, onboard_s: floa
 def test_a_hedge_does_not_start_where_the_first_is_in_time(course: Course) -> None:
     """An answer before the wait is over is the only execution."""
     course.take(cloud=0.3)
-    assert told(course.run(Plan((CLOUD,), ONBOARD, 0.4))) == [(CLOUD, None)]
+    assert told(course.run(Plan((CLOUD,), Hedge(ONBOARD, 0.4)))) == [(CLOUD, None)]
     assert course.clock.now_s() == 0.3
 
 
@@ -104,7 +105,7 @@ def test_of_a_hedge_the_first_answer_counts_and_the_other_is_given_up(
 ) -> None:
     """The second starts when the wait is over; whoever is late is cancelled and recorded as overtaken."""
     course.take(onboard=onboard_s, cloud=cloud_s)
-    executions = course.run(Plan((CLOUD,), ONBOARD, 0.4))
+    executions = course.run(Plan((CLOUD,), Hedge(ONBOARD, 0.4)))
     assert course.begun == [(CLOUD, 0.0), (ONBOARD, 0.4)]
     assert course.clock.now_s() == pytest.approx(waited_s)
     assert answer_of(executions).site == used
@@ -120,7 +121,7 @@ def test_of_a_hedge_the_first_answer_counts_and_the_other_is_given_up(
 def test_what_is_done_meanwhile_is_done_once_the_first_have_begun(course: Course) -> None:
     """Before anything is waited for, and before a second site begins."""
     course.take(onboard=1.0, cloud=0.2)
-    course.run(Plan((ONBOARD,), CLOUD, 0.1))
+    course.run(Plan((ONBOARD,), Hedge(CLOUD, 0.1)))
     assert course.meanwhile == [[ONBOARD]]
     assert [site for site, _ in course.begun] == [ONBOARD, CLOUD]
 
@@ -129,9 +130,9 @@ def test_whoever_is_late_is_asked_whether_it_is_there(course: Course) -> None:
     """When its hedge is due, whether or not that may start; not where it was in time."""
     course.take(cloud=0.5, onboard=0.1)
     course.allowed = False
-    course.run(Plan((CLOUD,), ONBOARD, 0.2))
+    course.run(Plan((CLOUD,), Hedge(ONBOARD, 0.2)))
     assert (course.sites[CLOUD].hurried_s, course.sites[ONBOARD].hurried_s) == ([0.2], [])
-    course.run(Plan((ONBOARD,), CLOUD, 0.2))
+    course.run(Plan((ONBOARD,), Hedge(CLOUD, 0.2)))
     assert course.sites[ONBOARD].hurried_s == []
 
 
@@ -144,18 +145,18 @@ def test_the_second_starts_before_the_late_one_is_asked(
         course.sites[ONBOARD], "hurry", lambda: begun_by_then.append([site for site, _ in course.begun])
     )
     course.take(onboard=0.5, cloud=0.1)
-    course.run(Plan((ONBOARD,), CLOUD, 0.2))
+    course.run(Plan((ONBOARD,), Hedge(CLOUD, 0.2)))
     assert begun_by_then == [[ONBOARD, CLOUD]]
 
 
 def test_what_comes_of_an_overtaken_run_is_told_once(course: Course) -> None:
     """A server's run ends at once, censored; one onboard, which cannot be stopped, when it is done."""
     course.take(onboard=0.2, cloud=1.0)
-    course.run(Plan((CLOUD,), ONBOARD, 0.4))
+    course.run(Plan((CLOUD,), Hedge(ONBOARD, 0.4)))
     assert [(site, one.seconds, one.ok) for site, one in course.late] == [(CLOUD, pytest.approx(0.6), False)]
     course.late.clear()
     course.take(onboard=0.9, cloud=0.5)
-    course.run(Plan((CLOUD,), ONBOARD, 0.4))
+    course.run(Plan((CLOUD,), Hedge(ONBOARD, 0.4)))
     assert course.late == []
     course.clock.run_out()
     assert [(site, one.seconds, one.ok) for site, one in course.late] == [(ONBOARD, pytest.approx(0.9), True)]
@@ -164,7 +165,7 @@ def test_what_comes_of_an_overtaken_run_is_told_once(course: Course) -> None:
 def test_a_probe_starts_at_once_and_runs_on(course: Course) -> None:
     """Its loser is not cancelled, and its time is told when it ends."""
     course.take(onboard=0.1, cloud=0.7)
-    executions = course.run(Plan((ONBOARD,), CLOUD, 0.0))
+    executions = course.run(Plan((ONBOARD,), Probe(CLOUD)))
     assert course.begun == [(ONBOARD, 0.0), (CLOUD, 0.0)]
     assert told(executions) == [(ONBOARD, None), (CLOUD, "Overtaken")]
     assert course.clock.now_s() == 0.1
@@ -173,17 +174,17 @@ def test_a_probe_starts_at_once_and_runs_on(course: Course) -> None:
     assert not course.sites[CLOUD].cancelled
 
 
-@pytest.mark.parametrize("after_s", [0.0, 0.4])
-def test_a_second_run_that_is_not_allowed_does_not_start(course: Course, after_s: float) -> None:
+@pytest.mark.parametrize("second", [Probe(ONBOARD), Hedge(ONBOARD, 0.4)])
+def test_a_second_run_that_is_not_allowed_does_not_start(course: Course, second: Probe | Hedge) -> None:
     """The allowance is asked when the second would begin, and its no is kept to."""
     course.allowed = False
     course.take(onboard=0.1, cloud=1.0)
-    assert told(course.run(Plan((CLOUD,), ONBOARD, after_s))) == [(CLOUD, None)]
+    assert told(course.run(Plan((CLOUD,), second))) == [(CLOUD, None)]
     assert course.begun == [(CLOUD, 0.0)]
 
 
 @pytest.mark.parametrize("failure", [CloudBroken("gone"), CloudBusy("full"), CloudTimeout("late")])
-@pytest.mark.parametrize("plan", [Plan((CLOUD,)), Plan((CLOUD,), EDGE, 0.0), Plan((CLOUD, EDGE), all=True)])
+@pytest.mark.parametrize("plan", [Plan((CLOUD,)), Plan((CLOUD,), Probe(EDGE)), Plan((CLOUD, EDGE), all=True)])
 def test_the_task_runs_onboard_where_all_others_failed(
     course: Course, plan: Plan, failure: OffloadError
 ) -> None:
@@ -203,7 +204,7 @@ def test_a_failed_first_does_not_wait_for_its_hedge(course: Course) -> None:
     """A site that fails before the second was due leads onboard at once, not after the wait."""
     course.take(cloud=0.1)
     course.sites[CLOUD].failure = CloudBroken("gone")
-    assert told(course.run(Plan((CLOUD,), EDGE, 0.4))) == [(CLOUD, "CloudBroken"), (ONBOARD, None)]
+    assert told(course.run(Plan((CLOUD,), Hedge(EDGE, 0.4)))) == [(CLOUD, "CloudBroken"), (ONBOARD, None)]
     assert course.begun == [(CLOUD, 0.0), (ONBOARD, 0.1)]
 
 
@@ -211,7 +212,7 @@ def test_a_site_that_fails_does_not_end_the_race_of_two(course: Course) -> None:
     """The other one's answer is waited for; nothing else starts."""
     course.take(cloud=0.5, onboard=3.0)
     course.sites[CLOUD].failure = CloudBroken("gone")
-    executions = course.run(Plan((CLOUD,), ONBOARD, 0.4))
+    executions = course.run(Plan((CLOUD,), Hedge(ONBOARD, 0.4)))
     assert told(executions) == [(CLOUD, "CloudBroken"), (ONBOARD, None)]
     assert course.clock.now_s() == 3.4
     assert not course.late
@@ -225,7 +226,7 @@ def test_silence_ends_with_the_budget(course: Course) -> None:
     assert course.begun[-1] == (ONBOARD, TIMEOUT_S)
 
 
-@pytest.mark.parametrize("plan", [Plan((CLOUD,), ONBOARD, 0.0), Plan((CLOUD,), ONBOARD, 0.1)])
+@pytest.mark.parametrize("plan", [Plan((CLOUD,), Probe(ONBOARD)), Plan((CLOUD,), Hedge(ONBOARD, 0.1))])
 def test_the_tasks_own_failure_ends_the_race(course: Course, plan: Plan) -> None:
     """It is the same everywhere: nobody waits for the other site, and nothing starts onboard."""
     course.take(cloud=0.2, onboard=5.0)

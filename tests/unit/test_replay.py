@@ -45,7 +45,7 @@ def trace_of(folder: Path, *records: tuple[str, str, dict[str, float], float]) -
     written = Trace(path)
     for i, (policy, site, seconds, waited_s) in enumerate(records):
         executions = tuple(Execution(name, s) for name, s in seconds.items())
-        decision = Decision(site, len(seconds) > 1, "", policy)
+        decision = Decision(site, "", policy, both=len(seconds) > 1)
         sites = {name: Outlook(None, None, False, 0, 0) for name in seconds}
         written.write(Record(i, f"t-{i}", "plan", 1.0 + i % 3, sites, decision, executions, site, waited_s))
     written.close()
@@ -83,7 +83,7 @@ def test_a_task_on_both_sites_takes_as_long_as_the_first_answer(
 
     class Twice:
         def decide(self, forecast: Forecast) -> Decision:  # noqa: ARG002 - whatever it is
-            return Decision("onboard", True, "", "twice")
+            return Decision("onboard", "", "twice", both=True)
 
     monkeypatch.setitem(policies._RULES, "twice", policies._Rule())
     monkeypatch.setitem(rules.RULES, "twice", lambda _: Twice())

@@ -22,7 +22,7 @@ from offboard.loadgen.simulation.world import World
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client import predictors
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.policies import Decision, Forecast
+from offboard.robot_client.policies import Decision, Forecast, Hedge, Probe
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.heartbeat import Told
 
@@ -234,7 +234,7 @@ def race(tmp_path: Path) -> Callable[..., tuple[list[Record], float]]:
 def test_a_hedge_by_hand(race: Callable[..., tuple[list[Record], float]]) -> None:
     """The link is silent: onboard begins after the hedge's wait and answers, the cloud is given up then."""
     silent = Event("link", {"outage": True})
-    records, _ = race(Decision("cloud", False, "", "test", second="onboard", second_after_s=0.1), silent)
+    records, _ = race(Decision("cloud", "", "test", second=Hedge("onboard", 0.1)), silent)
     first = records[0]
     assert first.waited_s == pytest.approx(0.1 + ONBOARD_S)
     cloud, onboard = first.executions
@@ -246,14 +246,14 @@ def test_a_hedge_by_hand(race: Callable[..., tuple[list[Record], float]]) -> Non
 
 def test_a_hedge_in_time_starts_nothing(race: Callable[..., tuple[list[Record], float]]) -> None:
     """The cloud answers before the wait is over."""
-    records, took_s = race(Decision("cloud", False, "", "test", second="onboard", second_after_s=0.1))
+    records, took_s = race(Decision("cloud", "", "test", second=Hedge("onboard", 0.1)))
     assert [len(record.executions) for record in records] == [1, 1]
     assert took_s == pytest.approx(2 * CLOUD_S)
 
 
 def test_a_probe_by_hand(race: Callable[..., tuple[list[Record], float]]) -> None:
     """Both begin at once, the first answer is used, and the other one's time is learnt when it ends."""
-    records, _ = race(Decision("cloud", False, "", "test", second="onboard", second_after_s=0.0))
+    records, _ = race(Decision("cloud", "", "test", second=Probe("onboard")))
     assert CLOUD_S < ONBOARD_S < 2 * CLOUD_S
     # Beside the run onboard, unpacking the reply takes twice as long.
     assert records[0].waited_s == pytest.approx(CLOUD_S + HASH.sending_s / 2 / 0.2)

@@ -19,7 +19,7 @@ from offboard.robot_client.learning import store
 from offboard.robot_client.learning.kind import OBSERVATIONS_MAX
 from offboard.robot_client.learning.store import HALF_LIFE_S, SAVE_EVERY_S, Store
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.policies import Outlook
+from offboard.robot_client.policies import Outlook, Probe
 from offboard.robot_client.policies.wrappers import STALE
 from offboard.robot_client.predictors.least_squares import LeastSquares
 from offboard.robot_client.records.trace import Record
@@ -178,7 +178,7 @@ def test_a_probe_comes_soon_after_a_restart(robot: Robot) -> None:
     with robot.started("average", "probe:greedy") as offload:
         for _ in range(12):
             offload(store_plain, robot.random.uniform(1, 5))
-    assert [one.decision.second for one in robot.records[-12:]].count(CLOUD) == 1
+    assert [one.decision.second for one in robot.records[-12:]].count(Probe(CLOUD)) == 1
 
 
 def test_any_predictor_learns_from_the_file(robot: Robot) -> None:
