@@ -356,12 +356,12 @@ class Offloader:
         self, kind: Kind, memory: KindMemory, size: float, outlooks: Mapping[str, Outlook]
     ) -> Forecast:
         return Forecast(
-            size,
-            outlooks,
-            memory.last_site,
-            self._allowance.duplicates if kind.duplicate else 0.0,
-            self._allowance.bytes_left,
-            self._allowance.joules_left,
+            size=size,
+            sites=outlooks,
+            last_site=memory.last_site,
+            duplicates=self._allowance.duplicates if kind.duplicate else 0.0,
+            bytes_left=self._allowance.bytes_left,
+            joules_left=self._allowance.joules_left,
         )
 
     def _outlook(self, memory: KindMemory, site: str, amount: float | None, timeout_s: float) -> Outlook:

@@ -69,7 +69,7 @@ def starts_no_second_run_on_a_silent_site(make: Make) -> None:
 
 def starts_no_second_run_beyond_the_allowance(make: Make) -> None:
     """Where no second run is left to spend none is planned."""
-    for _, decision in decisions(make(), (replace(one, duplicates=0.99) for one in forecasts())):
+    for _, decision in decisions(make(), (one._replace(duplicates=0.99) for one in forecasts())):
         assert decision.second is None
 
 
@@ -121,12 +121,12 @@ def forecasts(seed: int = 1) -> Iterator[Forecast]:
         names = [ONBOARD, *rng.sample((CLOUD, EDGE, FOG), rng.randint(0, 3))]
         rng.shuffle(names)
         yield Forecast(
-            10 ** rng.uniform(-3, 6),
-            {name: outlook(rng, name) for name in names},
-            rng.choice([None, ONBOARD, CLOUD, FOG]),
-            rng.choice([math.inf, 5.0, 1.0, 0.3, -7.0]),
-            rng.choice([math.inf, 1e5, 300.0, -10.0]),
-            rng.choice([math.inf, 100.0, 0.5, -10.0]),
+            size=10 ** rng.uniform(-3, 6),
+            sites={name: outlook(rng, name) for name in names},
+            last_site=rng.choice([None, ONBOARD, CLOUD, FOG]),
+            duplicates=rng.choice([math.inf, 5.0, 1.0, 0.3, -7.0]),
+            bytes_left=rng.choice([math.inf, 1e5, 300.0, -10.0]),
+            joules_left=rng.choice([math.inf, 100.0, 0.5, -10.0]),
         )
 
 
@@ -140,9 +140,6 @@ def outlook(rng: random.Random, site: str) -> Outlook:
         wait_s=rng.choice([0.0, 0.3]),
     )
     blank = Outlook(
-        None,
-        None,
-        full=False,
         age=rng.choice([0, 1, 19, 20, 500]),
         failures=rng.choice([0, 0, 1, 3, 9, 10_000]),
         in_flight=rng.choice([0, 0, 2]),
@@ -152,12 +149,11 @@ def outlook(rng: random.Random, site: str) -> Outlook:
         return blank
     seconds = rng.choice([-0.01, 0.0, 10 ** rng.uniform(-4, 6)])  # a line goes below 0 beyond its window
     spread = rng.choice([None, 0.0, 10 ** rng.uniform(-4, 6)])
-    return replace(
-        blank,
+    return blank._replace(
         predicted_s=seconds,
         spread_s=spread,
         full=rng.random() < 0.7,
-        count=rng.choice([1, 2, 3, 50]),
+        observations=rng.choice([1, 2, 3, 50]),
         low_s=None if spread is None else max(0.0, seconds - spread),
         high_s=None if spread is None else seconds + spread,
         error_s=rng.choice([None, 0.0, 0.2]),
@@ -170,7 +166,7 @@ def outlook(rng: random.Random, site: str) -> Outlook:
 def unknown(forecast: Forecast) -> Forecast:
     """The same with nothing learnt of any site."""
     blank = {
-        name: Outlook(None, None, False, one.age, one.failures, condition=one.condition)
+        name: Outlook(age=one.age, failures=one.failures, condition=one.condition)
         for name, one in forecast.sites.items()
     }
-    return replace(forecast, sites=blank)
+    return forecast._replace(sites=blank)

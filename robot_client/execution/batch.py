@@ -102,7 +102,7 @@ class Batch:
         cold = _cold(first)
         for site in cold:
             if not self._queues[site].running:
-                return self._warm_up(site, first[site].count)
+                return self._warm_up(site, first[site].observations)
         looked = self._waiting[:LOOK_AHEAD]
         start = next_start(
             (_seconds(_usable(self._look(number)), cold) for number in looked),
@@ -196,7 +196,7 @@ def _cold(sites: Mapping[str, Outlook]) -> list[str]:
     return [
         site
         for site, one in sites.items()
-        if one.predicted_s is None or (one.count < WARM_UP and not one.full)
+        if one.predicted_s is None or (one.observations < WARM_UP and not one.full)
     ]
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from offboard.common.errors import Overtaken, TaskError
 from offboard.common.host.load import LOADED
 from offboard.common.tasks import Kind
-from offboard.robot_client.learning.intervals import Conformal
+from offboard.robot_client.learning.conformal import Conformal
 from offboard.robot_client.learning.shared_work import SharedWork
 from offboard.robot_client.learning.under_load import UnderLoad
 from offboard.robot_client.policies.energy import Energy
@@ -163,30 +163,34 @@ class SiteMemory:
                 found = predictor.predict(amount, self.age + 1)
         if found is None:
             return Outlook(
-                None, None, predictor.full, self.age, self._failures, in_flight=in_flight, condition=condition
+                full=predictor.full,
+                age=self.age,
+                failures=self._failures,
+                in_flight=in_flight,
+                condition=condition,
             )
         seconds = found.seconds + condition.wait_s
         if condition.silent:
             seconds = max(seconds, timeout_s)
         low_s, high_s = self._conformal.interval(seconds, found.spread_s) or (None, None)
-        joules = self._joules(seconds)
+        joules, errors = self._joules(seconds), self._conformal.errors
         return Outlook(
-            seconds,
-            found.spread_s,
-            predictor.full,
-            self.age,
-            self._failures,
-            len(predictor),
-            low_s,
-            high_s,
-            found.error_s,
-            self._objective.cost(Expected(seconds, found.spread_s, joules), self._conformal),
-            in_flight,
-            self._bytes.value,
-            joules,
-            condition,
-            self._conformal,
-            amount is not None and amount < SMALL * self._least,
+            predicted_s=seconds,
+            spread_s=found.spread_s,
+            full=predictor.full,
+            age=self.age,
+            failures=self._failures,
+            observations=len(predictor),
+            low_s=low_s,
+            high_s=high_s,
+            error_s=found.error_s,
+            cost=self._objective.cost(Expected(seconds, found.spread_s, joules), errors),
+            in_flight=in_flight,
+            bytes=self._bytes.value,
+            joules=joules,
+            condition=condition,
+            errors=errors,
+            smallest=amount is not None and amount < SMALL * self._least,
         )
 
     def _foresee(self, model: Conditional, amount: float, condition: Condition) -> Prediction | None:

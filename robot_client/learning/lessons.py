@@ -6,7 +6,7 @@ and what it does once a task it does with cold caches.
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from offboard.common.errors import Overtaken
 from offboard.common.host.load import LOADED
@@ -149,7 +149,7 @@ class Learning:
             capacity = min(capacity, now) if later else max(capacity, now)
         if (load, capacity) == (before.load, before.capacity):
             return outlook
-        return replace(outlook, condition=before._replace(load=load, capacity=capacity))
+        return outlook._replace(condition=before._replace(load=load, capacity=capacity))
 
     def _as_the_server_says(self, site: str, outlook: Outlook, *, later: bool) -> Outlook:
         """In its answer to what was late, or early."""
@@ -157,7 +157,7 @@ class Learning:
         worse, better = (max, min) if later else (min, max)
         load = worse(before.server_load, now.server_load)
         capacity = better(before.capacity, now.capacity)
-        return replace(outlook, condition=before._replace(server_load=load, capacity=capacity))
+        return outlook._replace(condition=before._replace(server_load=load, capacity=capacity))
 
 
 def _as_expected(asked: Asked, execution: Execution) -> bool:

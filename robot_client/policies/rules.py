@@ -5,8 +5,8 @@ from functools import partial
 from random import Random
 
 from offboard.robot_client.policies.decision import Decision, Policy
-from offboard.robot_client.policies.forecast import Forecast, cheapest, costs_of, explain, home
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD
+from offboard.robot_client.policies.forecast import Forecast, Outlook, cheapest, costs_of, home
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition
 
 WARM_UP = 6  # observations of each site before anything is compared
 MARGIN = 0.1
@@ -119,15 +119,56 @@ def _compared(predicted: Mapping[str, float], site: str) -> str:
 
 def warm_up(forecast: Forecast, policy: str) -> Decision | None:
     """All sites but silent ones, while one of them has too few observations."""
-    if all(one.count >= WARM_UP for one in forecast.sites.values()):
+    if all(one.observations >= WARM_UP for one in forecast.sites.values()):
         return None
     heard = {site: one for site, one in forecast.sites.items() if not one.condition.silent}
-    cold = [site for site, one in heard.items() if one.count < WARM_UP and not (one.full or one.in_flight)]
+    cold = [
+        site for site, one in heard.items() if one.observations < WARM_UP and not (one.full or one.in_flight)
+    ]
     if not cold or len(heard) == 1:
         return None
     reason = f"warm-up: too little is known of {' and '.join(sorted(cold))}"
     silent = tuple(site for site in forecast.sites if site not in heard)
     return Decision(home(forecast.only(heard)), reason, policy, both=True, spared=silent)
+
+
+def explain(forecast: Forecast, site: str) -> str:
+    """Why this site: each one's prediction with its interval, what was measured, how stale the others are."""
+    sites = forecast.sites
+    parts, stale = [f"{site}: {_times(sites[site])}"], ""
+    measured = f"size {forecast.size:.3g}"
+    for name, one in sites.items():
+        if name != site:
+            parts.append(f"{name} {_times(one)}")
+            if one.age:
+                stale += f"; {name} last tried {one.age} tasks ago"
+        measured += _measured(name, one.condition, "" if len(sites) == 2 else f" {name}")
+    return f"{' against '.join(parts)}; {measured}{stale}"
+
+
+def _times(one: Outlook) -> str:
+    if one.condition.silent:
+        return "silent"
+    if one.predicted_s is None:
+        return "unknown"
+    if one.low_s is None or one.high_s is None:
+        return f"{one.predicted_s * 1e3:.3g} ms"
+    return f"{one.predicted_s * 1e3:.3g} ms [{one.low_s * 1e3:.3g}, {one.high_s * 1e3:.3g}]"
+
+
+def _measured(site: str, condition: Condition, of: str) -> str:
+    said, there = "", of if of or site == ONBOARD else " there"
+    if condition.round_trip_s is not None:
+        said = f", queue{of} {condition.queue}, rtt{of} {condition.round_trip_s * 1e3:.3g} ms"
+    if site == ONBOARD and condition.load >= 0.005:
+        said += f", load{of} {condition.load:.0%}"
+    if condition.server_load >= 0.005:
+        said += f", load{there} {condition.server_load:.0%}"
+    if condition.capacity < 1.0:
+        said += f", capacity{there} {condition.capacity:.0%}"
+    if condition.wait_s:
+        said += f", wait{of} {condition.wait_s * 1e3:.3g} ms"
+    return said
 
 
 RULES: dict[str, Callable[[Random], Policy]] = {

@@ -3,9 +3,10 @@
 import pytest
 
 from offboard.common.errors import ConfigError
-from offboard.robot_client.learning.intervals import Conformal
+from offboard.robot_client.learning.conformal import Conformal
 from offboard.robot_client.policies import objectives
 from offboard.robot_client.policies.energy import Energy
+from offboard.robot_client.policies.forecast import NO_ERRORS, PredictionErrors
 from offboard.robot_client.policies.objectives import Expected
 
 
@@ -13,16 +14,16 @@ def expected(seconds: float, spread_s: float | None = None, joules: float = 0.0)
     return Expected(seconds, spread_s, joules)
 
 
-def erring(*errors_s: float) -> Conformal:
+def erring(*errors_s: float) -> PredictionErrors:
     """The errors of a site that was always predicted to take 1 s, the first one taken twice."""
     found = Conformal()
     for error_s in (errors_s[0], *errors_s):
         found.learn(1.0, 1.0 + error_s)
-    return found
+    return found.errors
 
 
-def cost(name: str, of: Expected, errors: Conformal | None = None, **needs: float) -> float:
-    return objectives.make(name, **needs).cost(of, errors or Conformal())
+def cost(name: str, of: Expected, errors: PredictionErrors = NO_ERRORS, **needs: float) -> float:
+    return objectives.make(name, **needs).cost(of, errors)
 
 
 def test_the_mean_is_the_prediction() -> None:

@@ -118,18 +118,22 @@ def near_tie(before: tuple[str, Queue, Queue], row: Row) -> bool:
 
 
 def outlook(predicted_s: float | None, full: bool = True) -> Outlook:
-    return Outlook(predicted_s, None, full, age=0, failures=0)
+    return Outlook(predicted_s=predicted_s, full=full)
 
 
 def test_a_tie_stays_onboard() -> None:
     """Eq. 1: the cloud only where it is strictly faster."""
-    decision = policies.make("paper").decide(Forecast(1.0, {CLOUD: outlook(0.1), ONBOARD: outlook(0.1)}))
+    decision = policies.make("paper").decide(
+        Forecast(size=1.0, sites={CLOUD: outlook(0.1), ONBOARD: outlook(0.1)})
+    )
     assert (decision.site, decision.both) == (ONBOARD, False)
 
 
 def test_the_smaller_prediction_wins_and_the_reason_says_both() -> None:
     """The cloud is chosen where its prediction is smaller, and the reason shows the two times."""
-    decision = policies.make("paper").decide(Forecast(1.0, {CLOUD: outlook(0.0999), ONBOARD: outlook(0.1)}))
+    decision = policies.make("paper").decide(
+        Forecast(size=1.0, sites={CLOUD: outlook(0.0999), ONBOARD: outlook(0.1)})
+    )
     assert decision.site == CLOUD
     assert decision.reason == "cloud 99.9 ms against onboard 100.0 ms"
 
@@ -137,20 +141,20 @@ def test_the_smaller_prediction_wins_and_the_reason_says_both() -> None:
 @pytest.mark.parametrize(("cloud", "onboard"), [(True, False), (False, True), (False, False)])
 def test_both_sites_until_both_windows_are_full(cloud: bool, onboard: bool) -> None:
     """Warm-up lasts while either queue is short of N."""
-    forecast = Forecast(1.0, {CLOUD: outlook(0.1, cloud), ONBOARD: outlook(0.2, onboard)})
+    forecast = Forecast(size=1.0, sites={CLOUD: outlook(0.1, cloud), ONBOARD: outlook(0.2, onboard)})
     assert policies.make("paper").decide(forecast).both
 
 
 def test_the_rule_takes_the_fastest_of_three_sites() -> None:
     """With more servers the smallest prediction of all wins."""
     sites = {CLOUD: outlook(0.3), "edge": outlook(0.1), ONBOARD: outlook(0.2)}
-    assert policies.make("paper").decide(Forecast(1.0, sites)).site == "edge"
+    assert policies.make("paper").decide(Forecast(size=1.0, sites=sites)).site == "edge"
 
 
 @pytest.mark.parametrize("site", [ONBOARD, CLOUD])
 def test_a_constant_policy_never_moves(site: str) -> None:
     """`onboard` and `cloud` choose their site whatever is predicted."""
-    forecast = Forecast(1.0, {CLOUD: outlook(0.9), ONBOARD: outlook(0.1)})
+    forecast = Forecast(size=1.0, sites={CLOUD: outlook(0.9), ONBOARD: outlook(0.1)})
     assert policies.make(site).decide(forecast).site == site
     assert not policies.make(site).decide(forecast).both
 

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from itertools import permutations
 from typing import Any
 
@@ -51,15 +50,17 @@ def test_contract(check: Callable[[policy_checks.Make], None], rule: str) -> Non
 
 def known(seconds: float, **fields: Any) -> Outlook:
     """A site of which enough is known; its spread is a tenth of its time."""
-    return Outlook(seconds, 0.1 * seconds, **{"full": True, "age": 0, "failures": 0, "count": 50} | fields)
+    return Outlook(
+        **{"predicted_s": seconds, "spread_s": 0.1 * seconds, "full": True, "observations": 50} | fields
+    )
 
 
-UNKNOWN = Outlook(None, None, full=False, age=0, failures=0)
+UNKNOWN = Outlook()
 
 
 def decide(policy: str | Policy, sites: Mapping[str, Outlook], **fields: Any) -> Decision:
     made = policies.make(policy) if isinstance(policy, str) else policy
-    return made.decide(Forecast(1.0, sites, **fields))
+    return made.decide(Forecast(size=1.0, sites=sites, **fields))
 
 
 def shares(policy: Policy, sites: Mapping[str, Outlook]) -> dict[str, float]:
@@ -132,17 +133,17 @@ def test_thompson_chooses_as_often_as_it_believes() -> None:
 def test_all_sites_run_until_each_has_its_first_observations(rule: str) -> None:
     """Warm-up lasts while a site has fewer than WARM_UP, unless tasks that will tell are there already."""
     for count, both in ((0, True), (WARM_UP - 1, True), (WARM_UP, False)):
-        decision = decide(rule, {ONBOARD: known(0.1), CLOUD: known(0.2, count=count, full=False)})
+        decision = decide(rule, {ONBOARD: known(0.1), CLOUD: known(0.2, observations=count, full=False)})
         assert decision.both == both, (count, decision)
     assert "cloud" in decide(rule, {ONBOARD: known(0.1), CLOUD: UNKNOWN}).reason
-    under_way = replace(UNKNOWN, in_flight=1)
+    under_way = UNKNOWN._replace(in_flight=1)
     assert not decide(rule, {ONBOARD: known(0.1), CLOUD: under_way}).both
 
 
 @pytest.mark.parametrize("rule", ["greedy", "hysteresis", "epsilon", "linucb", "thompson"])
 def test_a_silent_site_is_neither_warmed_up_nor_chosen(rule: str) -> None:
     """Nothing is known of it, and its heartbeats say that nothing would be."""
-    silent = replace(UNKNOWN, condition=SILENT)
+    silent = UNKNOWN._replace(condition=SILENT)
     for onboard in (UNKNOWN, known(0.5)):
         decision = decide(rule, {ONBOARD: onboard, CLOUD: silent})
         assert (decision.site, decision.both) == (ONBOARD, False), decision
@@ -181,10 +182,10 @@ def test_a_task_smaller_than_all_it_ran_probes_the_robot() -> None:
 def test_a_probe_leaves_a_second_run_to_hedges() -> None:
     """With one second run left a stale site is not probed, and the task may still be hedged."""
     sites = {ONBOARD: known(0.1), CLOUD: known(0.2, age=500)}
-    forecast = Forecast(1.0, sites, duplicates=1.0)
+    forecast = Forecast(size=1.0, sites=sites, duplicates=1.0)
     assert policies.make("probe:greedy").decide(forecast).second is None
     assert isinstance(policies.make("hedge:probe:greedy").decide(forecast).second, Hedge)
-    assert policies.make("probe:greedy").decide(replace(forecast, duplicates=2.0)).second == Probe(CLOUD)
+    assert policies.make("probe:greedy").decide(forecast._replace(duplicates=2.0)).second == Probe(CLOUD)
 
 
 @pytest.mark.parametrize("fields", [{"in_flight": 1}, {"condition": SILENT}], ids=["under way", "silent"])
@@ -196,7 +197,7 @@ def test_some_sites_are_not_probed(fields: dict[str, Any]) -> None:
 
 def test_a_hedge_starts_at_two_deviations() -> None:
     """The cheapest other site starts when the chosen one is 2 sd later than its mean."""
-    sites = {ONBOARD: known(0.5), CLOUD: Outlook(0.2, 0.03, True, 0, 0, 50), EDGE: known(0.4)}
+    sites = {ONBOARD: known(0.5), CLOUD: known(0.2, spread_s=0.03), EDGE: known(0.4)}
     decision = decide("hedge:greedy", sites)
     assert decision.site == CLOUD
     assert decision.second == Hedge(EDGE, pytest.approx(0.2 + 2 * 0.03))
@@ -205,8 +206,8 @@ def test_a_hedge_starts_at_two_deviations() -> None:
 @pytest.mark.parametrize(
     "sites",
     [
-        {ONBOARD: Outlook(0.2, None, True, 0, 0, 50), CLOUD: known(0.5)},
-        {ONBOARD: known(0.2), CLOUD: replace(UNKNOWN, count=50)},
+        {ONBOARD: known(0.2, spread_s=None), CLOUD: known(0.5)},
+        {ONBOARD: known(0.2), CLOUD: UNKNOWN._replace(observations=50)},
         {ONBOARD: known(0.2), CLOUD: known(0.5, condition=SILENT)},
     ],
     ids=["spread unknown", "other unknown", "other silent"],

@@ -46,7 +46,7 @@ def trace_of(folder: Path, *records: tuple[str, str, dict[str, float], float]) -
     for i, (policy, site, seconds, waited_s) in enumerate(records):
         executions = tuple(Execution(name, s) for name, s in seconds.items())
         decision = Decision(site, "", policy, both=len(seconds) > 1)
-        sites = {name: Outlook(None, None, False, 0, 0) for name in seconds}
+        sites = {name: Outlook() for name in seconds}
         written.write(Record(i, f"t-{i}", "plan", 1.0 + i % 3, sites, decision, executions, site, waited_s))
     written.close()
     return path

@@ -242,8 +242,8 @@ def test_what_was_not_asked_for_is_kept_and_fades_on(robot: Robot) -> None:
     assert kinds["store_plain"]["sites"][ONBOARD]["saved_at"] == robot.unix_s
     robot.unix_s += HALF_LIFE_S
     robot.sites.append(cloud)
-    assert robot.outlooks(robot.started())[CLOUD].count == 25
-    assert robot.outlooks(robot.started())[ONBOARD].count == 26, "50, one more, and an hour"
+    assert robot.outlooks(robot.started())[CLOUD].observations == 25
+    assert robot.outlooks(robot.started())[ONBOARD].observations == 26, "50, one more, and an hour"
 
 
 def test_the_file_is_bounded(robot: Robot) -> None:
@@ -366,7 +366,7 @@ def test_a_kill_while_writing_leaves_the_last_whole_file(robot: Robot) -> None:
     torn = robot.path.with_name(".memory.json.new")
     torn.write_bytes(robot.path.read_bytes()[:1000])
     with robot.started() as offload:
-        assert robot.outlooks(offload)[CLOUD].count == 50
+        assert robot.outlooks(offload)[CLOUD].observations == 50
     assert not torn.exists()
     assert sorted(one.name for one in robot.path.parent.iterdir()) == ["memory.json"]
 

@@ -28,8 +28,8 @@ def record(i: int = 0) -> Record:
         kind="plan_path",
         size=1.5,
         sites={
-            ONBOARD: Outlook(0.1, 0.01, True, 3, 0, low_s=0.08, high_s=0.15),
-            CLOUD: Outlook(None, None, False, 0, 1, condition=Condition(round_trip_s=0.03, queue=2)),
+            ONBOARD: Outlook(predicted_s=0.1, spread_s=0.01, full=True, age=3, low_s=0.08, high_s=0.15),
+            CLOUD: Outlook(failures=1, condition=Condition(round_trip_s=0.03, queue=2)),
         },
         decision=Decision(CLOUD, "cloud 1 ms against onboard 2 ms", "paper", second=Hedge(ONBOARD, 0.5)),
         executions=(
