@@ -3,8 +3,8 @@
 What a decision is based on is in `forecast`; `execution/race.py` carries it out.
 """
 
-from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass
+from collections.abc import Callable, Collection
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Protocol
 
 from offboard.robot_client.policies.forecast import Forecast
@@ -61,3 +61,12 @@ class Policy(Protocol):
     """
 
     def decide(self, forecast: Forecast) -> Decision: ...
+
+
+def decide_among(sites: Collection[str], forecast: Forecast, policy: Policy) -> Decision:
+    """What the policy decides if only these sites are offered; a decision for all sites spares the others."""
+    decision = policy.decide(forecast.only(sites))
+    if not decision.both:
+        return decision
+    left_out = [site for site in forecast.sites if site not in sites]
+    return replace(decision, spared=(*decision.spared, *left_out))

@@ -83,7 +83,7 @@ class Outlook(NamedTuple):
 
     `predicted_s` and `spread_s`: the prediction and its standard deviation.
     `error_s`: the standard error of the prediction itself. `low_s`, `high_s`: its 90 % interval.
-    `full`: the warm-up of the predictor is over. `observations`: how many observations the prediction rests on.
+    `full`: the warm-up of the predictor is over. `observations`: how many the prediction rests on.
     `age`: tasks of this kind since the site last ran one. `failures`: failed runs in a row.
     `cost`: what the objective makes of the outlook; less is better.
     `in_flight`: tasks of any kind that run there now.

@@ -13,7 +13,7 @@ from offboard.common.errors import ConfigError, DataError, OffloadError
 from offboard.robot_client.policies.allowance import DUPLICATES_MAX
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.objectives import Mean, TimeAndEnergy
-from offboard.robot_client.policies.wrappers import STALE
+from offboard.robot_client.policies.probe import STALE
 from offboard.robot_client.records import trace
 from offboard.robot_client.simulated.config import RobotConfig
 

@@ -18,7 +18,7 @@ from offboard.common.planning.maps import GridMap
 from offboard.common.planning.planner import plan_path, warm
 from offboard.common.tasks import Task, task
 from offboard.robot_client.offloader import BOTH, Offloader
-from offboard.robot_client.policies.rules import Paper
+from offboard.robot_client.policies.paper import Paper
 from offboard.robot_client.predictors import LEAST_SQUARES, make
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.simulated import answers as answers_file

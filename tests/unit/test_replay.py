@@ -13,7 +13,7 @@ from offboard.loadgen.table.replay import ReplayConfig, replay, run_replay
 from offboard.loadgen.table.rows import read
 from offboard.loadgen.table.table_two import TableConfig
 from offboard.robot_client import policies
-from offboard.robot_client.policies import Decision, Forecast, Outlook, rules
+from offboard.robot_client.policies import Decision, Forecast, Outlook
 from offboard.robot_client.records.trace import Record, Trace
 from offboard.robot_client.sites.runner import Execution
 from tests.unit.test_evaluate import THOUSAND, TWELVE, csv_of
@@ -85,8 +85,7 @@ def test_a_task_on_both_sites_takes_as_long_as_the_first_answer(
         def decide(self, forecast: Forecast) -> Decision:  # noqa: ARG002 - whatever it is
             return Decision("onboard", "", "twice", both=True)
 
-    monkeypatch.setitem(policies._RULES, "twice", policies._Rule())
-    monkeypatch.setitem(rules.RULES, "twice", lambda _: Twice())
+    monkeypatch.setattr(policies, "make", lambda _name, _seed: Twice())
     rows = read(dataset(tmp_path, TWELVE))
     played = replay(rows, "twice", predictor="least-squares", window=3, feedback="chosen")
     assert played.both.all()

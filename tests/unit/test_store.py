@@ -20,7 +20,7 @@ from offboard.robot_client.learning.kind import OBSERVATIONS_MAX
 from offboard.robot_client.learning.store import HALF_LIFE_S, SAVE_EVERY_S, Store
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Outlook, Probe
-from offboard.robot_client.policies.wrappers import STALE
+from offboard.robot_client.policies.probe import STALE
 from offboard.robot_client.predictors.least_squares import LeastSquares
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
@@ -131,7 +131,7 @@ def test_a_restart_at_once_predicts_the_same(robot: Robot, name: str) -> None:
             "bytes",
             "joules",
             "cost",
-            "count",
+            "observations",
             "full",
         ):
             one, other = getattr(before[site], field), getattr(after[site], field)

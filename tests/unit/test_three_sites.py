@@ -8,7 +8,7 @@ from offboard.common.errors import CloudTimeout
 from offboard.common.tasks import Task, task
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.policies.wrappers import PROBE_EVERY
+from offboard.robot_client.policies.probe import PROBE_EVERY
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution
 from tests.fakes import ScriptedRunner
