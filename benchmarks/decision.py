@@ -10,6 +10,7 @@ import numpy as np
 from benchmarks.measure import Bar, Table, each_of
 from offboard.common.tasks import Kind, Task, kind_of, task
 from offboard.robot_client import policies, predictors
+from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Policy, Probe
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
@@ -80,8 +81,7 @@ def _offloader(policy: str, window: int) -> tuple[Offloader, Kept]:
     offload = Offloader(
         [AtOnce(ONBOARD), AtOnce(CLOUD)],
         policy=kept,
-        predictor=lambda: predictors.make(plain, window),
-        shared_work=name != plain,
+        memories=Memories(lambda: predictors.make(plain, window), shared_work=name != plain),
     )
     for size in SIZES:
         offload(counted, size, where="both")

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from offboard.robot_client.policies import Decision, Forecast, Outlook
     from offboard.robot_client.predictors import Prediction, Predictor
     from offboard.robot_client.records.trace import Record, Trace
+    from offboard.robot_client.settings import Settings
     from offboard.robot_client.sites.runner import Execution, Runner
 
 __all__ = [
@@ -50,6 +51,7 @@ __all__ = [
     "ProtocolError",
     "Record",
     "Runner",
+    "Settings",
     "TaskError",
     "TaskFailed",
     "Trace",
@@ -70,6 +72,7 @@ _HOMES = {
     "Predictor": "robot_client.predictors",
     "Record": "robot_client.records.trace",
     "Runner": "robot_client.sites.runner",
+    "Settings": "robot_client.settings",
     "Trace": "robot_client.records.trace",
     "check_wanted": "common.wanted",
     "task": "common.tasks",

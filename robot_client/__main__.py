@@ -80,14 +80,9 @@ def _drive(config: RobotConfig) -> int:
                 connect(
                     sites=config.sites(),
                     policy=config.policy,
-                    predictor=config.predictor,
                     window=config.window,
-                    seed=config.seed,
-                    objective=config.goal(),
-                    energy=config.energy(),
-                    allowance=config.allowance(),
-                    memory=config.memory,
                     observers=observers,
+                    settings=config.settings(),
                 )
             )
             again, references = None, None

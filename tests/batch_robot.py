@@ -10,7 +10,6 @@ import time
 
 from offboard.loadgen.scenario.hash_tasks import hash_rounds
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.policies import DEFAULT, predictor_of
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
@@ -31,8 +30,7 @@ def main() -> None:
     records: list[Record] = []
     with Offloader.connect(
         given.cloud,
-        policy=DEFAULT,
-        predictor=predictor_of(DEFAULT),
+        policy="default",
         timeout_s=TIMEOUT_S,
         observers=[records.append],
     ) as offload:

@@ -16,7 +16,9 @@ from offboard.loadgen.simulation.model.simulated_tasks import Tasks
 from offboard.loadgen.simulation.world import World
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client import policies, predictors
-from offboard.robot_client.offloader import BOTH, Offloader
+from offboard.robot_client.learning.memories import Memories
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import BOTH
 from offboard.robot_client.records.trace import Record, as_dict
 from offboard.robot_client.simulated.drive import OwnRecord
 from offboard.robot_client.simulated.workload import CLOSED, due_instants
@@ -70,8 +72,9 @@ class _Run:
         self.offload = Offloader(
             [self._world.cloud, self._world.onboard],
             policy=policies.make(robot.policy, scenario.seed),
-            predictor=partial(predictors.make, plain, robot.window, scenario.seed),
-            shared_work=name != plain,
+            memories=Memories(
+                partial(predictors.make, plain, robot.window, scenario.seed), shared_work=name != plain
+            ),
             timeout_s=robot.timeout_s,
             observers=[self._own],
             clock=self._clock,

@@ -21,6 +21,7 @@ from offboard.loadgen.table.rows import Column, Rows, read_lived
 from offboard.loadgen.table.score import Scored, Sides
 from offboard.loadgen.table.table_two import BOTH, FULL, Asked
 from offboard.robot_client import policies, predictors
+from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Decision, Forecast, Policy, Probe
 from offboard.robot_client.predictors.window import WINDOW, WINDOW_MAX
@@ -122,7 +123,7 @@ def replay(
     with Offloader(
         [_Replaying(ONBOARD, rows.onboard_s), _Replaying(CLOUD, rows.cloud_s)],
         policy=chooser,
-        predictor=lambda: predictors.make(name, window, seed),
+        memories=Memories(lambda: predictors.make(name, window, seed)),
     ) as offload:
         for row, size in enumerate(rows.size.tolist()):
             offload(_replayed, size, row, where=BOTH if row < window else None)

@@ -43,7 +43,7 @@ class Race:
         begun: Callable[[str], None],
         allowed: Callable[[], bool],
         late: Callable[[str, Execution], None],
-        meanwhile: Callable[[], None],
+        idle: Callable[[], None],
     ) -> None:
         self._task = task
         self._runners = runners
@@ -52,14 +52,14 @@ class Race:
         self._begun = begun
         self._allowed = allowed
         self._late = late
-        self._meanwhile = meanwhile
+        self._idle = idle
         self._runs: dict[str, tuple[Future[Execution], float]] = {}  # and when it began
 
     def run(self, plan: Plan) -> tuple[Execution, ...]:
         """All executions in the order in which they began; those still under way as overtaken."""
         for site in plan.first:
             self._start(site)
-        self._meanwhile()
+        self._idle()
         if plan.all:
             self._wait_for_all()
         else:

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from offboard.common import VERSION as SOFTWARE
-from offboard.robot_client.learning.kind import OBSERVATIONS_MAX, Observation
+from offboard.robot_client.learning.site import OBSERVATIONS_MAX, Observation
 from offboard.robot_client.sites.runner import Condition
 
 FORMAT = 1

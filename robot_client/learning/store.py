@@ -16,8 +16,9 @@ from pathlib import Path
 
 from offboard.common.errors import ConfigError
 from offboard.robot_client.learning import memory_file
-from offboard.robot_client.learning.kind import KindMemory, Observation
+from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.memory_file import PER_SIZE, PER_WORK, KeptKind, KeptSite, Unreadable
+from offboard.robot_client.learning.site import Observation
 from offboard.robot_client.policies.probe import STALE
 
 SAVE_EVERY_S = 30.0  # at most, between the first task and the end

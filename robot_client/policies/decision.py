@@ -10,6 +10,7 @@ from typing import Protocol
 from offboard.robot_client.policies.forecast import Forecast
 
 PINNED = "pinned"  # stands for the policy where the caller said where to run
+BOTH = "both"  # `where=BOTH`: the caller measures the task on all sites
 
 
 @dataclass(frozen=True, slots=True)

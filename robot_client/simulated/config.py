@@ -8,10 +8,11 @@ from offboard.common.errors import ConfigError
 from offboard.common.planning.planner_names import DIJKSTRA, PLANNERS
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.policies import objectives
-from offboard.robot_client.policies.allowance import DUPLICATES, Allowance
+from offboard.robot_client.policies.allowance import DUPLICATES
 from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.objectives import OBJECTIVES, Objective
+from offboard.robot_client.policies.objectives import OBJECTIVES
 from offboard.robot_client.predictors.window import WINDOW
+from offboard.robot_client.settings import Settings
 from offboard.robot_client.simulated.workload import ARRIVALS, CLOSED, parse_sizes
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, TIMEOUT_S, check_endpoint
 
@@ -195,17 +196,18 @@ class RobotConfig:
         if self.reference and self.map is not None and not self.jump:
             raise ConfigError(f"--reference: {self.reference} on a map needs --jump")
 
-    def goal(self) -> Objective:
-        """What the policy makes small."""
-        return objectives.make(self.objective, deadline_s=self.deadline_s, s_a_joule=self.s_per_joule)
-
-    def energy(self) -> Energy:
-        """What tasks take from the battery."""
-        return Energy(self.compute_watts, self.idle_watts, self.radio_joules_byte)
-
-    def allowance(self) -> Allowance:
-        """What may be spent; a fresh one each time."""
-        return Allowance(self.duplicates, self.bytes_per_minute, self.joules_per_minute)
+    def settings(self) -> Settings:
+        """The rare options of the offloader."""
+        return Settings(
+            predictor=self.predictor,
+            objective=objectives.make(self.objective, deadline_s=self.deadline_s, s_a_joule=self.s_per_joule),
+            energy=Energy(self.compute_watts, self.idle_watts, self.radio_joules_byte),
+            duplicates=self.duplicates,
+            bytes_a_minute=self.bytes_per_minute,
+            joules_a_minute=self.joules_per_minute,
+            memory=self.memory,
+            seed=self.seed,
+        )
 
     def sites(self) -> dict[str, str]:
         """Endpoint by name of every `--site`."""

@@ -12,6 +12,7 @@ from offboard.common.errors import CloudBroken, CloudTimeout, ConfigError, Overt
 from offboard.common.tasks import Task, task
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.execution.placement import SERVER_IN_FLIGHT_MAX
+from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies.allowance import DUPLICATES_MAX, Allowance
 from offboard.robot_client.policies.greedy import WARM_UP
@@ -116,7 +117,7 @@ def make() -> Iterator[Make]:
             Offloader(
                 list(runners),
                 policy=policies.make("paper"),
-                predictor=lambda: predictors.make(predictors.LEAST_SQUARES, 20),
+                memories=Memories(lambda: predictors.make(predictors.LEAST_SQUARES, 20)),
                 observers=[(records if records is not None else []).append],
                 **options,
             )
@@ -313,7 +314,7 @@ def test_a_silent_site_is_left_out() -> None:
     offload = Offloader(
         [cloud, ScriptedRunner(ONBOARD, answers(ONBOARD, 1.0))],
         policy=policies.make(policies.DEFAULT),
-        predictor=lambda: predictors.make("average", 20),
+        memories=Memories(lambda: predictors.make("average", 20)),
     )
     with offload:
         warm(offload)

@@ -350,9 +350,9 @@ def test_a_workload_that_can_be_is_taken(settings: dict[str, Any]) -> None:
 def test_the_flags_of_cost_become_what_the_offloader_is_given() -> None:
     """Objective, energy and allowance are made of the flags; by default those of the library."""
     plain = RobotConfig(**MAP)
-    assert isinstance(plain.goal(), Mean)
-    assert plain.energy() == Energy()
-    assert not plain.allowance().capped
+    assert isinstance(plain.settings().objective, Mean)
+    assert plain.settings().energy == Energy()
+    assert not plain.settings().allowance().capped
     flags = "--objective energy --s-per-joule 2 --compute-watts 3 --idle-watts 0.5 --radio-joules-byte 1e-6"
     caps = "--policy greedy --bytes-per-minute 6000 --joules-per-minute 60 --duplicates 0.5"
     config = load(
@@ -363,9 +363,9 @@ def test_the_flags_of_cost_become_what_the_offloader_is_given() -> None:
         environ={},
         prefix="R",
     )
-    assert config.goal() == TimeAndEnergy(2.0)
-    assert config.energy() == Energy(3.0, 0.5, 1e-6)
-    allowance = config.allowance()
+    assert config.settings().objective == TimeAndEnergy(2.0)
+    assert config.settings().energy == Energy(3.0, 0.5, 1e-6)
+    allowance = config.settings().allowance()
     allowance.begin(0.0)
     assert (allowance.duplicates, allowance.bytes_left, allowance.joules_left) == (
         DUPLICATES_MAX,

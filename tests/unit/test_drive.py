@@ -16,8 +16,10 @@ import pytest
 from offboard.common.errors import CloudTimeout, TaskFailed
 from offboard.common.planning.maps import GridMap
 from offboard.common.planning.planner import plan_path, warm
-from offboard.common.tasks import Task, task
-from offboard.robot_client.offloader import BOTH, Offloader
+from offboard.common.tasks import Task, kind_of, task
+from offboard.robot_client.learning.memories import Memories
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import BOTH
 from offboard.robot_client.policies.paper import Paper
 from offboard.robot_client.predictors import LEAST_SQUARES, make
 from offboard.robot_client.records.trace import Record
@@ -59,7 +61,7 @@ def test_the_seed_decides_the_order() -> None:
 
 def offloader(*runners: Runner, observers: Sequence[Callable[[Record], None]] = ()) -> Offloader:
     return Offloader(
-        runners, policy=Paper(), predictor=lambda: make(LEAST_SQUARES, 5), observers=list(observers)
+        runners, policy=Paper(), memories=Memories(lambda: make(LEAST_SQUARES, 5)), observers=list(observers)
     )
 
 
@@ -394,7 +396,7 @@ def referenced(
         work = Calls(scripted, map(float, itertools.count()))
         Drive(config, work, offload, own, lambda _: None, references=references).run()
         references.close()
-        assert again._memories["scripted"].sites.keys() == {ONBOARD, CLOUD} or cloud.absent
+        assert again._memories.of(kind_of(scripted), []).sites.keys() == {ONBOARD, CLOUD} or cloud.absent
     return list(references_file.read(path)), records
 
 

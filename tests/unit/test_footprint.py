@@ -12,6 +12,7 @@ import pytest
 from benchmarks.decision import AtOnce
 from offboard.common.tasks import Task, task
 from offboard.robot_client import policies, predictors
+from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 
@@ -43,8 +44,10 @@ def offloader(policy: str) -> Offloader:
     return Offloader(
         [Forgetful(ONBOARD), Forgetful(CLOUD)],
         policy=policies.make(policy),
-        predictor=lambda: predictors.make(name.removeprefix(predictors.WORK), 50),
-        shared_work=name.startswith(predictors.WORK),
+        memories=Memories(
+            lambda: predictors.make(name.removeprefix(predictors.WORK), 50),
+            shared_work=name.startswith(predictors.WORK),
+        ),
     )
 
 

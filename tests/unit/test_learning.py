@@ -6,11 +6,13 @@ from random import Random
 import pytest
 
 from offboard.common.errors import CloudTimeout, OffloadError
-from offboard.common.tasks import task
+from offboard.common.tasks import kind_of, task
 from offboard.robot_client import policies, predictors
-from offboard.robot_client.learning.kind import SiteMemory
-from offboard.robot_client.learning.lessons import TOGETHER
-from offboard.robot_client.offloader import BOTH, Offloader
+from offboard.robot_client.learning.learner import TOGETHER
+from offboard.robot_client.learning.memories import Memories
+from offboard.robot_client.learning.site import SiteMemory
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import BOTH
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.predictors import AVERAGE, LEAST_SQUARES
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
@@ -32,17 +34,18 @@ class Scene:
         self.clock = VirtualClock()
         self.sites = {site: VirtualRunner(site, self.clock) for site in (ONBOARD, CLOUD)}
         self.random = Random(1)
+        self.memories = Memories(lambda: predictors.make(predictor, 20))
         self.offload = Offloader(
             list(self.sites.values()),
             policy=policies.make("greedy"),
-            predictor=lambda: predictors.make(predictor, 20),
+            memories=self.memories,
             allowance=allowance,
             clock=self.clock,
         )
         for _ in range(WARM):
             self.ask(ONBOARD)
             self.ask(CLOUD)
-        self.offload._learning.catch_up()
+        self.offload._learner.catch_up()
 
     def ask(self, where: str = CLOUD, times: float = 1.0, failure: OffloadError | None = None) -> None:
         """A task that takes so many times as long as it should."""
@@ -56,7 +59,7 @@ class Scene:
             runner.scripts.clear()
 
     def site(self, name: str = CLOUD) -> SiteMemory:
-        return self.offload._memories["learning_echo"].site(name)
+        return self.memories.of(kind_of(learning_echo), self.sites).site(name)
 
     def learnt(self, name: str = CLOUD) -> int:
         return len(self.site(name).observations) - WARM
@@ -119,10 +122,10 @@ def test_waiting_changes_neither_what_is_learnt_nor_how_old_it_is() -> None:
         where = ONBOARD if n % 7 == 0 else CLOUD
         for scene in (waiting, prompt):
             scene.ask(where)
-        prompt.offload._learning.catch_up()
+        prompt.offload._learner.catch_up()
         for site in (ONBOARD, CLOUD):
             assert waiting.site(site).age == prompt.site(site).age
-    waiting.offload._learning.catch_up()
+    waiting.offload._learner.catch_up()
     for site in (ONBOARD, CLOUD):
         one, other = waiting.site(site), prompt.site(site)
         assert [(o.seconds, o.ahead) for o in one.observations] == [

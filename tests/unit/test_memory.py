@@ -8,7 +8,8 @@ import pytest
 from offboard.common.errors import CloudBroken, CloudBusy, CloudError, CloudTimeout, Overtaken, TaskFailed
 from offboard.common.tasks import kind_of, task
 from offboard.robot_client import predictors
-from offboard.robot_client.learning.kind import WAY_LEAST_OF, KindMemory
+from offboard.robot_client.learning.kind import KindMemory
+from offboard.robot_client.learning.site import WAYS_MAX
 from offboard.robot_client.policies import Outlook, objectives
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.sites.own_cpu import LATE_MAX
@@ -49,7 +50,7 @@ def learn(
 ) -> None:
     site = of.site(execution.site)
     expected = outlook(of, execution.site, condition, in_flight=in_flight)
-    of.pass_by()
+    of.count_task()
     site.learn(1.0, execution, expected, silent=silent, size=1.0, beside=beside)
 
 
@@ -159,7 +160,7 @@ def test_probes_heard_late_lower_what_was_too_high() -> None:
     for _ in range(20):
         learn(one, Execution(CLOUD, 0.05, run_s=0.003), condition=near)
     for n in range(40):
-        seconds = 0.055 if n % WAY_LEAST_OF else 0.035
+        seconds = 0.055 if n % WAYS_MAX else 0.035
         learn(one, Execution(CLOUD, seconds, run_s=0.003), condition=near, beside=True)
     assert outlook(one, condition=near).predicted_s == pytest.approx(0.035, rel=0.05)
 
@@ -195,7 +196,7 @@ def test_failures_of_a_silent_site_teach_nothing() -> None:
 def test_the_tasks_own_failure_is_no_time() -> None:
     """It is news of the site and nothing else."""
     one = known()
-    one.pass_by()
+    one.count_task()
     learn(one, Execution(CLOUD, 0.001, failure=TaskFailed("no")))
     assert outlook(one).predicted_s == pytest.approx(0.2)
     assert (outlook(one).age, outlook(one).failures) == (0, 0)
@@ -231,8 +232,8 @@ def test_work_is_told_by_results_and_shared() -> None:
     """One result on any site tells all of them what a size is; a failed run tells nothing."""
     one = memory(shared_work=True)
     assert one.amount(3.0) is None
-    assert one.work_told([lost(CloudTimeout("late"), 2.0)]) is None
-    told = one.work_told([lost(CloudTimeout("late"), 2.0), Execution(ONBOARD, 0.1, {"work": 30.0})])
+    assert one.work_of_any([lost(CloudTimeout("late"), 2.0)]) is None
+    told = one.work_of_any([lost(CloudTimeout("late"), 2.0), Execution(ONBOARD, 0.1, {"work": 30.0})])
     assert told == 30.0
     one.learn_size(3.0, told)
     assert one.amount(3.0) == 30.0
@@ -242,8 +243,8 @@ def test_work_is_told_by_results_and_shared() -> None:
 def test_a_work_function_that_fails_costs_no_answer(caplog: pytest.LogCaptureFixture) -> None:
     """It is the user's own: logged, and the work unknown."""
     one = memory(shared_work=True)
-    assert one.work_told([Execution(ONBOARD, 0.1, {})]) is None
-    assert "cannot be told" in caplog.text
+    assert one.work_of_any([Execution(ONBOARD, 0.1, {})]) is None
+    assert "cannot read the work" in caplog.text
 
 
 def test_bytes_and_joules_are_those_that_were_usual() -> None:

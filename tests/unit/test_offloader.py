@@ -20,6 +20,7 @@ from offboard.common.errors import (
 )
 from offboard.common.tasks import Task, task
 from offboard.robot_client import policies, predictors
+from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Decision, Forecast, Probe
 from offboard.robot_client.policies.allowance import DUPLICATES, Allowance
@@ -72,7 +73,7 @@ def make() -> Make:
         return Offloader(
             list(runners),
             policy=policies.make(policy),
-            predictor=lambda: predictors.make(predictors.LEAST_SQUARES, 2),
+            memories=Memories(lambda: predictors.make(predictors.LEAST_SQUARES, 2)),
             **options,  # type: ignore[arg-type]
         )
 
@@ -288,9 +289,11 @@ def test_many_threads_lose_nothing(make: Make) -> None:
 def test_onboard_must_be_among_the_sites() -> None:
     """An offloader without onboard, or with a site twice, is refused."""
     for runners in ([cloud_answers()], [OnboardRunner(), OnboardRunner()]):
-        with pytest.raises(ConfigError, match="each once, 'onboard' among them"):
+        with pytest.raises(ConfigError, match="each site once, and 'onboard' among them"):
             Offloader(
-                runners, policy=policies.make("paper"), predictor=lambda: predictors.make("least-squares", 5)
+                runners,
+                policy=policies.make("paper"),
+                memories=Memories(lambda: predictors.make("least-squares", 5)),
             )  # type: ignore[arg-type]
 
 
@@ -342,7 +345,7 @@ def test_late_tasks_are_learnt_with_the_load_that_made_them_late() -> None:
     takes: Iterator[float] = itertools.cycle([0.009, 0.01, 0.011])
     cloud.script = lambda one: Execution(CLOUD, next(takes), one.args)
     with Offloader(
-        [home, cloud], policy=policies.make(CLOUD), predictor=lambda: predictors.make("average", 50)
+        [home, cloud], policy=policies.make(CLOUD), memories=Memories(lambda: predictors.make("average", 50))
     ) as offload:
         for _ in range(60):
             offload(add_one, 2)
@@ -374,7 +377,7 @@ def test_late_tasks_are_learnt_with_what_the_server_said_in_its_answer(
     cloud.script, says = answer, UNMEASURED
     home = ScriptedRunner(ONBOARD, lambda one: Execution(ONBOARD, 0.05, one.args))
     with Offloader(
-        [home, cloud], policy=policies.make(CLOUD), predictor=lambda: predictors.make("average", 50)
+        [home, cloud], policy=policies.make(CLOUD), memories=Memories(lambda: predictors.make("average", 50))
     ) as offload:
         for _ in range(60):
             offload(add_one, 2)
@@ -405,7 +408,7 @@ def test_odd_tasks_are_learnt_with_the_capacity_that_made_them_odd(capacity: flo
     with Offloader(
         [home, cloud_answers()],
         policy=policies.make(ONBOARD),
-        predictor=lambda: predictors.make("average", 50),
+        memories=Memories(lambda: predictors.make("average", 50)),
     ) as offload:
         for _ in range(60):
             offload(add_one, 2)
@@ -427,7 +430,7 @@ def test_a_server_that_is_probed_beside_an_own_run_is_not_taken_for_slow(
     policy, clock = Scripted(), VirtualClock()
     home, cloud = VirtualRunner(ONBOARD, clock, 0.02), VirtualRunner(CLOUD, clock, 0.04)
     with Offloader(
-        [home, cloud], policy=policy, predictor=lambda: predictors.make("average", 50), clock=clock
+        [home, cloud], policy=policy, memories=Memories(lambda: predictors.make("average", 50)), clock=clock
     ) as offload:
         for _ in range(30):
             policy.next = Decision(CLOUD, "plain", "scripted")

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from offboard.common.errors import ConfigError
 from offboard.common.tasks import task
 from offboard.robot_client import policies
+from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Forecast, Outlook
 from offboard.robot_client.predictors.least_squares import LeastSquares
@@ -75,7 +76,7 @@ def offloaded(rows: list[Row], n: int) -> list[tuple[str, Queue, Queue]]:
     seen = []
     # The order of the runners is the order in which their memories are made.
     with Offloader(
-        [answer(ONBOARD, 1), answer(CLOUD, 2)], policy=policies.make("paper"), predictor=remember
+        [answer(ONBOARD, 1), answer(CLOUD, 2)], policy=policies.make("paper"), memories=Memories(remember)
     ) as offload:
         for row in rows:
             offload(paper_probe, *row)

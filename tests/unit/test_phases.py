@@ -13,6 +13,7 @@ import pytest
 from offboard.common.errors import CloudBroken, CloudBusy, CloudTimeout, OffloadError, TaskFailed
 from offboard.common.tasks import task
 from offboard.robot_client import policies, predictors
+from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Decision, Forecast, Hedge, Policy, Probe
 from offboard.robot_client.policies.allowance import DUPLICATES_MAX, Allowance
@@ -66,7 +67,7 @@ class Scene:
         self.offload = Offloader(
             list(self.sites.values()),
             policy=policy or self.policy,
-            predictor=self._remember,
+            memories=Memories(self._remember),
             allowance=self.allowance,
             timeout_s=TIMEOUT_S,
             observers=[self.records.append],
@@ -91,7 +92,7 @@ class Scene:
         return [(size, round(seconds, 6)) for size, seconds in self._made[[*self.sites].index(site)].window]
 
     def in_flight(self) -> int:
-        return sum(len(flights) for flights in self.offload._flights.values())
+        return sum(self.offload._flights.count(site) for site in self.sites)
 
 
 Run = tuple[float | None, OffloadError | None]
@@ -297,7 +298,7 @@ def test_no_answer_is_lost_among_random_faults(policy: str, seed: int) -> None:
     offload = Offloader(
         list(sites.values()),
         policy=policies.make(policy, seed),
-        predictor=lambda: predictors.make(name, 20),
+        memories=Memories(lambda: predictors.make(name, 20)),
         timeout_s=TIMEOUT_S,
         observers=[records.append],
         clock=clock,
@@ -314,7 +315,7 @@ def test_no_answer_is_lost_among_random_faults(policy: str, seed: int) -> None:
     offload(phase_echo, 600, where=ONBOARD)
     assert [one.size for one in records] == list(range(601))
     assert all(len({run.site for run in one.executions}) == len(one.executions) for one in records)
-    assert all(not flights for flights in offload._flights.values())
+    assert not any(offload._flights.count(site) for site in sites)
     overtaken = sum("Overtaken" in (run.error or "") for one in records for run in one.executions)
     assert sum(len(one.late) for one in records) == overtaken
     assert overtaken > 0 or policy == "paper"

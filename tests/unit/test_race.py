@@ -41,7 +41,7 @@ class Course:
         self.sites = {site: VirtualRunner(site, self.clock) for site in (ONBOARD, CLOUD, EDGE)}
         self.begun: list[tuple[str, float]] = []
         self.late: list[tuple[str, Execution]] = []
-        self.meanwhile: list[list[str]] = []  # the sites that had begun by then
+        self.idle: list[list[str]] = []  # the sites that had begun by then
         self.allowed = True
 
     def run(self, plan: Plan, function: Callable[[int], int] = race_echo) -> tuple[Execution, ...]:
@@ -53,7 +53,7 @@ class Course:
             begun=lambda site: self.begun.append((site, self.clock.now_s())),
             allowed=lambda: self.allowed,
             late=lambda site, execution: self.late.append((site, execution)),
-            meanwhile=lambda: self.meanwhile.append([site for site, _ in self.begun]),
+            idle=lambda: self.idle.append([site for site, _ in self.begun]),
         )
         return race.run(plan)
 
@@ -122,7 +122,7 @@ def test_what_is_done_meanwhile_is_done_once_the_first_have_begun(course: Course
     """Before anything is waited for, and before a second site begins."""
     course.take(onboard=1.0, cloud=0.2)
     course.run(Plan((ONBOARD,), Hedge(CLOUD, 0.1)))
-    assert course.meanwhile == [[ONBOARD]]
+    assert course.idle == [[ONBOARD]]
     assert [site for site, _ in course.begun] == [ONBOARD, CLOUD]
 
 

@@ -21,6 +21,7 @@ from offboard.loadgen.simulation.model.simulated_tasks import find_tasks
 from offboard.loadgen.simulation.world import World
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client import predictors
+from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Decision, Forecast, Hedge, Probe
 from offboard.robot_client.records.trace import Record
@@ -217,7 +218,7 @@ def race(tmp_path: Path) -> Callable[..., tuple[list[Record], float]]:
         offload = Offloader(
             [world.cloud, world.onboard],
             policy=Scripted(decision),
-            predictor=lambda: predictors.make("least-squares", 5),
+            memories=Memories(lambda: predictors.make("least-squares", 5)),
             observers=[records.append],
             clock=clock,
         )

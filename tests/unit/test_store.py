@@ -16,7 +16,8 @@ from offboard.common.errors import CloudTimeout, ConfigError, TaskFailed
 from offboard.common.tasks import Task, task
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.learning import store
-from offboard.robot_client.learning.kind import OBSERVATIONS_MAX
+from offboard.robot_client.learning.memories import Memories
+from offboard.robot_client.learning.site import OBSERVATIONS_MAX
 from offboard.robot_client.learning.store import HALF_LIFE_S, SAVE_EVERY_S, Store
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Outlook, Probe
@@ -87,10 +88,12 @@ class Robot:
         return Offloader(
             self.sites,
             policy=policies.make(policy, 1),
-            predictor=remember,
-            shared_work=plain != predictor,
+            memories=Memories(
+                remember,
+                shared_work=plain != predictor,
+                store=Store(self.path, now=lambda: self.unix_s),
+            ),
             clock=self.clock,
-            store=Store(self.path, now=lambda: self.unix_s),
             observers=[self.records.append],
             **options,
         )
@@ -384,6 +387,16 @@ def test_a_save_survives_a_loss_of_power(robot: Robot, monkeypatch: pytest.Monke
     assert synced == [(".memory.json.new", False), (robot.path.parent.name, True)]
 
 
+def writers() -> list[threading.Thread]:
+    """The threads that write a memory file now."""
+    return [thread for thread in threading.enumerate() if thread.name == "memory"]
+
+
+def wait_for_writers() -> None:
+    for writer in writers():
+        writer.join(10)
+
+
 def test_it_is_saved_every_half_minute(robot: Robot) -> None:
     """Not at the first task, but SAVE_EVERY_S after it and again after as long: a crash costs no more."""
     offload = robot.started()
@@ -392,9 +405,7 @@ def test_it_is_saved_every_half_minute(robot: Robot) -> None:
     for observations in (6, 7):
         robot.clock.wait([], SAVE_EVERY_S)
         robot.ask(offload, 1)
-        assert offload._store is not None
-        assert offload._store._writer is not None
-        offload._store._writer.join(10)
+        wait_for_writers()
         sites = json.loads(robot.path.read_bytes())["kinds"]["store_plain"]["sites"]
         assert len(sites[CLOUD]["observations"]) == observations
         robot.ask(offload, 0)
@@ -417,11 +428,11 @@ def test_a_slow_disk_keeps_nobody_waiting(robot: Robot, monkeypatch: pytest.Monk
     robot.clock.wait([], SAVE_EVERY_S)
     robot.ask(offload, 1)
     assert entered.wait(10)
-    writer = offload._store._writer  # type: ignore[union-attr]
+    (writer,) = writers()
     for _ in range(3):
         robot.clock.wait([], SAVE_EVERY_S)
         robot.ask(offload, 1)
-        assert offload._store._writer is writer  # type: ignore[union-attr]
+        assert writers() == [writer]
     hanging.set()
     offload.close()
     sites = json.loads(robot.path.read_bytes())["kinds"]["store_plain"]["sites"]
@@ -440,7 +451,7 @@ def test_a_disk_that_hangs_for_ever_does_not_hang_the_end(
     offload.close()
     assert "not written within 0.01 s" in caplog.text
     hanging.set()
-    offload._store._writer.join(10)  # type: ignore[union-attr]
+    wait_for_writers()
 
 
 def test_a_failing_disk_is_one_warning_and_no_lost_answer(
@@ -453,9 +464,7 @@ def test_a_failing_disk_is_one_warning_and_no_lost_answer(
     for _ in range(4):
         robot.clock.wait([], SAVE_EVERY_S)
         assert offload(store_plain, 2.0) == 2.0
-        writer = offload._store._writer  # type: ignore[union-attr]
-        if writer is not None:
-            writer.join(10)
+        wait_for_writers()
     assert [one.getMessage() for one in caplog.records if one.levelno == logging.WARNING] == [
         f"memory {robot.path} cannot be written: Is a directory; tasks go on"
     ]

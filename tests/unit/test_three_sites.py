@@ -7,6 +7,7 @@ import pytest
 from offboard.common.errors import CloudTimeout
 from offboard.common.tasks import Task, task
 from offboard.robot_client import policies, predictors
+from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies.probe import PROBE_EVERY
 from offboard.robot_client.records.trace import Record
@@ -52,7 +53,7 @@ def test_the_best_living_site_is_used_soon_after_each_change(
     with Offloader(
         [*servers, runner(ONBOARD)],
         policy=policies.make(policies.DEFAULT),
-        predictor=lambda: predictors.make("average", 50),
+        memories=Memories(lambda: predictors.make("average", 50)),
         observers=[records.append],
     ) as offload:
         for fail, _ in PHASES:
