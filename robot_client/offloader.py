@@ -13,7 +13,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -309,7 +308,7 @@ class Offloader:
         self._allowance.begin(now_s)
         memory = self._memories.of(task.kind, self._runners)
         amount = memory.amount(task.size)
-        sites = [site for site in self._runners if site not in absent]
+        sites = [site for site in self._runners if site not in absent] if absent else self._runners
         forecast = self._forecaster.forecast(
             memory, task.size, sites, amount=amount, timeout_s=timeout_s, now_s=now_s
         )
@@ -336,7 +335,7 @@ class Offloader:
             heard = [site for site in forecast.sites if site not in decision.spared]
             site = min(heard, key=lambda site: (len(memory.site(site).predictor), site != ONBOARD))
             return Decision(site, f"{decision.reason}; never on two sites", decision.policy)
-        return decision if decision.second is None else replace(decision, second=None)
+        return decision if decision.second is None else decision._replace(second=None)
 
     def _note_move(self, memory: KindMemory, decision: Decision) -> None:
         if decision.site == memory.last_site:

@@ -7,7 +7,6 @@ import copy
 import math
 import random
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
 
 from offboard.robot_client.policies import Decision, Forecast, Hedge, Outlook, Policy
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition
@@ -111,7 +110,7 @@ def decisions(policy: Policy, asked: Iterable[Forecast]) -> Iterator[tuple[Forec
 
 def told(decision: Decision) -> Decision:
     """The same with its reason in words: two that say the same are equal."""
-    return replace(decision, why=decision.reason)
+    return decision._replace(why=decision.reason)
 
 
 def forecasts(seed: int = 1) -> Iterator[Forecast]:

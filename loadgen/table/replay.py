@@ -149,7 +149,7 @@ class _Chooser:
 
     def decide(self, forecast: Forecast) -> Decision:
         self.last = self._policy.decide(forecast)
-        return replace(self.last, both=self.last.both or self._every)
+        return self.last._replace(both=self.last.both or self._every)
 
 
 class _Replaying:

@@ -16,7 +16,7 @@ OUTSIDE = 1 - COVERAGE
 OUTSIDE_MIN, OUTSIDE_MAX = -0.1, 0.5  # below 0, the interval is wider than all errors seen
 ERRORS_MAX = 100  # the last ones
 RATE = 0.03  # of the adaptation
-USUAL_RATE = 0.05  # of the running mean of the times
+USUAL_FROM = 20  # times: the usual time is their mean; from then on, old times fade from it
 
 
 class Conformal:
@@ -52,8 +52,10 @@ class Conformal:
                 low, high = self._ends or self._interval()
                 self._adapt(missed=not low <= score <= high)
             self._add(score)
-        self._count = min(self._count + 1, ERRORS_MAX)
-        self._usual_s += max(1 / self._count, USUAL_RATE) * (max(seconds, predicted_s) - self._usual_s)
+        if self._count < USUAL_FROM:
+            self._count += 1
+        slower_s = seconds if seconds > predicted_s else predicted_s
+        self._usual_s += (slower_s - self._usual_s) * (1 / self._count)
         self._errors = None
 
     def miss(self) -> None:

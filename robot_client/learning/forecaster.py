@@ -32,15 +32,11 @@ class Forecaster:
         now_s: float,
     ) -> Forecast:
         """The forecast of one task on these sites, behind all runs that are under way."""
-        outlooks = {
-            site: memory.site(site).outlook(
-                amount,
-                self._condition(memory, site, now_s),
-                in_flight=self._flights.count(site),
-                timeout_s=timeout_s,
-            )
-            for site in sites
-        }
+        outlooks = {}
+        for site in sites:
+            here, in_flight = memory.site(site), self._flights.count(site)
+            condition = self._condition(site, in_flight, now_s) if here.conditional else UNMEASURED
+            outlooks[site] = here.outlook(amount, condition, in_flight=in_flight, timeout_s=timeout_s)
         return self._with_allowance(memory, size, outlooks)
 
     def forecast_in_batch(
@@ -51,12 +47,11 @@ class Forecaster:
         `own` holds the sites that may be used, and how many tasks of the batch each of them has.
         """
         amount = memory.amount(size)
-        outlooks = {
-            site: memory.site(site).outlook(
-                amount, self._apart_from(count, memory, site), in_flight=count, timeout_s=timeout_s
-            )
-            for site, count in own.items()
-        }
+        outlooks = {}
+        for site, count in own.items():
+            here = memory.site(site)
+            condition = self._apart_from(site, count) if here.conditional else UNMEASURED
+            outlooks[site] = here.outlook(amount, condition, in_flight=count, timeout_s=timeout_s)
         return self._with_allowance(memory, size, outlooks)
 
     def _with_allowance(self, memory: KindMemory, size: float, outlooks: Mapping[str, Outlook]) -> Forecast:
@@ -70,22 +65,18 @@ class Forecaster:
             joules_left=allowance.joules_left,
         )
 
-    def _condition(self, memory: KindMemory, site: str, now_s: float) -> Condition:
+    def _condition(self, site: str, in_flight: int, now_s: float) -> Condition:
         """The condition of a site behind the runs under way there.
 
         Onboard runs one task at a time. The queue of a server may not yet count what was sent to it.
         """
-        if not memory.site(site).conditional:
-            return UNMEASURED
-        condition, flying = self._conditions.now(site), self._flights.count(site)
-        if not flying:
+        condition = self._conditions.now(site)
+        if not in_flight:
             return condition
         if site != ONBOARD:
-            return condition._replace(queue=max(condition.queue, flying))
+            return condition._replace(queue=max(condition.queue, in_flight))
         return condition._replace(wait_s=self._flights.left_s(site, now_s))
 
-    def _apart_from(self, own: int, memory: KindMemory, site: str) -> Condition:
-        if not memory.site(site).conditional:
-            return UNMEASURED
+    def _apart_from(self, site: str, own: int) -> Condition:
         condition = self._conditions.now(site)
         return condition._replace(queue=max(0, condition.queue - own))

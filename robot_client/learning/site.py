@@ -20,7 +20,9 @@ from offboard.robot_client.predictors.features import Conditional
 from offboard.robot_client.sites.own_cpu import may_be_late
 from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Execution
 
-MEAN_RATE = 0.1  # of the running means of bytes and CPU seconds
+MEAN_FROM = (
+    10  # amounts of bytes and CPU seconds: what is usual is their mean; then, old amounts fade from it
+)
 OBSERVATIONS_MAX = 200  # of one site, kept for `store`
 SMALL = 0.5  # of the smallest amount that a site ran: the prediction for less is a guess
 LOADED_FROM = 10  # observations: times under load are learnt apart only after these
@@ -259,7 +261,8 @@ class SiteMemory:
 
     def _take(self, one: Observation) -> None:
         self.observations.append(one)
-        self._smallest = min(self._smallest, one.amount)
+        if one.amount < self._smallest:
+            self._smallest = one.amount
         self._use(one.bytes, one.cpu_s)
         if one.predicted_s is not None and one.ok:
             self._conformal.learn(one.predicted_s, one.seconds + one.waited_s)
@@ -367,5 +370,6 @@ class _RunningMean:
 
     def add(self, amount: float) -> None:
         if math.isfinite(amount):
-            self._count = min(self._count + 1, round(1 / MEAN_RATE))
+            if self._count < MEAN_FROM:
+                self._count += 1
             self.value += (amount - self.value) / self._count

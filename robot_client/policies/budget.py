@@ -5,7 +5,6 @@
 
 import math
 from collections.abc import Collection
-from dataclasses import replace
 
 from offboard.robot_client.policies.decision import Decision, Policy, decide_among
 from offboard.robot_client.policies.forecast import Forecast
@@ -26,9 +25,9 @@ class WithBudget:
         decision = decide_among(fit, forecast, self._inner)
         if decision.both and not _fits(forecast, forecast.sites.keys() - decision.spared):
             why = f"{decision.reason}; the caps allow one site only"
-            return replace(decision, both=False, spared=(), why=why)
+            return decision._replace(both=False, spared=(), why=why)
         if decision.second is not None and not _fits(forecast, {decision.site, decision.second.site}):
-            return replace(decision, second=None)
+            return decision._replace(second=None)
         return decision
 
 

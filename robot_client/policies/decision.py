@@ -4,8 +4,8 @@ What a decision is based on is in `forecast`; `execution/race.py` carries it out
 """
 
 from collections.abc import Callable, Collection
-from dataclasses import KW_ONLY, dataclass, replace
-from typing import Protocol
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 from offboard.robot_client.policies.forecast import Forecast
 
@@ -34,8 +34,7 @@ class Hedge:
     after_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class Decision:
+class Decision(NamedTuple):
     """Run the task on `site`; with `both`, on all sites except those in `spared`, in parallel.
 
     `why` is the reason for people, or a function that makes it: few reasons are ever read.
@@ -45,7 +44,6 @@ class Decision:
     site: str
     why: str | Callable[[], str]
     policy: str
-    _: KW_ONLY
     both: bool = False
     second: Probe | Hedge | None = None
     spared: tuple[str, ...] = ()
@@ -70,4 +68,4 @@ def decide_among(sites: Collection[str], forecast: Forecast, policy: Policy) -> 
     if not decision.both:
         return decision
     left_out = [site for site in forecast.sites if site not in sites]
-    return replace(decision, spared=(*decision.spared, *left_out))
+    return decision._replace(spared=(*decision.spared, *left_out))

@@ -159,7 +159,10 @@ def cheapest(costs: Mapping[str, float]) -> str:
 
 def costs_of(forecast: Forecast) -> dict[str, float]:
     """The cost of each site."""
-    return {site: _cost_of(one) for site, one in forecast.sites.items()}
+    return {
+        site: _cost_without_objective(one) if one.cost is None else one.cost
+        for site, one in forecast.sites.items()
+    }
 
 
 def home(forecast: Forecast) -> str:
@@ -167,10 +170,8 @@ def home(forecast: Forecast) -> str:
     return ONBOARD if ONBOARD in forecast.sites else cheapest(costs_of(forecast))
 
 
-def _cost_of(outlook: Outlook) -> float:
+def _cost_without_objective(outlook: Outlook) -> float:
     """An unknown site costs nothing, so that it is tried; an unknown site that is silent is never tried."""
-    if outlook.cost is not None:
-        return outlook.cost
     if outlook.predicted_s is None:
         return math.inf if outlook.condition.silent else 0.0
     return outlook.predicted_s

@@ -19,9 +19,9 @@ class Greedy:
     name = "greedy"
 
     def decide(self, forecast: Forecast) -> Decision:
-        warming = self._warm_up(forecast)
-        if warming is not None:
-            return warming
+        for outlook in forecast.sites.values():
+            if outlook.observations < WARM_UP and (warming := self._warm_up(forecast)) is not None:
+                return warming
         site = self._choose(forecast, costs_of(forecast))
         return Decision(site, partial(explain, forecast, site), self.name)
 
@@ -29,9 +29,7 @@ class Greedy:
         return cheapest(costs)
 
     def _warm_up(self, forecast: Forecast) -> Decision | None:
-        """Run on all sites except silent ones while too little is known of one of them."""
-        if all(one.observations >= WARM_UP for one in forecast.sites.values()):
-            return None
+        """Run on all sites except silent ones, unless tasks under way will soon tell enough."""
         heard = {site: one for site, one in forecast.sites.items() if not one.condition.silent}
         cold = [site for site, one in heard.items() if _is_cold(one)]
         if not cold or len(heard) == 1:

@@ -3,8 +3,6 @@
 `execution/race.py` starts both runs and uses the first answer.
 """
 
-from dataclasses import replace
-
 from offboard.robot_client.policies.decision import Decision, Policy, Probe
 from offboard.robot_client.policies.forecast import Forecast, Outlook
 from offboard.robot_client.sites.runner import ONBOARD
@@ -48,7 +46,7 @@ class WithProbes:
                 stalest, age = site, one.age
         if not stalest:
             return decision
-        return replace(decision, second=Probe(stalest), why=f"{decision.reason}; {stalest} is probed")
+        return decision._replace(second=Probe(stalest), why=f"{decision.reason}; {stalest} is probed")
 
 
 def _probe_after(site: str, one: Outlook, chosen: Outlook) -> float:
