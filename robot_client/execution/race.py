@@ -1,6 +1,6 @@
-"""One task on the sites that were decided for: who starts when, and whose answer is used.
+"""One task on the sites of its decision: when each site starts, and whose answer is used.
 
-Which sites these are is `policies`' business, what is learnt of it the offloader's.
+The sites are chosen in `policies`; what comes of the runs is learnt in `learning`.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,9 +17,11 @@ from offboard.robot_client.sites.runner import ONBOARD, Execution, Runner
 
 @dataclass(slots=True)
 class Plan:
-    """`first` start at once; `second` is a second run; `all`: wait for every one.
+    """When the sites of one task start.
 
-    `call`: a site that starts too once this names it.
+    `first`: the sites that start at once. `second`: a second run.
+    `all`: wait for every run, not for the first answer.
+    `call`: a future that may name one more site while the task runs; that site then starts too.
     """
 
     first: tuple[str, ...]
@@ -29,9 +31,13 @@ class Plan:
 
 
 class Race:
-    """Runs one task. `begun` is told of every site that starts; `allowed` is asked before a second one does,
-    but not before one in place of those that failed; `late` gets, in any thread, what comes of a run that was
-    still under way when the answer was there; `meanwhile` is called once the first ones have started."""
+    """Runs one task.
+
+    `begun`: called with every site that starts.
+    `allowed`: asked before a second run starts. A fallback, which replaces failed runs, is always allowed.
+    `late`: called in any thread when a run ends after the task was answered.
+    `idle`: called once, after the first sites have started.
+    """
 
     def __init__(
         self,
@@ -53,10 +59,10 @@ class Race:
         self._allowed = allowed
         self._late = late
         self._idle = idle
-        self._runs: dict[str, tuple[Future[Execution], float]] = {}  # and when it began
+        self._runs: dict[str, tuple[Future[Execution], float]] = {}  # with its start time
 
     def run(self, plan: Plan) -> tuple[Execution, ...]:
-        """All executions in the order in which they began; those still under way as overtaken."""
+        """All executions in the order of their start; runs that are still under way count as overtaken."""
         for site in plan.first:
             self._start(site)
         self._idle()
@@ -94,7 +100,7 @@ class Race:
                 return
         if self._allowed():
             self._start(second.site)
-        for first in late:  # after the start: a robot may be late for want of CPU
+        for first in late:  # after the start: the robot itself may be late because its CPU is busy
             self._runners[first].hurry()
 
     def _wait_for_answer(self, call: "Future[str] | None") -> None:
@@ -122,7 +128,7 @@ class Race:
             self._clock.wait(pending)
 
     def _leave(self, site: str, run: "Future[Execution]", began_s: float, *, keep: bool) -> Execution:
-        """A run that came second: its time is learnt when it ends, now where it can be stopped."""
+        """Leave a run that lost the race; it is cancelled, unless its whole time is wanted (`keep`)."""
         run.add_done_callback(lambda done: self._late(site, _finished(site, done)))
         if not keep:
             self._runners[site].cancel(self._task)
@@ -131,7 +137,7 @@ class Race:
 
 
 def answer_of(executions: tuple[Execution, ...]) -> Execution:
-    """The first good answer; else the task's own failure; else whatever failed last."""
+    """The fastest good answer, or else the failure of the task itself, or else the last failure."""
     for execution in executions:
         if isinstance(execution.failure, BadValue):
             return execution
@@ -143,7 +149,7 @@ def answer_of(executions: tuple[Execution, ...]) -> Execution:
 
 
 def _finished(site: str, future: "Future[Execution]") -> Execution:
-    """A runner's future ends by itself within the budget; one cancelled by `close` counts as broken."""
+    """The result of a run. A runner ends every run within its budget; `close` cancels the future instead."""
     try:
         return future.result()
     except CancelledError:
@@ -151,7 +157,7 @@ def _finished(site: str, future: "Future[Execution]") -> Execution:
 
 
 def _is_answer(execution: Execution) -> bool:
-    """A failure of the task itself is the same everywhere."""
+    """Whether the race is over: if the task itself fails, it fails on every site."""
     return execution.ok or isinstance(execution.failure, TaskError)
 
 

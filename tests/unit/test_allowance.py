@@ -102,5 +102,5 @@ def test_a_share_is_from_0_to_1(wrong: float) -> None:
 @pytest.mark.parametrize("wrong", [-1.0, math.nan])
 def test_a_cap_is_not_below_zero(cap: str, wrong: float) -> None:
     """Anything else is refused by name."""
-    with pytest.raises(ConfigError, match=r"a minute .* must be from 0"):
+    with pytest.raises(ConfigError, match=r"a minute .* must be 0 or more"):
         Allowance(**{cap: wrong})

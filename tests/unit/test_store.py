@@ -265,9 +265,12 @@ def test_the_file_is_bounded(robot: Robot) -> None:
         (b'{"v":1,"kinds":{"store_plain":{"sou', "not JSON"),
         (b"\x00\xff\x00", "not JSON"),
         (b"[" * 100_000, "not JSON"),
-        (b"[1, 2]", "no memory of a robot-client"),
-        (b'{"name": "small"}', "no memory of a robot-client"),
-        (b'{"v": 2, "software": "9.0", "kinds": {}}', "format version 2 of software '9.0'; this reads 1"),
+        (b"[1, 2]", "not a memory file of a robot-client"),
+        (b'{"name": "small"}', "not a memory file of a robot-client"),
+        (
+            b'{"v": 2, "software": "9.0", "kinds": {}}',
+            "format version 2 of software '9.0'; this version reads 1",
+        ),
         (b'{"v": 1, "kinds": []}', "AttributeError"),
         (b'{"v": 1, "kinds": {"store_plain": {}}}', "KeyError: 'per'"),
         (

@@ -4,7 +4,7 @@ from random import Random
 
 import pytest
 
-from offboard.robot_client.learning.under_load import KEPT, ODD, UnderLoad
+from offboard.robot_client.learning.under_load import KEPT, OUTLIER, UnderLoad
 
 
 def taught(*times: tuple[float, float], onboard: bool = False) -> UnderLoad:
@@ -50,7 +50,7 @@ def test_many_times_tell_the_line() -> None:
 def test_one_odd_time_counts_as_a_few_of_the_usual_ones() -> None:
     """A second run beside it, or a stall."""
     one = taught(*[(0.04, 0.1)] * 4, (0.04, 9.0))
-    assert one.expect(0.04) == pytest.approx((4 * 0.1 + ODD * 0.1) / 5)
+    assert one.expect(0.04) == pytest.approx((4 * 0.1 + OUTLIER * 0.1) / 5)
 
 
 def test_it_is_never_quicker_than_without_the_load() -> None:
