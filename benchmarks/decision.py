@@ -1,4 +1,4 @@
-"""What deciding costs: predict both sites, decide, learn and record, with runners that answer at once."""
+"""What a decision costs: predict, decide, learn and record, with runners that answer at once."""
 
 import itertools
 import random
@@ -31,7 +31,7 @@ def counted(size: float) -> float:
 
 
 class AtOnce:
-    """A site whose answers are there when they are asked for, and take what a line says."""
+    """A site that answers at once, with times on a line."""
 
     def __init__(self, site: str) -> None:
         self.site = site
@@ -59,7 +59,7 @@ class AtOnce:
 
 
 class Kept:
-    """A policy that remembers the last forecast it was asked about."""
+    """A policy that keeps the last forecast."""
 
     def __init__(self, inner: Policy) -> None:
         self.inner = inner
@@ -74,7 +74,7 @@ def tables() -> list[Table]:
 
 
 def _offloader(policy: str, window: int) -> tuple[Offloader, Kept]:
-    """One that knows both sites well."""
+    """An offloader that knows both sites well."""
     name = policies.predictor_of(policy)
     plain = name.removeprefix(predictors.WORK)
     kept = Kept(policies.make(policy))
@@ -132,7 +132,7 @@ def _ask(offload: Offloader, count: int) -> None:
 
 
 def _thinks(offload: Offloader) -> Callable[[int], None]:
-    """What is between a task and where it runs, and its time and the next task: no future, no record."""
+    """The steps between a task and its run, and between its time and the next task."""
     kind = kind_of(counted)
     tasks = [Task(kind, (size,), size) for size in SIZES]
     ran = {

@@ -1,6 +1,6 @@
-"""A robot that maps the same tasks over all sites and over each alone, in turn, and prints the seconds.
+"""A robot that runs the same batch on all sites, onboard only and in the cloud only, and prints the seconds.
 
-The local testbed starts it in place of `robot-client`, held to its quota: `python -m tests.batch_robot`.
+The local testbed starts it instead of `robot-client`, with its CPU quota: `python -m tests.batch_robot`.
 """
 
 import argparse
@@ -14,9 +14,9 @@ from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 TASKS = 40
-ROUNDS = (10_000, 150_000)  # of a task, drawn evenly
+ROUNDS = (10_000, 150_000)  # the work of a task, drawn evenly
 CONNECT_S = 20.0
-TIMEOUT_S = 20.0  # no answer is given up: what is measured is where tasks are put
+TIMEOUT_S = 20.0  # so long that no answer is given up
 
 
 def main() -> None:

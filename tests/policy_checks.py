@@ -1,6 +1,6 @@
-"""The policy contract, one function a check; tests/unit/test_policies.py runs them on all policies.
+"""The policy contract, one function per check; tests/unit/test_policies.py runs them on all policies.
 
-Each takes `make`, which makes a fresh policy, always with the same seed.
+Each check gets `make`, which makes a fresh policy, always with the same seed.
 """
 
 import copy
@@ -19,7 +19,7 @@ SILENT = Condition(silent=True)
 
 
 def decides_among_the_sites_of_the_forecast(make: Make) -> None:
-    """Site, second and spared sites are of the forecast; the second is another site, after a finite wait."""
+    """All sites of a decision are in the forecast, and the second run is on another site."""
     for forecast, decision in decisions(make(), forecasts()):
         assert decision.site in forecast.sites
         assert set(decision.spared) <= forecast.sites.keys() - {decision.site}
@@ -31,20 +31,20 @@ def decides_among_the_sites_of_the_forecast(make: Make) -> None:
 
 
 def says_why(make: Make) -> None:
-    """A reason and the name of the rule are given each time."""
+    """Every decision has a reason and the name of the rule."""
     for _, decision in decisions(make(), forecasts()):
         assert decision.reason
         assert decision.policy
 
 
 def repeats_itself_for_a_seed(make: Make) -> None:
-    """Two of the same seed decide the same on the same forecasts."""
+    """Two policies with the same seed make the same decisions."""
     once, again = (list(decisions(make(), forecasts())) for _ in range(2))
     assert once == again
 
 
 def leaves_the_forecast_as_it_is(make: Make) -> None:
-    """Deciding changes nothing of what it was told."""
+    """Deciding does not change the forecast."""
     policy = make()
     for forecast in forecasts():
         before = copy.deepcopy(forecast)
@@ -52,35 +52,35 @@ def leaves_the_forecast_as_it_is(make: Make) -> None:
         assert forecast == before
 
 
-def stays_onboard_where_nothing_else_is(make: Make) -> None:
-    """With onboard as the only site the task runs there, once."""
+def stays_onboard_without_other_sites(make: Make) -> None:
+    """If onboard is the only site, the task runs there once."""
     for forecast, decision in decisions(make(), (one.only([ONBOARD]) for one in forecasts())):
         assert decision.site in forecast.sites
         assert (decision.site, decision.both, decision.second) == (ONBOARD, False, None)
 
 
 def starts_no_second_run_on_a_silent_site(make: Make) -> None:
-    """A site whose heartbeats go unanswered is neither probed nor hedged to."""
+    """A site that does not answer heartbeats gets neither a probe nor a hedge."""
     for forecast, decision in decisions(make(), forecasts()):
         if decision.second is not None:
             assert not forecast.sites[decision.second.site].condition.silent
 
 
 def starts_no_second_run_beyond_the_allowance(make: Make) -> None:
-    """Where no second run is left to spend none is planned."""
+    """If no second run is allowed, none is planned."""
     for _, decision in decisions(make(), (one._replace(duplicates=0.99) for one in forecasts())):
         assert decision.second is None
 
 
 def decides_before_anything_is_known(make: Make) -> None:
-    """Sites of which nothing was learnt yet are decided about like others."""
+    """A policy decides even if nothing was learnt of any site."""
     for forecast, decision in decisions(make(), (unknown(one) for one in forecasts())):
         assert decision.site in forecast.sites
-        assert not isinstance(decision.second, Hedge), "nothing tells when a site is late"
+        assert not isinstance(decision.second, Hedge), "nothing says when a site is late"
 
 
-def has_a_look_at_one_forecast_only(make: Make) -> None:
-    """Without chance the same forecast leads to the same decision, whatever was decided in between."""
+def remembers_no_forecast(make: Make) -> None:
+    """Rules that do not draw make the same decision for the same forecast, whatever came in between."""
     policy, probe = make(), next(iter(forecasts()))
     if policy.decide(probe).policy in ("epsilon", "thompson"):
         return
@@ -95,11 +95,11 @@ CONTRACT: tuple[Callable[[Make], None], ...] = (
     says_why,
     repeats_itself_for_a_seed,
     leaves_the_forecast_as_it_is,
-    stays_onboard_where_nothing_else_is,
+    stays_onboard_without_other_sites,
     starts_no_second_run_on_a_silent_site,
     starts_no_second_run_beyond_the_allowance,
     decides_before_anything_is_known,
-    has_a_look_at_one_forecast_only,
+    remembers_no_forecast,
 )
 
 
@@ -109,12 +109,12 @@ def decisions(policy: Policy, asked: Iterable[Forecast]) -> Iterator[tuple[Forec
 
 
 def told(decision: Decision) -> Decision:
-    """The same with its reason in words: two that say the same are equal."""
+    """The same decision with its reason in words, so that equal reasons compare as equal."""
     return decision._replace(why=decision.reason)
 
 
 def forecasts(seed: int = 1) -> Iterator[Forecast]:
-    """One to four sites with anything that the offloader can say of them."""
+    """Random forecasts of one to four sites."""
     rng = random.Random(seed)
     for _ in range(FORECASTS):
         names = [ONBOARD, *rng.sample((CLOUD, EDGE, FOG), rng.randint(0, 3))]
@@ -146,7 +146,7 @@ def outlook(rng: random.Random, site: str) -> Outlook:
     )
     if rng.random() < 0.2:
         return blank
-    seconds = rng.choice([-0.01, 0.0, 10 ** rng.uniform(-4, 6)])  # a line goes below 0 beyond its window
+    seconds = rng.choice([-0.01, 0.0, 10 ** rng.uniform(-4, 6)])  # a line may predict a time below 0
     spread = rng.choice([None, 0.0, 10 ** rng.uniform(-4, 6)])
     return blank._replace(
         predicted_s=seconds,
@@ -163,7 +163,7 @@ def outlook(rng: random.Random, site: str) -> Outlook:
 
 
 def unknown(forecast: Forecast) -> Forecast:
-    """The same with nothing learnt of any site."""
+    """The same forecast with nothing learnt of any site."""
     blank = {
         name: Outlook(age=one.age, failures=one.failures, condition=one.condition)
         for name, one in forecast.sites.items()

@@ -155,7 +155,7 @@ def test_an_unavailable_site_gets_no_task(make: Make) -> None:
 
 
 def test_where_pins_a_call(make: Make) -> None:
-    """A call pinned onboard stays on the robot, `both` runs on every site, and an unknown site is an error."""
+    """`onboard` stays on the robot, `both` runs on every site, and an unknown site is an error."""
     cloud = cloud_answers()
     with make(cloud, OnboardRunner()) as offload:
         offload(add_one, 1, where=ONBOARD)

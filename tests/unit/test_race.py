@@ -130,7 +130,7 @@ def test_idle_time_is_used_once_after_the_first_sites_have_started(course: Cours
 
 
 def test_a_late_site_is_hurried(course: Course) -> None:
-    """A site is hurried when its hedge is due, also if the hedge is not allowed, but not if it was in time."""
+    """A site is hurried when its hedge is due, even if the hedge is not allowed."""
     course.take(cloud=0.5, onboard=0.1)
     course.allowed = False
     course.run(Plan((CLOUD,), Hedge(ONBOARD, 0.2)))

@@ -65,8 +65,8 @@ def test_the_best_living_site_is_used_soon_after_each_change(
     check(records, within)
 
 
-def test_a_switch_point_is_the_first_task_from_which_on_most_are_right() -> None:
-    """By hand: two wrong of ten are tries, three are not; what is over too soon tells nothing."""
+def test_a_switch_point_is_the_first_task_after_which_most_are_right() -> None:
+    """Two other sites in ten tasks count as tries, three do not; a sequence that is too short has none."""
     assert switch_point(["a"] * 10, "a") == 0
     assert switch_point(["b"] * 5 + ["a"] * 20, "a") == 5
     assert switch_point(["b"] * 2 + ["a"] * 20 + ["b"] + ["a"] * 9, "a") == 2
