@@ -39,7 +39,6 @@ from offboard.robot_client.records.trace import Late, Record
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites import heartbeat
 from offboard.robot_client.sites.clock import Clock, SystemClock
-from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, TIMEOUT_S, Execution, Runner
 
 TIMEOUT_MAX_S = 24 * 3600.0
@@ -117,6 +116,8 @@ class Offloader:
         server.key (None: no encryption).
         `observers`: called with the record of every task. `settings`: options that few robots need.
         """
+        from offboard.robot_client.runners import make_runners  # zmq is loaded only for a connection
+
         rare = settings or Settings()
         allowance = rare.allowance()
         if allowance.capped and "budget" not in policy.split(":"):
@@ -135,7 +136,7 @@ class Offloader:
         )
         servers = ({CLOUD: endpoint} if endpoint else {}) | dict(sites or {})
         heartbeat_s = heartbeat.EVERY_S if predictors.conditional(plain) else 0.0
-        runners = _connected(servers, keys=keys, heartbeat_s=heartbeat_s, seed=rare.seed)
+        runners = make_runners(servers, keys=keys, heartbeat_s=heartbeat_s, seed=rare.seed)
         try:
             return cls(
                 runners,
@@ -146,7 +147,8 @@ class Offloader:
                 observers=observers,
             )
         except ConfigError:
-            _close(runners)
+            for runner in runners:
+                runner.close()
             raise
 
     def __call__(
@@ -221,7 +223,8 @@ class Offloader:
             if first:
                 self._learner.catch_up()
             last = self._memories.snapshot() if first else None
-        _close(self._runners.values())
+        for runner in self._runners.values():
+            runner.close()
         if last is not None:
             self._memories.save_last(last)
 
@@ -417,30 +420,6 @@ class Offloader:
         with self._lock:
             if not self._closed:
                 self._learner.use_idle_time()
-
-
-def _connected(
-    servers: Mapping[str, str], *, keys: Path | str | None, heartbeat_s: float, seed: int
-) -> list[Runner]:
-    """A runner for each server, and one for onboard."""
-    from offboard.common.security.keys import robot_keys  # zmq is loaded only if a socket is opened
-    from offboard.robot_client.sites.cloud import CloudRunner
-
-    runners: list[Runner] = []
-    try:
-        for site, endpoint in servers.items():
-            own = None if keys is None else robot_keys(Path(keys), site)
-            runners.append(CloudRunner(endpoint, site=site, heartbeat_s=heartbeat_s, seed=seed, keys=own))
-        runners.append(OnboardRunner())
-    except ConfigError:
-        _close(runners)
-        raise
-    return runners
-
-
-def _close(runners: Iterable[Runner]) -> None:
-    for runner in runners:
-        runner.close()
 
 
 def _check_crosses(kind: Kind, what: str, value: Any) -> None:
