@@ -144,7 +144,7 @@ def _thinks(offload: Offloader) -> Callable[[int], None]:
 
     def think(count: int) -> None:
         for n, one in enumerate(tasks[:count]):
-            asked = offload._ask(one, "", {}, None, 2.0, None)
+            asked = offload._ask(one, "", absent={}, where=None, timeout_s=2.0, placed=None)
             decision = asked.decision
             probed = [decision.second.site] if isinstance(decision.second, Probe) else []
             offload._learn(asked, [ran[site][n] for site in (decision.site, *probed)])

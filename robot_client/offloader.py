@@ -258,7 +258,14 @@ class Offloader:
         number = next(self._numbers)
         absent = self._absent(task.kind)
         with self._lock:
-            pending = self._ask(task, f"{self._session}-{number}", absent, where, budget_s, placed)
+            pending = self._ask(
+                task,
+                f"{self._session}-{number}",
+                absent=absent,
+                where=where,
+                timeout_s=budget_s,
+                placed=placed,
+            )
         executions = self._execute(pending, budget_s, placed.call if placed else None)
         answer = answer_of(executions)
         with self._lock:
@@ -301,6 +308,7 @@ class Offloader:
         self,
         task: Task,
         id: str,
+        *,
         absent: Mapping[str, str],
         where: str | None,
         timeout_s: float,
@@ -322,7 +330,9 @@ class Offloader:
             decision = self._decide(memory, forecast, absent, placed or self._policy)
             if placed is None:
                 self._note_move(memory, decision)
-        return PendingTask(task, id, memory, forecast, amount, decision)
+        return PendingTask(
+            task=task, id=id, memory=memory, forecast=forecast, amount=amount, decision=decision
+        )
 
     def _decide(
         self, memory: KindMemory, forecast: Forecast, absent: Mapping[str, str], policy: Policy
@@ -411,7 +421,15 @@ class Offloader:
     def _ended_late(self, pending: PendingTask, site: str, execution: Execution) -> None:
         """A run has ended after its task was answered; called in any thread."""
         with self._lock:
-            self._late.append(Late(pending.id, site, execution.seconds, execution.ok, execution.censored))
+            self._late.append(
+                Late(
+                    id=pending.id,
+                    site=site,
+                    seconds=execution.seconds,
+                    ok=execution.ok,
+                    censored=execution.censored,
+                )
+            )
             self._flights.end(site, pending.task.id)
             if execution.started and not self._closed:
                 self._learner.learn_late(pending, execution)

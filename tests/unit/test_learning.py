@@ -145,9 +145,10 @@ def test_times_that_wait_are_learnt_at_the_end() -> None:
 
 def test_bytes_are_taken_from_the_caps_at_once() -> None:
     """The caps count a task when it ends, even if its time is learnt later."""
-    scene = Scene(allowance=Allowance(bytes_a_minute=1e6))
+    allowance = Allowance(bytes_a_minute=1e6)
+    scene = Scene(allowance=allowance)
     scene.sites[CLOUD].fields = {"bytes_out": 1000, "bytes_in": 0}
-    before = scene.offload._allowance.bytes_left
+    before = allowance.bytes_left
     scene.ask()
     assert scene.learnt() == 0
-    assert scene.offload._allowance.bytes_left < before
+    assert allowance.bytes_left < before

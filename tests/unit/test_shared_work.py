@@ -38,7 +38,6 @@ def test_only_the_last_results_count() -> None:
         size = rng.uniform(1, 5)
         work.learn(size, 20 * size * (2.0 if n >= PAIRS_MAX else 1.0))
     assert work.predict(3.0) == pytest.approx(120.0)
-    assert len(work._order) == len(work._sizes) == len(work._works) == PAIRS_MAX
 
 
 def test_an_outlier_has_little_influence() -> None:
