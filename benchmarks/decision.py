@@ -10,8 +10,9 @@ import numpy as np
 from benchmarks.measure import Requirement, Table, each_of
 from offboard.common.tasks import Kind, Task, kind_of, task
 from offboard.robot_client import policies, predictors
+from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.policies import Policy
+from offboard.robot_client.policies import Policy, Probe
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
 
 CALLS = 2_000
@@ -80,8 +81,7 @@ def _offloader(policy: str, window: int) -> tuple[Offloader, Remembering]:
     offload = Offloader(
         [InstantRunner(ONBOARD), InstantRunner(CLOUD)],
         policy=kept,
-        predictor=lambda: predictors.make(plain, window),
-        shared_work=name != plain,
+        memories=Memories(lambda: predictors.make(plain, window), shared_work=name != plain),
     )
     for size in SIZES:
         offload(counted, size, where="both")
@@ -146,10 +146,10 @@ def _thinks(offload: Offloader) -> Callable[[int], None]:
 
     def think(count: int) -> None:
         for n, one in enumerate(tasks[:count]):
-            asked = offload._ask(one, "", {}, None, 2.0, None)
+            asked = offload._ask(one, "", absent={}, where=None, timeout_s=2.0, placed=None)
             decision = asked.decision
-            sites = [decision.site, decision.second] if decision.second_after_s == 0 else [decision.site]
-            offload._learn(asked, [ran[site][n] for site in sites if site])
+            probed = [decision.second.site] if isinstance(decision.second, Probe) else []
+            offload._learn(asked, [ran[site][n] for site in (decision.site, *probed)])
 
     return think
 

@@ -1,4 +1,7 @@
-"""The entrance: the names that users import. In a checkout it also finds the packages that lie next to it."""
+"""The entrance: the names that users import, as in `from offboard import Offloader, task`.
+
+The names live in the packages next to this file; in a checkout those are the folders next to this one.
+"""
 
 import importlib
 from pathlib import Path
@@ -28,6 +31,7 @@ if TYPE_CHECKING:
     from offboard.robot_client.policies import Decision, Forecast, Outlook
     from offboard.robot_client.predictors import Prediction, Predictor
     from offboard.robot_client.records.trace import Record, Trace
+    from offboard.robot_client.settings import Settings
     from offboard.robot_client.sites.runner import Execution, Runner
 
 __all__ = [
@@ -50,6 +54,7 @@ __all__ = [
     "ProtocolError",
     "Record",
     "Runner",
+    "Settings",
     "TaskError",
     "TaskFailed",
     "Trace",
@@ -70,6 +75,7 @@ _HOMES = {
     "Predictor": "robot_client.predictors",
     "Record": "robot_client.records.trace",
     "Runner": "robot_client.sites.runner",
+    "Settings": "robot_client.settings",
     "Trace": "robot_client.records.trace",
     "check_wanted": "common.wanted",
     "task": "common.tasks",
@@ -77,12 +83,12 @@ _HOMES = {
 _ERRORS = "common.errors"  # the home of every other name
 
 _here = Path(__file__).parent
-if not (_here / "common").is_dir():  # a checkout: in the wheel the packages are inside this folder
+if not (_here / "common").is_dir():  # a checkout; in the wheel, the packages are inside this folder
     __path__.append(str(_here.parent))
 
 
 def __getattr__(name: str) -> Any:
-    """Loads a name when it is first asked for (PEP 562), so that `--help` stays fast."""
+    """Names are loaded when they are first used (PEP 562), so that `--help` stays fast."""
     if name == "__version__":
         found = importlib.import_module("offboard.common").VERSION
     elif name in __all__:

@@ -153,13 +153,8 @@ def _run_tasks(
                 config,
                 sites=sites,
                 policy=config.policy,
-                predictor=config.predictor,
                 window=config.window,
-                seed=config.seed,
-                objective=config.goal(),
-                energy=config.energy(),
-                allowance=config.allowance(),
-                memory=config.memory,
+                settings=config.settings(config.seed),
                 observers=[own, *observers],
             )
         )

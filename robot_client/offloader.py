@@ -1,4 +1,8 @@
-"""One task, one way: predict, decide, execute, learn, record."""
+"""The one way of every task: predict, decide, execute, learn, record.
+
+Each step is a subject of its own in `learning`, `policies`, `execution` and `records`; this file holds the
+lock under which they meet.
+"""
 
 import asyncio
 import itertools
@@ -9,7 +13,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -20,59 +23,41 @@ from offboard.common.tasks import Kind, Task, kind_of
 from offboard.common.wire.values import encode
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.execution.batch import Batch, Placed, arguments
+from offboard.robot_client.execution.pin import check_where, pinned
 from offboard.robot_client.execution.race import Plan, Race, answer_of
+from offboard.robot_client.learning.conditions import Conditions
+from offboard.robot_client.learning.flights import Flights
+from offboard.robot_client.learning.forecaster import Forecaster
 from offboard.robot_client.learning.kind import KindMemory
-from offboard.robot_client.learning.lessons import Asked, Learning
+from offboard.robot_client.learning.learner import Learner, PendingTask
+from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.learning.store import Store
-from offboard.robot_client.policies import PINNED, Decision, Forecast, Outlook, Policy, objectives
+from offboard.robot_client.policies import BOTH, PINNED, Decision, Forecast, Policy
 from offboard.robot_client.policies.allowance import Allowance
-from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.objectives import Objective
-from offboard.robot_client.predictors import Predictor
 from offboard.robot_client.predictors.window import WINDOW
 from offboard.robot_client.records.trace import Late, Record
+from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites import heartbeat
 from offboard.robot_client.sites.clock import Clock, SystemClock
-from offboard.robot_client.sites.onboard import OnboardRunner
-from offboard.robot_client.sites.runner import (
-    CLOUD,
-    ONBOARD,
-    TIMEOUT_S,
-    UNMEASURED,
-    Condition,
-    Execution,
-    Runner,
-)
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, TIMEOUT_S, Execution, Runner
 
-BOTH = "both"
 TIMEOUT_MAX_S = 24 * 3600.0
 POLL_S = 0.01
-LATE_MAX = 64  # executions that ended after their task, kept for the next record
-OVERDUE = 0.5  # of the time it took so far: what a task that should be done is taken to need still
+LATE_MAX = 64  # executions that ended after their task was answered, kept for the next record
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(slots=True)
-class _Flight:
-    """A run under way on a site."""
-
-    began_s: float
-    predicted_s: float
-
-    def left_s(self, now_s: float) -> float:
-        """What it is taken to need still."""
-        so_far_s = now_s - self.began_s
-        return max(self.predicted_s - so_far_s, OVERDUE * so_far_s)
 
 
 class Offloader:
     """Runs each task where its policy says, always gets an answer, and learns from what happened.
 
-    `runners` holds one runner a site, onboard among them; `predictor` makes the memory of one kind on one
-    site; with `shared_work` sites learn seconds per work where a kind tells its work. `observers` are called
-    with the record of every task, in the thread that asked for it; what is learnt outlives the process in
-    `store`. Use it as a context manager, from any number of threads.
+    `runners`: one runner for each site, with onboard among them.
+    `memories`: what is known of each kind of task, and the predictors that it is learnt with.
+    `allowance`: second runs, bytes and joules that tasks may spend.
+    `timeout_s`: how long a remote site has for a task before the task runs onboard.
+    `observers`: called with the record of every task, in the thread that asked for it.
+
+    Use it as a context manager, from any number of threads.
     """
 
     def __init__(
@@ -80,35 +65,26 @@ class Offloader:
         runners: Sequence[Runner],
         *,
         policy: Policy,
-        predictor: Callable[[], Predictor],
-        shared_work: bool = False,
-        objective: Objective | None = None,
-        energy: Energy | None = None,
+        memories: Memories,
         allowance: Allowance | None = None,
         timeout_s: float = TIMEOUT_S,
         observers: Iterable[Callable[[Record], None]] = (),
         clock: Clock | None = None,
-        store: Store | None = None,
     ) -> None:
         self._runners = {runner.site: runner for runner in runners}
         if ONBOARD not in self._runners or len(self._runners) != len(runners):
-            raise ConfigError(f"sites {[r.site for r in runners]}: each once, {ONBOARD!r} among them")
+            given = [runner.site for runner in runners]
+            raise ConfigError(f"sites {given}: each site once, and {ONBOARD!r} among them")
         self._policy = policy
-        self._remember = partial(
-            KindMemory,
-            make=predictor,
-            objective=objective or objectives.Mean(),
-            energy=energy or Energy(),
-            shared_work=shared_work,
-        )
+        self._memories = memories
         self._allowance = allowance or Allowance()
         self._timeout_s = _checked_timeout(timeout_s)
         self._observers = tuple(observers)
         self._clock = clock or SystemClock()
-        self._store = store
-        self._memories: dict[str, KindMemory] = {}
-        self._flights: dict[str, dict[int, _Flight]] = {site: {} for site in self._runners}
-        self._learning = Learning(self._runners, self._allowance)
+        self._flights = Flights(self._runners)
+        conditions = Conditions(self._runners)
+        self._forecaster = Forecaster(conditions, self._flights, self._allowance)
+        self._learner = Learner(conditions, self._allowance)
         self._late: deque[Late] = deque(maxlen=LATE_MAX)
         self._crossed: set[str] = set()  # kinds whose values are known to cross the wire
         self._lock = threading.Lock()
@@ -122,59 +98,53 @@ class Offloader:
         cls,
         endpoint: str | None = None,
         *,
-        sites: dict[str, str] | None = None,
+        sites: Mapping[str, str] | None = None,
         policy: str = policies.DEFAULT,
-        predictor: str | None = None,
         window: int = WINDOW,
         timeout_s: float = TIMEOUT_S,
-        seed: int = 0,
-        objective: Objective | None = None,
-        energy: Energy | None = None,
-        allowance: Allowance | None = None,
-        observers: Iterable[Callable[[Record], None]] = (),
-        memory: Path | None = None,
         keys: Path | str | None = None,
+        observers: Iterable[Callable[[Record], None]] = (),
+        settings: Settings | None = None,
     ) -> Self:
-        """Onboard, `cloud` at `endpoint` (tcp://HOST:PORT) and any further named `sites`.
+        """An offloader for onboard, a server `cloud` at `endpoint` (tcp://HOST:PORT), and further servers.
 
-        `predictor` (None: the one that the policy is meant with) may begin with `work:`, for times per work.
-        `seed` is that of policies and predictors that draw. `memory`: the file in which what was learnt
-        outlives the process. Caps in the allowance put `budget` around the policy. `keys`: the folder of
-        `robot-client keys` with the public key of each server, NAME.key or server.key (None: no encryption).
+        `sites`: the endpoint of each further server, by name.
+        `policy`: the name of a policy; caps in the settings add the wrapper `budget` to it.
+        `window`: observations of each kind on each site that predictions rest on.
+        `timeout_s`: how long a server has for a task before the task runs onboard, in seconds.
+        `keys`: the folder of `robot-client keys`, with the public key of each server in NAME.key or
+        server.key (None: no encryption).
+        `observers`: called with the record of every task. `settings`: options that few robots need.
         """
-        from offboard.common.security.keys import robot_keys  # zmq is loaded only where a socket is opened
-        from offboard.robot_client.sites.cloud import CloudRunner
+        from offboard.robot_client.runners import make_runners  # zmq is loaded only for a connection
 
-        servers = ({CLOUD: endpoint} if endpoint else {}) | (sites or {})
-        if allowance is not None and allowance.capped and "budget" not in policy.split(":"):
+        rare = settings or Settings()
+        allowance = rare.allowance()
+        if allowance.capped and "budget" not in policy.split(":"):
             policy = f"budget:{policy}"
-        chosen = policies.make(policy, seed)
-        name = policies.predictor_of(policy) if predictor is None else predictor
+        chosen = policies.make(policy, rare.seed)
+        name = policies.predictor_of(policy) if rare.predictor is None else rare.predictor
         plain = name.removeprefix(predictors.WORK)
-
-        def remember() -> Predictor:
-            return predictors.make(plain, window, seed)
-
-        remember()  # a wrong name or window is said now, not at the first task
-        store = None if memory is None else Store(memory)
+        make = partial(predictors.make, plain, window, rare.seed)
+        make()  # a wrong name or window is an error now, not at the first task
+        memories = Memories(
+            make,
+            shared_work=name != plain,
+            objective=rare.objective,
+            energy=rare.energy,
+            store=None if rare.memory is None else Store(rare.memory),
+        )
+        servers = ({CLOUD: endpoint} if endpoint else {}) | dict(sites or {})
         heartbeat_s = heartbeat.EVERY_S if predictors.conditional(plain) else 0.0
-        runners: list[Runner] = []
+        runners = make_runners(servers, keys=keys, heartbeat_s=heartbeat_s, seed=rare.seed)
         try:
-            for site, where in servers.items():
-                own = None if keys is None else robot_keys(Path(keys), site)
-                runners.append(CloudRunner(where, site=site, heartbeat_s=heartbeat_s, seed=seed, keys=own))
-            runners.append(OnboardRunner())
             return cls(
                 runners,
                 policy=chosen,
-                predictor=remember,
-                shared_work=name != plain,
-                objective=objective,
-                energy=energy,
+                memories=memories,
                 allowance=allowance,
                 timeout_s=timeout_s,
                 observers=observers,
-                store=store,
             )
         except ConfigError:
             for runner in runners:
@@ -189,10 +159,10 @@ class Offloader:
         timeout_s: float | None = None,
         **kwargs: Any,
     ) -> Any:
-        """Run a `@task` function and return its result; TaskFailed where the function itself raised.
+        """Run a `@task` function and return its result; TaskFailed if the function itself raised.
 
-        `where` pins the call to a site, or to `both` for measuring; `timeout_s` bounds the wait for a
-        remote site, after which the task runs onboard.
+        `where` pins the call to a site, or to `both` to measure all of them. `timeout_s` bounds the wait for
+        a remote site, after which the task runs onboard.
         """
         budget_s = self._timeout_s if timeout_s is None else _checked_timeout(timeout_s)
         kind = kind_of(function)
@@ -210,10 +180,10 @@ class Offloader:
         where: str | None = None,
         timeout_s: float | None = None,
     ) -> list[Any]:
-        """Run a `@task` function on every item, on all sites at once so that the last one ends soonest.
+        """Run a `@task` function on every item, on all sites at once, so that the last one ends soonest.
 
-        An item is the argument, or a tuple of all of them where the function takes several. The results come
-        in the order of the items; where tasks fail, the first one's error is raised once all have ended.
+        An item is the argument, or a tuple of all arguments if the function takes several. The results come
+        in the order of the items. If tasks fail, the error of the first one is raised when all have ended.
         `where` and `timeout_s` are those of a single call. Observers are called in threads of the batch.
         """
         budget_s = self._timeout_s if timeout_s is None else _checked_timeout(timeout_s)
@@ -221,12 +191,12 @@ class Offloader:
         tasks = [Task(kind, args, kind.size_of(args)) for args in arguments(kind, items)]
         sites = tuple(self._runners)
         if where is not None:
-            self._check_where(kind, where)
+            check_where(where, kind, self._runners)
             sites = (ONBOARD if where == BOTH else where,)
         batch = Batch(
             tasks,
             sites,
-            predict=partial(self._expect, kind, sites, budget_s),
+            predict=partial(self._expect, kind, budget_s),
             run=partial(self._answer, where, budget_s),
             clock=self._clock,
             timeout_s=budget_s,
@@ -234,11 +204,11 @@ class Offloader:
         return batch.run()
 
     async def run(self, function: Callable[..., Any], *args: Any, **options: Any) -> Any:
-        """The same for asyncio; the event loop is free meanwhile."""
+        """The same call for asyncio; the event loop is free while the task runs."""
         return await asyncio.to_thread(self, function, *args, **options)
 
     def wait_for_sites(self, function: Callable[..., Any], timeout_s: float) -> dict[str, str]:
-        """Wait until every site can take this task; after `timeout_s` says why the remaining ones cannot."""
+        """Wait until every site can take this task; returns why some still cannot after `timeout_s`."""
         kind, until = kind_of(function), time.monotonic() + timeout_s
         while True:
             absent = self._absent(kind)
@@ -247,16 +217,16 @@ class Offloader:
             time.sleep(POLL_S)
 
     def close(self) -> None:
-        """Safe to call twice."""
+        """Close all runners and save what was learnt. Safe to call twice."""
         with self._lock:
-            if not self._closed:
-                self._learning.catch_up()
-            last = None if self._closed or self._store is None else self._store.snapshot(self._memories)
-            self._closed = True
+            first, self._closed = not self._closed, True
+            if first:
+                self._learner.catch_up()
+            last = self._memories.snapshot() if first else None
         for runner in self._runners.values():
             runner.close()
-        if last is not None and self._store is not None:
-            self._store.save_last(last)
+        if last is not None:
+            self._memories.save_last(last)
 
     def __enter__(self) -> Self:
         return self
@@ -267,7 +237,7 @@ class Offloader:
     def _answer(
         self, where: str | None, budget_s: float, task: Task, placed: Placed | None = None
     ) -> tuple[Execution, Record]:
-        """One task from its arguments to its record; `placed` stands for the policy."""
+        """One task from its arguments to its record; `placed` replaces the policy."""
         kind = task.kind
         first = kind.name not in self._crossed and len(self._runners) > 1
         if first:
@@ -288,27 +258,34 @@ class Offloader:
         number = next(self._numbers)
         absent = self._absent(task.kind)
         with self._lock:
-            asked = self._ask(task, f"{self._session}-{number}", absent, where, budget_s, placed)
-        executions = self._execute(asked, budget_s, placed.call if placed else None)
+            pending = self._ask(
+                task,
+                f"{self._session}-{number}",
+                absent=absent,
+                where=where,
+                timeout_s=budget_s,
+                placed=placed,
+            )
+        executions = self._execute(pending, budget_s, placed.call if placed else None)
         answer = answer_of(executions)
         with self._lock:
-            self._learn(asked, executions)
-            if self._store is not None and not self._closed and self._store.due(self._clock.now_s()):
-                self._learning.catch_up()
-                self._store.save_soon(self._store.snapshot(self._memories))
-            late, regret = tuple(self._late), self._learning.regret.estimate()
+            self._learn(pending, executions)
+            if not self._closed and self._memories.due(self._clock.now_s()):
+                self._learner.catch_up()
+                self._memories.save_soon()
+            late, regret = tuple(self._late), self._learner.regret.estimate()
             self._late.clear()
         record = Record(
             i=number,
-            id=asked.id,
+            id=pending.id,
             kind=task.kind.name,
             size=task.size,
-            sites=asked.forecast.sites,
-            decision=asked.decision,
+            sites=pending.forecast.sites,
+            decision=pending.decision,
             executions=tuple(execution.without_value() for execution in executions),
             used=answer.site if answer.ok else None,
             waited_s=self._clock.now_s() - started,
-            amount=asked.amount,
+            amount=pending.amount,
             late=late,
             regret=regret,
             started_at=started_at,
@@ -324,157 +301,101 @@ class Offloader:
                 log.exception("observer %r failed on task %d", observe, record.i)
 
     def _absent(self, kind: Kind) -> dict[str, str]:
+        """The sites that cannot take this kind now, and why."""
         return {site: why for site, runner in self._runners.items() if (why := runner.unavailable(kind))}
 
     def _ask(
         self,
         task: Task,
         id: str,
-        absent: dict[str, str],
+        *,
+        absent: Mapping[str, str],
         where: str | None,
         timeout_s: float,
         placed: Placed | None,
-    ) -> Asked:
+    ) -> PendingTask:
         """Predict and decide."""
-        self._allowance.begin(self._clock.now_s())
-        memory = self._memory(task.kind)
+        now_s = self._clock.now_s()
+        self._allowance.begin(now_s)
+        memory = self._memories.of(task.kind, self._runners)
         amount = memory.amount(task.size)
-        outlooks = {
-            site: self._outlook(memory, site, amount, timeout_s)
-            for site in self._runners
-            if site not in absent
-        }
-        forecast = self._forecast(task.kind, memory, task.size, outlooks)
-        decision = self._decide(task.kind, forecast, absent, where, placed or self._policy)
-        if where is None and placed is None and decision.site != memory.last_site:
-            if memory.last_site is not None:
-                log.info("%s moves to %s: %s", task.kind.name, decision.site, decision.reason)
-            memory.last_site = decision.site
-        return Asked(task, id, memory, forecast, amount, decision)
-
-    def _forecast(
-        self, kind: Kind, memory: KindMemory, size: float, outlooks: Mapping[str, Outlook]
-    ) -> Forecast:
-        return Forecast(
-            size,
-            outlooks,
-            memory.last_site,
-            self._allowance.duplicates if kind.duplicate else 0.0,
-            self._allowance.bytes_left,
-            self._allowance.joules_left,
+        sites = [site for site in self._runners if site not in absent] if absent else self._runners
+        forecast = self._forecaster.forecast(
+            memory, task.size, sites, amount=amount, timeout_s=timeout_s, now_s=now_s
+        )
+        if where is not None:
+            check_where(where, task.kind, self._runners)
+            decision = pinned(where, forecast)
+        else:
+            decision = self._decide(memory, forecast, absent, placed or self._policy)
+            if placed is None:
+                self._note_move(memory, decision)
+        return PendingTask(
+            task=task, id=id, memory=memory, forecast=forecast, amount=amount, decision=decision
         )
 
-    def _outlook(self, memory: KindMemory, site: str, amount: float | None, timeout_s: float) -> Outlook:
-        here, flights = memory.site(site), self._flights[site]
-        condition = UNMEASURED
-        if here.conditional:
-            condition = self._measured(site)
-            if flights:
-                condition = self._behind_own(site, condition)
-        return here.outlook(amount, condition, in_flight=len(flights), timeout_s=timeout_s)
-
-    def _behind_own(self, site: str, condition: Condition) -> Condition:
-        """Onboard runs one task at a time; a server's queue may not know yet of what was sent to it."""
-        flights = self._flights[site].values()
-        if site != ONBOARD:
-            return condition._replace(queue=max(condition.queue, len(flights)))
-        now_s = self._clock.now_s()
-        left_s = [one.left_s(now_s) for one in flights]
-        return condition._replace(wait_s=sum(left_s))
-
     def _decide(
-        self, kind: Kind, forecast: Forecast, absent: dict[str, str], where: str | None, policy: Policy
+        self, memory: KindMemory, forecast: Forecast, absent: Mapping[str, str], policy: Policy
     ) -> Decision:
-        if where is not None:
-            return self._pinned(kind, forecast, where)
         if len(forecast.sites) == 1:
             why = "; ".join(f"{site}: {why}" for site, why in absent.items()) or "no other site"
-            return Decision(ONBOARD, False, why, "none")
+            return Decision(ONBOARD, why, "none")
         decision = policy.decide(forecast)
-        if decision.both and not kind.duplicate:
-            # Warm-up without running twice: the site that knows least learns next.
-            memory = self._memory(kind)
+        if memory.kind.duplicate:
+            return decision
+        if decision.both:
+            # Warm-up without a second run: the site that is known least learns next.
             heard = [site for site in forecast.sites if site not in decision.spared]
             site = min(heard, key=lambda site: (len(memory.site(site).predictor), site != ONBOARD))
-            return Decision(site, False, f"{decision.reason}; never on two sites", decision.policy)
-        if decision.second is not None and not kind.duplicate:
-            return replace(decision, second=None)
-        return decision
+            return Decision(site, f"{decision.reason}; never on two sites", decision.policy)
+        return decision if decision.second is None else decision._replace(second=None)
 
-    def _expect(
-        self, kind: Kind, sites: Sequence[str], timeout_s: float, size: float, own: Mapping[str, int]
-    ) -> Forecast:
-        """What a batch is placed by: the wait for its own tasks, so many on each site, is left out."""
-        absent = self._absent(kind) if len(sites) > 1 else {}
+    def _note_move(self, memory: KindMemory, decision: Decision) -> None:
+        if decision.site == memory.last_site:
+            return
+        if memory.last_site is not None:
+            log.info("%s moves to %s: %s", memory.kind.name, decision.site, decision.reason)
+        memory.last_site = decision.site
+
+    def _expect(self, kind: Kind, timeout_s: float, size: float, own: Mapping[str, int]) -> Forecast:
+        """What a batch is placed by; `own` holds how many of its tasks each site has."""
+        absent = self._absent(kind) if len(own) > 1 else {}
+        present = {site: count for site, count in own.items() if site not in absent}
         with self._lock:
-            memory = self._memory(kind)
-            amount, outlooks = memory.amount(size), {}
-            for site in sites:
-                if site not in absent:
-                    here, measured = memory.site(site), self._apart_from(own[site], memory, site)
-                    outlooks[site] = here.outlook(amount, measured, in_flight=own[site], timeout_s=timeout_s)
-            return self._forecast(kind, memory, size, outlooks)
+            memory = self._memories.of(kind, self._runners)
+            return self._forecaster.forecast_in_batch(memory, size, present, timeout_s=timeout_s)
 
-    def _apart_from(self, own: int, memory: KindMemory, site: str) -> Condition:
-        if not memory.site(site).conditional:
-            return UNMEASURED
-        condition = self._measured(site)
-        return condition._replace(queue=max(0, condition.queue - own))
-
-    def _measured(self, site: str) -> Condition:
-        """Of a server too the load of the robot, where that is what its times tell of."""
-        condition = self._runners[site].condition()
-        if site != ONBOARD and (load := self._learning.load(site)):
-            return condition._replace(load=load)
-        return condition
-
-    def _check_where(self, kind: Kind, where: str) -> None:
-        if where != BOTH and where not in self._runners:
-            raise ConfigError(f"where={where!r} is not one of {', '.join([*self._runners, BOTH])}")
-        if where == BOTH and not kind.duplicate:
-            raise ConfigError(f"where='both': task {kind.name} is declared duplicate=False")
-
-    def _pinned(self, kind: Kind, forecast: Forecast, where: str) -> Decision:
-        self._check_where(kind, where)
-        if where == BOTH:
-            both = len(forecast.sites) > 1
-            return Decision(ONBOARD, both, "measured on both" if both else "only onboard was there", PINNED)
-        if where not in forecast.sites:
-            return Decision(ONBOARD, False, f"pinned to {where}, which cannot take it", PINNED)
-        return Decision(where, False, "pinned by the caller", PINNED)
-
-    def _execute(self, asked: Asked, timeout_s: float, call: "Future[str] | None") -> tuple[Execution, ...]:
-        decision, sites = asked.decision, asked.forecast.sites
+    def _execute(
+        self, pending: PendingTask, timeout_s: float, call: "Future[str] | None"
+    ) -> tuple[Execution, ...]:
+        decision, sites = pending.decision, pending.forecast.sites
         race = Race(
-            asked.task,
+            pending.task,
             self._runners,
             self._clock,
             timeout_s,
-            begun=partial(self._begun, asked),
+            begun=partial(self._begun, pending),
             allowed=self._take_duplicate,
-            late=partial(self._ended_late, asked),
-            meanwhile=self._meanwhile,
+            late=partial(self._ended_late, pending),
+            idle=self._use_idle_time,
         )
         first: tuple[str, ...] = (decision.site,)
         if decision.both:
             first = tuple(site for site in sites if site not in decision.spared)
-            if decision.policy != PINNED:  # measuring is the caller's choice, not the policy's
+            if decision.policy != PINNED:  # a measurement is the choice of the caller, not of the policy
                 self._take_duplicates(len(first) - 1)
         try:
-            return race.run(
-                Plan(first, decision.second, decision.second_after_s, all=decision.both, call=call)
-            )
-        except BaseException:  # closed meanwhile, or Ctrl-C: whatever still runs is nobody's
+            return race.run(Plan(first, decision.second, all=decision.both, call=call))
+        except BaseException:  # closed during the task, or Ctrl-C: nobody waits for what still runs
             with self._lock:
-                for flights in self._flights.values():
-                    flights.pop(asked.task.id, None)
+                self._flights.end_all(pending.task.id)
             raise
 
-    def _begun(self, asked: Asked, site: str) -> None:
-        outlook = asked.forecast.sites.get(site)
+    def _begun(self, pending: PendingTask, site: str) -> None:
+        outlook = pending.forecast.sites.get(site)
         predicted_s = (outlook.predicted_s if outlook else None) or 0.0
         with self._lock:
-            self._flights[site][asked.task.id] = _Flight(self._clock.now_s(), predicted_s)
+            self._flights.begin(site, pending.task.id, predicted_s=predicted_s, now_s=self._clock.now_s())
 
     def _take_duplicates(self, count: int) -> None:
         with self._lock:
@@ -482,45 +403,45 @@ class Offloader:
                 self._allowance.duplicate()
 
     def _take_duplicate(self) -> bool:
-        """Whether a second run may begin; it is then counted. A fallback needs no leave and is none."""
+        """Whether a second run may start; it is then counted. A fallback needs no permission."""
         with self._lock:
             allowed = self._allowance.duplicates >= 1
             if allowed:
                 self._allowance.duplicate()
             return allowed
 
-    def _learn(self, asked: Asked, executions: Sequence[Execution]) -> None:
-        """What has ended by now."""
+    def _learn(self, pending: PendingTask, executions: Sequence[Execution]) -> None:
+        """Learn the runs that have ended by now."""
         for one in executions:
             if not isinstance(one.failure, Overtaken):
-                self._flights[one.site].pop(asked.task.id, None)
-        if not self._closed:  # what was given up at the end says nothing of the site
-            self._learning.learn(asked, executions)
+                self._flights.end(one.site, pending.task.id)
+        if not self._closed:  # a run that `close` gave up says nothing about its site
+            self._learner.learn(pending, executions)
 
-    def _ended_late(self, asked: Asked, site: str, execution: Execution) -> None:
-        """A run that came second has ended; called in any thread."""
+    def _ended_late(self, pending: PendingTask, site: str, execution: Execution) -> None:
+        """A run has ended after its task was answered; called in any thread."""
         with self._lock:
-            self._late.append(Late(asked.id, site, execution.seconds, execution.ok, execution.censored))
-            self._flights[site].pop(asked.task.id, None)
+            self._late.append(
+                Late(
+                    id=pending.id,
+                    site=site,
+                    seconds=execution.seconds,
+                    ok=execution.ok,
+                    censored=execution.censored,
+                )
+            )
+            self._flights.end(site, pending.task.id)
             if execution.started and not self._closed:
-                self._learning.learn_late(asked, execution)
+                self._learner.learn_late(pending, execution)
 
-    def _meanwhile(self) -> None:
-        """A task is under way."""
+    def _use_idle_time(self) -> None:
         with self._lock:
             if not self._closed:
-                self._learning.between()
-
-    def _memory(self, kind: Kind) -> KindMemory:
-        if kind.name not in self._memories:
-            memory = self._memories[kind.name] = self._remember(kind)
-            if self._store is not None:
-                self._store.recall(memory, self._runners.keys())
-        return self._memories[kind.name]
+                self._learner.use_idle_time()
 
 
 def _check_crosses(kind: Kind, what: str, value: Any) -> None:
-    """BadValue at the first call, wherever it runs, and not at the first one that goes to a server."""
+    """BadValue at the first call, wherever it runs, and not at the first call that goes to a server."""
     try:
         encode(value, kind.types)
     except BadValue as error:

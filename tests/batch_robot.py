@@ -1,6 +1,6 @@
-"""A robot that maps the same tasks over all sites and over each alone, in turn, and prints the seconds.
+"""A robot that runs the same batch on all sites, onboard only and in the cloud only, and prints the seconds.
 
-The local testbed starts it in place of `robot-client`, held to its quota: `python -m tests.batch_robot`.
+The local testbed starts it instead of `robot-client`, with its CPU quota: `python -m tests.batch_robot`.
 """
 
 import argparse
@@ -10,14 +10,13 @@ import time
 
 from offboard.loadgen.scenario.hash_tasks import hash_rounds
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.policies import DEFAULT, predictor_of
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 TASKS = 40
-ROUNDS = (10_000, 150_000)  # of a task, drawn evenly
+ROUNDS = (10_000, 150_000)  # the work of a task, drawn evenly
 CONNECT_S = 20.0
-TIMEOUT_S = 20.0  # no answer is given up: what is measured is where tasks are put
+TIMEOUT_S = 20.0  # so long that no answer is given up
 
 
 def main() -> None:
@@ -31,8 +30,7 @@ def main() -> None:
     records: list[Record] = []
     with Offloader.connect(
         given.cloud,
-        policy=DEFAULT,
-        predictor=predictor_of(DEFAULT),
+        policy="default",
         timeout_s=TIMEOUT_S,
         observers=[records.append],
     ) as offload:

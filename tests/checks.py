@@ -1,6 +1,6 @@
-"""The predictor contract, one function a check; tests/unit/test_predictors.py runs each on every predictor.
+"""The predictor contract, one function per check; tests/unit/test_predictors.py runs them on all predictors.
 
-Each takes `make`, which makes a fresh predictor of window WINDOW, always with the same seed.
+Each check gets `make`, which makes a fresh predictor with window WINDOW, always with the same seed.
 """
 
 import copy
@@ -17,13 +17,13 @@ Make = Callable[[], Predictor]
 Row = tuple[float, float]  # size, seconds
 
 WINDOW = 50
-SIZES = (0.0, 1.3, 2.5, 5.0, 40.0)  # inside and outside of what `line` teaches
+SIZES = (0.0, 1.3, 2.5, 5.0, 40.0)  # inside and outside of the sizes of `line`
 TAUGHT = 100_000
 MEMORY_SLACK_BYTES = 512
 
 
 def refuses_bad_observations(make: Make) -> None:
-    """NaN, infinite and negative sizes and seconds raise ValueError, and nothing is learnt from them."""
+    """NaN, infinite or negative sizes and seconds raise ValueError, and nothing is learnt."""
     for taught in (0, 5):
         predictor = teach(make(), line(taught))
         before = predict(predictor) if taught else None
@@ -62,7 +62,7 @@ def predicts_finite_times_of_any_data(make: Make) -> None:
 
 
 def looks_ahead_without_harm(make: Make) -> None:
-    """However many tasks lie between the last one learnt and the next, the prediction is finite."""
+    """The prediction is finite for any number of tasks since the last observation."""
     predictor = teach(make(), line(WINDOW))
     for ahead in (1, 2, 7, 500):
         prediction = predictor.predict(2.0, ahead)
@@ -71,7 +71,7 @@ def looks_ahead_without_harm(make: Make) -> None:
 
 
 def is_full_after_the_window(make: Make) -> None:
-    """`len` counts observations up to the window, and `full` holds from the window on."""
+    """`len` counts observations up to the window, and then `full` is true."""
     predictor = make()
     for i, row in enumerate(line(2 * WINDOW), start=1):
         predictor.learn(*row)
@@ -80,14 +80,14 @@ def is_full_after_the_window(make: Make) -> None:
 
 
 def has_bounded_memory(make: Make) -> None:
-    """100,000 observations leave no more bytes behind than the last 2 N of them alone."""
+    """A predictor that learnt 100,000 observations is as small as one that learnt the last 2 N."""
     rows = line(2 * WINDOW)
 
     def taught(rounds: int) -> int:
         predictor = make()
         for _ in range(rounds - 1):
             teach(predictor, rows)
-        for i, row in enumerate(rows):  # the last round predicts a few times, so that fits are part of it
+        for i, row in enumerate(rows):  # the last round also predicts, so that fits are part of the size
             predictor.learn(*row)
             if i % 33 == 0:
                 predict(predictor)
@@ -98,13 +98,13 @@ def has_bounded_memory(make: Make) -> None:
 
 
 def gives_the_same_answers_for_the_same_seed(make: Make) -> None:
-    """Two of the same seed that learnt the same predict the same, to the bit."""
+    """Two predictors with the same seed and the same observations predict exactly the same."""
     rows = line(WINDOW)
     assert predict(teach(make(), rows)) == predict(teach(make(), rows))
 
 
 def predicts_without_learning(make: Make) -> None:
-    """Predicting again, and predicting other sizes in between, changes no prediction."""
+    """Predictions do not change other predictions."""
     predictor = teach(make(), line(WINDOW))
     first = predict(predictor)
     for size in (0.0, 7e6, 3.0):
@@ -114,7 +114,7 @@ def predicts_without_learning(make: Make) -> None:
 
 
 def is_copied_whole(make: Make) -> None:
-    """A deep copy and an unpickled one predict as the original, learn on as it would, and leave it alone."""
+    """A deep copy and an unpickled copy predict and learn as the original, and do not change it."""
     original = teach(make(), line(WINDOW))
     first = predict(original)
     later = [(size, 3 * seconds) for size, seconds in line(WINDOW, seed=2)]
@@ -127,7 +127,7 @@ def is_copied_whole(make: Make) -> None:
 
 
 def predicts_the_mean_where_all_sizes_are_equal(make: Make) -> None:
-    """With one size only, the prediction for it lies in the middle half of the times seen."""
+    """With one size only, its prediction is in the middle half of the times seen."""
     rng = random.Random(4)
     times = [0.2 + rng.uniform(-0.02, 0.02) for _ in range(WINDOW)]
     predictor = teach(make(), [(3.0, seconds) for seconds in times])
@@ -138,7 +138,7 @@ def predicts_the_mean_where_all_sizes_are_equal(make: Make) -> None:
 
 
 def predicts_constant_times(make: Make) -> None:
-    """Where every task took the same time, that is the prediction, to 1e-12 of it."""
+    """If every task took the same time, that is the prediction, to a relative 1e-12."""
     for seconds in (0.1, 7.3):
         predictor = teach(make(), [(size, seconds) for size, _ in line(WINDOW)])
         for size in (0.5, 2.5, 4.5):
@@ -148,7 +148,7 @@ def predicts_constant_times(make: Make) -> None:
 
 
 def learns_a_line(make: Make, gain: float) -> None:
-    """On t = 0.1 + 0.03 d with noise of 3 ms its mean error is below `gain` times that of the mean time."""
+    """On t = 0.1 + 0.03 d with noise of 3 ms, its mean error is below `gain` times that of the mean time."""
     rows = line(2 * WINDOW)
     predictor = teach(make(), rows)
     mean = sum(seconds for _, seconds in rows[-WINDOW:]) / WINDOW
@@ -161,7 +161,7 @@ def learns_a_line(make: Make, gain: float) -> None:
     assert ours < gain * theirs, f"error {ours / 19:.5f} s, that of the mean {theirs / 19:.5f} s"
 
 
-# Those that hold for every predictor alike; how well a line is learnt differs.
+# The checks that hold for every predictor; how well a line is learnt differs.
 CONTRACT: tuple[Callable[[Make], None], ...] = (
     refuses_bad_observations,
     predicts_nothing_before_it_has_learnt,
@@ -179,7 +179,7 @@ CONTRACT: tuple[Callable[[Make], None], ...] = (
 
 
 def line(count: int, seed: int = 1) -> list[Row]:
-    """Sizes from 0 to 5, seconds = 0.1 + 0.03 size with normal noise of 3 ms."""
+    """Sizes from 0 to 5, and seconds = 0.1 + 0.03 size with normal noise of 3 ms."""
     rng = random.Random(seed)
     sizes = [rng.uniform(0, 5) for _ in range(count)]
     return [(size, 0.1 + 0.03 * size + rng.gauss(0, 0.003)) for size in sizes]

@@ -1,4 +1,4 @@
-"""Stand-ins for the outside world at the runner seam, for tests of deciding and learning only."""
+"""A runner that answers from a script, for tests of deciding and learning."""
 
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -8,7 +8,7 @@ from offboard.robot_client.sites.runner import UNMEASURED, Condition, Execution
 
 
 class ScriptedRunner:
-    """Answers at once with what `script` makes of each task; remembers the tasks it was given."""
+    """Answers each task at once with what `script` returns, and keeps the tasks."""
 
     def __init__(
         self, site: str, script: Callable[[Task], Execution], unavailable: str | None = None

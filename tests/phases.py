@@ -1,4 +1,4 @@
-"""Onboard, edge and cloud failing in turn, and from which task on the best living one is used."""
+"""Phases in which onboard, edge or cloud fails, and how soon the best remaining site is used."""
 
 from collections.abc import Sequence
 
@@ -6,10 +6,10 @@ from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 EDGE = "edge"
-TASKS = 100  # of each phase
+TASKS = 100  # per phase
 WITHIN = 30  # tasks after a change
-SPAN, MOST = 10, 8  # tasks, and how many of them the best site answers: others are tried now and then
-# What fails in it, and the site that is best then.
+SPAN, MOST = 10, 8  # the best site must answer 8 of 10 tasks: other sites are tried now and then
+# The sites that fail in each phase, and the best site then.
 PHASES: tuple[tuple[tuple[str, ...], str], ...] = (
     ((), EDGE),
     ((EDGE,), CLOUD),
@@ -21,7 +21,7 @@ PHASES: tuple[tuple[tuple[str, ...], str], ...] = (
 
 
 def switch_point(used: Sequence[str | None], best: str) -> int | None:
-    """The first task from which on the best site answers MOST of any SPAN; None where there is none."""
+    """The first task after which the best site answers MOST of any SPAN tasks; None if there is none."""
     right = [site == best for site in used]
     bad = [n for n in range(len(right) - SPAN + 1) if sum(right[n : n + SPAN]) < MOST]
     first = bad[-1] + 1 if bad else 0
@@ -29,7 +29,7 @@ def switch_point(used: Sequence[str | None], best: str) -> int | None:
 
 
 def check(records: Sequence[Record], within: int = WITHIN) -> None:
-    """Print the switch point of each phase, and hold it to so many tasks."""
+    """Print the switch point of each phase, and check that it comes `within` this many tasks."""
     assert len(records) == TASKS * len(PHASES)
     points = []
     for n, (failing, best) in enumerate(PHASES):

@@ -1,15 +1,14 @@
-"""The policy contract, one function a check; tests/unit/test_policies.py runs them on all policies.
+"""The policy contract, one function per check; tests/unit/test_policies.py runs them on all policies.
 
-Each takes `make`, which makes a fresh policy, always with the same seed.
+Each check gets `make`, which makes a fresh policy, always with the same seed.
 """
 
 import copy
 import math
 import random
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
 
-from offboard.robot_client.policies import Decision, Forecast, Outlook, Policy
+from offboard.robot_client.policies import Decision, Forecast, Hedge, Outlook, Policy
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition
 
 Make = Callable[[], Policy]
@@ -20,31 +19,32 @@ SILENT = Condition(silent=True)
 
 
 def decides_among_the_sites_of_the_forecast(make: Make) -> None:
-    """Site, second and spared sites are of the forecast; the second is another site, after a finite wait."""
+    """All sites of a decision are in the forecast, and the second run is on another site."""
     for forecast, decision in decisions(make(), forecasts()):
         assert decision.site in forecast.sites
         assert set(decision.spared) <= forecast.sites.keys() - {decision.site}
-        assert 0 <= decision.second_after_s < math.inf
+        if isinstance(decision.second, Hedge):
+            assert 0 < decision.second.after_s < math.inf
         if decision.second is not None:
-            assert decision.second in forecast.sites.keys() - {decision.site}
+            assert decision.second.site in forecast.sites.keys() - {decision.site}
             assert not decision.both
 
 
 def says_why(make: Make) -> None:
-    """A reason and the name of the rule are given each time."""
+    """Every decision has a reason and the name of the rule."""
     for _, decision in decisions(make(), forecasts()):
         assert decision.reason
         assert decision.policy
 
 
 def repeats_itself_for_a_seed(make: Make) -> None:
-    """Two of the same seed decide the same on the same forecasts."""
+    """Two policies with the same seed make the same decisions."""
     once, again = (list(decisions(make(), forecasts())) for _ in range(2))
     assert once == again
 
 
 def leaves_the_forecast_as_it_is(make: Make) -> None:
-    """Deciding changes nothing of what it was told."""
+    """Deciding does not change the forecast."""
     policy = make()
     for forecast in forecasts():
         before = copy.deepcopy(forecast)
@@ -52,35 +52,35 @@ def leaves_the_forecast_as_it_is(make: Make) -> None:
         assert forecast == before
 
 
-def stays_onboard_where_nothing_else_is(make: Make) -> None:
-    """With onboard as the only site the task runs there, once."""
+def stays_onboard_without_other_sites(make: Make) -> None:
+    """If onboard is the only site, the task runs there once."""
     for forecast, decision in decisions(make(), (one.only([ONBOARD]) for one in forecasts())):
         assert decision.site in forecast.sites
         assert (decision.site, decision.both, decision.second) == (ONBOARD, False, None)
 
 
 def starts_no_second_run_on_a_silent_site(make: Make) -> None:
-    """A site whose heartbeats go unanswered is neither probed nor hedged to."""
+    """A site that does not answer heartbeats gets neither a probe nor a hedge."""
     for forecast, decision in decisions(make(), forecasts()):
         if decision.second is not None:
-            assert not forecast.sites[decision.second].condition.silent
+            assert not forecast.sites[decision.second.site].condition.silent
 
 
 def starts_no_second_run_beyond_the_allowance(make: Make) -> None:
-    """Where no second run is left to spend none is planned."""
-    for _, decision in decisions(make(), (replace(one, duplicates=0.99) for one in forecasts())):
+    """If no second run is allowed, none is planned."""
+    for _, decision in decisions(make(), (one._replace(duplicates=0.99) for one in forecasts())):
         assert decision.second is None
 
 
 def decides_before_anything_is_known(make: Make) -> None:
-    """Sites of which nothing was learnt yet are decided about like others."""
+    """A policy decides even if nothing was learnt of any site."""
     for forecast, decision in decisions(make(), (unknown(one) for one in forecasts())):
         assert decision.site in forecast.sites
-        assert decision.second is None or decision.second_after_s == 0, "nothing tells when a site is late"
+        assert not isinstance(decision.second, Hedge), "nothing says when a site is late"
 
 
-def has_a_look_at_one_forecast_only(make: Make) -> None:
-    """Without chance the same forecast leads to the same decision, whatever was decided in between."""
+def remembers_no_forecast(make: Make) -> None:
+    """Rules that do not draw make the same decision for the same forecast, whatever came in between."""
     policy, probe = make(), next(iter(forecasts()))
     if policy.decide(probe).policy in ("epsilon", "thompson"):
         return
@@ -95,11 +95,11 @@ CONTRACT: tuple[Callable[[Make], None], ...] = (
     says_why,
     repeats_itself_for_a_seed,
     leaves_the_forecast_as_it_is,
-    stays_onboard_where_nothing_else_is,
+    stays_onboard_without_other_sites,
     starts_no_second_run_on_a_silent_site,
     starts_no_second_run_beyond_the_allowance,
     decides_before_anything_is_known,
-    has_a_look_at_one_forecast_only,
+    remembers_no_forecast,
 )
 
 
@@ -109,23 +109,23 @@ def decisions(policy: Policy, asked: Iterable[Forecast]) -> Iterator[tuple[Forec
 
 
 def told(decision: Decision) -> Decision:
-    """The same with its reason in words: two that say the same are equal."""
-    return replace(decision, why=decision.reason)
+    """The same decision with its reason in words, so that equal reasons compare as equal."""
+    return decision._replace(why=decision.reason)
 
 
 def forecasts(seed: int = 1) -> Iterator[Forecast]:
-    """One to four sites with anything that the offloader can say of them."""
+    """Random forecasts of one to four sites."""
     rng = random.Random(seed)
     for _ in range(FORECASTS):
         names = [ONBOARD, *rng.sample((CLOUD, EDGE, FOG), rng.randint(0, 3))]
         rng.shuffle(names)
         yield Forecast(
-            10 ** rng.uniform(-3, 6),
-            {name: outlook(rng, name) for name in names},
-            rng.choice([None, ONBOARD, CLOUD, FOG]),
-            rng.choice([math.inf, 5.0, 1.0, 0.3, -7.0]),
-            rng.choice([math.inf, 1e5, 300.0, -10.0]),
-            rng.choice([math.inf, 100.0, 0.5, -10.0]),
+            size=10 ** rng.uniform(-3, 6),
+            sites={name: outlook(rng, name) for name in names},
+            last_site=rng.choice([None, ONBOARD, CLOUD, FOG]),
+            duplicates=rng.choice([math.inf, 5.0, 1.0, 0.3, -7.0]),
+            bytes_left=rng.choice([math.inf, 1e5, 300.0, -10.0]),
+            joules_left=rng.choice([math.inf, 100.0, 0.5, -10.0]),
         )
 
 
@@ -139,9 +139,6 @@ def outlook(rng: random.Random, site: str) -> Outlook:
         wait_s=rng.choice([0.0, 0.3]),
     )
     blank = Outlook(
-        None,
-        None,
-        full=False,
         age=rng.choice([0, 1, 19, 20, 500]),
         failures=rng.choice([0, 0, 1, 3, 9, 10_000]),
         in_flight=rng.choice([0, 0, 2]),
@@ -149,14 +146,13 @@ def outlook(rng: random.Random, site: str) -> Outlook:
     )
     if rng.random() < 0.2:
         return blank
-    seconds = rng.choice([-0.01, 0.0, 10 ** rng.uniform(-4, 6)])  # a line goes below 0 beyond its window
+    seconds = rng.choice([-0.01, 0.0, 10 ** rng.uniform(-4, 6)])  # a line may predict a time below 0
     spread = rng.choice([None, 0.0, 10 ** rng.uniform(-4, 6)])
-    return replace(
-        blank,
+    return blank._replace(
         predicted_s=seconds,
         spread_s=spread,
         full=rng.random() < 0.7,
-        count=rng.choice([1, 2, 3, 50]),
+        observations=rng.choice([1, 2, 3, 50]),
         low_s=None if spread is None else max(0.0, seconds - spread),
         high_s=None if spread is None else seconds + spread,
         error_s=rng.choice([None, 0.0, 0.2]),
@@ -167,9 +163,9 @@ def outlook(rng: random.Random, site: str) -> Outlook:
 
 
 def unknown(forecast: Forecast) -> Forecast:
-    """The same with nothing learnt of any site."""
+    """The same forecast with nothing learnt of any site."""
     blank = {
-        name: Outlook(None, None, False, one.age, one.failures, condition=one.condition)
+        name: Outlook(age=one.age, failures=one.failures, condition=one.condition)
         for name, one in forecast.sites.items()
     }
-    return replace(forecast, sites=blank)
+    return forecast._replace(sites=blank)

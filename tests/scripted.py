@@ -5,8 +5,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from offboard.common.tasks import task
+from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.policies.rules import Paper
+from offboard.robot_client.policies.paper import Paper
 from offboard.robot_client.predictors import LEAST_SQUARES, make
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.runner import Runner
@@ -14,7 +15,7 @@ from offboard.robot_client.sites.runner import Runner
 
 def offloader(*runners: Runner, observers: Sequence[Callable[[Record], None]] = ()) -> Offloader:
     return Offloader(
-        runners, policy=Paper(), predictor=lambda: make(LEAST_SQUARES, 5), observers=list(observers)
+        runners, policy=Paper(), memories=Memories(lambda: make(LEAST_SQUARES, 5)), observers=list(observers)
     )
 
 

@@ -19,7 +19,9 @@ from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks
 from offboard.loadgen.simulation.simulated_testbed import SimulatedTestbed
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client import policies, predictors
-from offboard.robot_client.offloader import BOTH, Offloader
+from offboard.robot_client.learning.memories import Memories
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import BOTH
 from offboard.robot_client.records.trace import Record, as_dict
 from offboard.robot_client.simulated.run import OwnRecord
 from offboard.robot_client.simulated.workload import CLOSED, due_instants
@@ -90,8 +92,9 @@ class _Run:
         self.offload = Offloader(
             [self._testbed.cloud, self._testbed.onboard],
             policy=policies.make(robot.policy, scenario.seed),
-            predictor=partial(predictors.make, plain, robot.window, scenario.seed),
-            shared_work=name != plain,
+            memories=Memories(
+                partial(predictors.make, plain, robot.window, scenario.seed), shared_work=name != plain
+            ),
             timeout_s=robot.timeout_s,
             observers=[self._own],
             clock=self._clock,

@@ -21,8 +21,9 @@ from offboard.loadgen.table.table_formats import Heading, Table, render
 from offboard.loadgen.table.table_settings import BOTH, FULL, MeasuredTimesConfig
 from offboard.loadgen.table.table_two_figures import Scored, Sides
 from offboard.robot_client import policies, predictors
+from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.policies import Decision, Forecast, Policy
+from offboard.robot_client.policies import Decision, Forecast, Policy, Probe
 from offboard.robot_client.predictors import Predictor
 from offboard.robot_client.predictors.window import WINDOW, WINDOW_MAX
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
@@ -143,7 +144,7 @@ def replay_policy(
     with Offloader(
         [_Replaying(ONBOARD, rows.onboard_s), _Replaying(CLOUD, rows.cloud_s)],
         policy=chooser,
-        predictor=predictor,
+        memories=Memories(predictor),
     ) as offload:
         for row, size in enumerate(rows.size.tolist()):
             offload(_replayed, size, row, where=BOTH if row < window else None)
@@ -155,7 +156,7 @@ def replay_policy(
 
 def _ran_both(decision: Decision) -> bool:
     """A probe runs both at once; a hedge waits for a time that a replayed task does not have."""
-    return decision.both or (decision.second is not None and decision.second_after_s == 0)
+    return decision.both or isinstance(decision.second, Probe)
 
 
 class _Chooser:
@@ -172,7 +173,7 @@ class _Chooser:
 
     def decide(self, forecast: Forecast) -> Decision:
         self.last = self._policy.decide(forecast)
-        return replace(self.last, both=self.last.both or self._every)
+        return self.last._replace(both=self.last.both or self._every)
 
 
 class _Replaying:

@@ -1,6 +1,6 @@
-"""A batch of tasks of one kind over all sites at once: what `Offloader.map` runs.
+"""A batch: tasks of one kind on all sites at once, for `Offloader.map`.
 
-Which task goes where is `placement`'s business; each one then takes the offloader's one way.
+Which task goes where is decided in `placement`; each task is then run by the offloader as any other.
 """
 
 import inspect
@@ -19,20 +19,20 @@ from offboard.robot_client.execution.placement import (
     next_start,
     takeover,
 )
-from offboard.robot_client.policies.forecast import Decision, Forecast, Outlook
-from offboard.robot_client.policies.rules import WARM_UP
+from offboard.robot_client.policies import Decision, Forecast, Outlook
+from offboard.robot_client.policies.greedy import WARM_UP
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.clock import Clock
 from offboard.robot_client.sites.runner import ONBOARD, Execution
 
 NAME = "map"
-LOOK_AHEAD = 32  # waiting tasks that are looked at when one is placed
-RECHECK_S = 0.05  # at least so often running tasks are looked at: one may be overdue
+LOOK_AHEAD = 32  # waiting tasks that may be placed next
+RECHECK_S = 0.05  # the longest wait before running tasks are checked again: one may be overdue
 
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """The policy of one task that a batch has placed; `call` names a site that shall run it too, later."""
+    """The policy of one task in a batch: the site it was placed on. `call` may name a second site later."""
 
     site: str
     reason: str
@@ -40,8 +40,8 @@ class Placed:
 
     def decide(self, forecast: Forecast) -> Decision:
         if self.site not in forecast.sites:
-            return Decision(ONBOARD, False, f"{self.reason}; {self.site} cannot take it", NAME)
-        return Decision(self.site, False, self.reason, NAME)
+            return Decision(ONBOARD, f"{self.reason}; {self.site} cannot take it", NAME)
+        return Decision(self.site, self.reason, NAME)
 
 
 Predict = Callable[[float, Mapping[str, int]], Forecast]
@@ -51,9 +51,10 @@ Run = Callable[[Task, Placed], tuple[Execution, Record]]
 class Batch:
     """Runs all tasks once; make a new one for the next.
 
-    `sites` are those that may be used. `predict` gives the forecast of a size, less the wait for so many
-    tasks of this batch that each site has; `run` runs a task to its end, in any thread. A server's answer is
-    given up after `timeout_s`.
+    `sites`: the sites that may be used.
+    `predict`: makes the forecast of a size, without the wait for this batch's own tasks on each site.
+    `run`: runs a task to its end; called in threads.
+    `timeout_s`: how long a server has for a task.
     """
 
     def __init__(
@@ -67,7 +68,7 @@ class Batch:
         timeout_s: float,
     ) -> None:
         self._tasks = tasks
-        # Of one kind: the longest is the largest.
+        # The tasks are of one kind, so the largest takes longest.
         self._waiting = sorted(range(len(tasks)), key=lambda number: -tasks[number].size)
         self._queues = {site: Queue(site, BUDGET_SHARE * timeout_s) for site in sites}
         self._predict = predict
@@ -79,7 +80,7 @@ class Batch:
         self._errors: dict[int, BaseException] = {}
 
     def run(self) -> list[Any]:
-        """The results in the order of the tasks; the first error in that order once all have ended."""
+        """The results in the order of the tasks; if tasks failed, the first error, when all have ended."""
         threads = SERVER_IN_FLIGHT_MAX * len(self._queues)
         with ThreadPoolExecutor(threads, thread_name_prefix=NAME) as pool:
             while self._waiting or self._running:
@@ -95,14 +96,14 @@ class Batch:
         return [self._values[number] for number in range(len(self._tasks))]
 
     def _next(self) -> tuple[int, str, str] | None:
-        """Task, site and reason of what should start now."""
+        """The task that should start now, with its site and the reason."""
         if not self._waiting or all(len(one.running) >= one.limit for one in self._queues.values()):
             return None
         first = _usable(self._look(self._waiting[0]))
         cold = _cold(first)
         for site in cold:
             if not self._queues[site].running:
-                return self._warm_up(site, first[site].count)
+                return self._warm_up(site, first[site].observations)
         looked = self._waiting[:LOOK_AHEAD]
         start = next_start(
             (_seconds(_usable(self._look(number)), cold) for number in looked),
@@ -116,7 +117,7 @@ class Batch:
         return self._predict(self._tasks[number].size, own)
 
     def _warm_up(self, site: str, count: int) -> tuple[int, str, str]:
-        """From each part of the waiting sizes one, so that the line through them is known."""
+        """Warm a site up with tasks of different sizes, so that its time is known for all of them."""
         place = len(self._waiting) * (count % WARM_UP + 1) // (WARM_UP + 1)
         return self._waiting[place], site, f"warm-up: too little is known of {site}"
 
@@ -133,7 +134,7 @@ class Batch:
         self._running[pool.submit(self._run, self._tasks[number], placed)] = number
 
     def _take_over(self) -> None:
-        """An idle site runs too what should finish sooner there, while second runs are allowed."""
+        """Let an idle site run a task too if it should end sooner there, and if second runs are allowed."""
         once = [number for number in self._running.values() if not self._placed[number].call.done()]
         if not once or all(queue.running for queue in self._queues.values()):
             return
@@ -171,14 +172,14 @@ class Batch:
 
 
 def arguments(kind: Kind, items: Iterable[Any]) -> list[tuple[Any, ...]]:
-    """Of each item: a tuple holds all arguments where the function takes several, else it is the argument."""
+    """The arguments of each item: a tuple holds all of them if the function takes several."""
     parameters = inspect.signature(kind.function).parameters.values()
     several = len(parameters) > 1 or any(one.kind is one.VAR_POSITIONAL for one in parameters)
     return [kind.bind(item if several and isinstance(item, tuple) else (item,), {}) for item in items]
 
 
 def _usable(forecast: Forecast) -> Mapping[str, Outlook]:
-    """The sites to compare: neither silent ones nor those that the caps leave too little for."""
+    """The sites to compare: not the silent ones, and not those beyond the caps."""
     if len(forecast.sites) == 1:
         return forecast.sites
     return {
@@ -190,13 +191,13 @@ def _usable(forecast: Forecast) -> Mapping[str, Outlook]:
 
 
 def _cold(sites: Mapping[str, Outlook]) -> list[str]:
-    """Those of which too little is known; of a site that is alone nothing need be known."""
+    """The sites of which too little is known; if there is one site only, nothing must be known."""
     if len(sites) == 1:
         return []
     return [
         site
         for site, one in sites.items()
-        if one.predicted_s is None or (one.count < WARM_UP and not one.full)
+        if one.predicted_s is None or (one.observations < WARM_UP and not one.full)
     ]
 
 

@@ -1,7 +1,8 @@
-"""Which task of a batch starts next, and where, so that the last one ends soonest. Pure: times are arguments.
+"""Which task of a batch starts next, and where, so that the last one ends soonest.
 
-List scheduling by earliest predicted finish, the longest task first (Graham 1969, Bounds on Multiprocessing
-Timing Anomalies), begun anew whenever something has ended: only what can begin now is placed.
+This is list scheduling by earliest predicted finish, the longest task first (Graham 1969, Bounds on
+Multiprocessing Timing Anomalies). It is repeated whenever a task has ended: only tasks that can start now are
+placed. There is no clock here; `batch` runs the tasks.
 """
 
 from collections.abc import Iterable, Mapping
@@ -9,29 +10,32 @@ from dataclasses import dataclass, field
 
 from offboard.robot_client.sites.runner import ONBOARD
 
-SERVER_IN_FLIGHT = 2  # one runs while the next is on its way
+SERVER_IN_FLIGHT = 2  # one task runs while the next one is on its way
 SERVER_IN_FLIGHT_MAX = 8
-ONBOARD_IN_FLIGHT = 1  # it runs one at a time, and nothing is on its way
-QUEUED, UNQUEUED = 1.0, 0.1  # of the time that a task ran there, how long it had waited for a worker
-BUDGET_SHARE = 0.5  # of the time after which a server's answer is given up: more is not put before a task
+ONBOARD_IN_FLIGHT = 1  # onboard runs one task at a time, and no task is on its way
+QUEUED, UNQUEUED = 1.0, 0.1  # wait for a worker over run time: above, fewer tasks at once; below, more
+BUDGET_SHARE = 0.5  # of the timeout of a server: a queue of tasks there may take this long
 PACE_MIN = 0.1
-OVERDUE = 0.1  # of its predicted time: what a task that should be done is taken to need still, at least
+OVERDUE = 0.1  # of its predicted time: an overdue task should still need at least this long
 
 
 @dataclass(slots=True)
 class Queue:
-    """The tasks of a batch that one site has, first come, first served.
+    """The tasks of a batch on one site, in the order of their start.
 
-    `within_s`: a task that would take longer from now on is not added to others. `pace` is how many seconds
-    of predicted time the site does in one: above 1 where it runs several at once, or hides the round trip.
+    `within_s`: a task that would end later than this is not added to other tasks.
+    The pace of a site is the predicted time that it works off in one second. It is above 1 if the site runs
+    several tasks at once, or if tasks travel while others run.
     """
 
     site: str
     within_s: float
     limit: int = 0
-    running: dict[int, float] = field(default_factory=dict)  # task to predicted seconds, in order of start
-    _since_s: float = 0.0  # when the first of them got its turn
-    _done_s: float = 0.0  # predicted seconds of those that ended
+    running: dict[int, float] = field(
+        default_factory=dict
+    )  # predicted seconds by task, in the order of start
+    _since_s: float = 0.0  # when the first running task got its turn
+    _done_s: float = 0.0  # predicted seconds of the tasks that ended
     _busy_s: float = 0.0
 
     def __post_init__(self) -> None:
@@ -43,13 +47,13 @@ class Queue:
         self.running[task] = seconds
 
     def end(self, task: int, now_s: float) -> None:
-        """It was answered, here or elsewhere."""
+        """The task was answered, on this site or another one."""
         self._done_s += self.running.pop(task)
         self._busy_s += now_s - self._since_s
         self._since_s = now_s
 
     def hear(self, queue_s: float | None, run_s: float | None) -> None:
-        """How long an answered task waited for a worker of the server, and ran; None where it failed."""
+        """Adapt the limit to how long an answered task waited for a worker, and ran; None if it failed."""
         if self.site == ONBOARD:
             return
         if queue_s is None or run_s is None:
@@ -65,22 +69,22 @@ class Queue:
         return len(self.running) < self.limit and self.finish_s(seconds, now_s) <= self.within_s
 
     def finish_s(self, seconds: float, now_s: float, behind_s: float = 0.0) -> float:
-        """In how many seconds one more task, predicted to take `seconds`, would be done.
+        """How many seconds from now one more task would end; it is predicted to take `seconds`.
 
-        `behind_s`: predicted seconds of others that would come before it.
+        `behind_s`: predicted seconds of other tasks that would run before it.
         """
         left_s = self._left_s(len(self.running), now_s)
         return max(seconds, (left_s + behind_s + seconds) / self._pace(seconds))
 
     def end_s(self, task: int, now_s: float) -> float:
-        """In how many seconds a task that runs here should end."""
+        """How many seconds from now a task that runs here should end."""
         place = list(self.running).index(task) + 1
         return self._left_s(place, now_s) / self._pace(self.running[task])
 
     def _left_s(self, count: int, now_s: float) -> float:
-        """Predicted seconds that the first so many need still.
+        """Predicted seconds that the first `count` tasks still need.
 
-        A task that is overdue may need as long again as it is late: what ails it is not known.
+        An overdue task should need as long again as it is late already: the reason is not known.
         """
         if not self.running:
             return 0.0
@@ -89,7 +93,7 @@ class Queue:
         return max(first - done_s, done_s - first, OVERDUE * first) + sum(others)
 
     def _pace(self, seconds: float) -> float:
-        """As if one more task, of so many seconds, had taken what was predicted."""
+        """The pace, with one more task counted as if it took what was predicted."""
         if self._busy_s + seconds <= 0:
             return 1.0
         return max(PACE_MIN, (self._done_s + seconds) / (self._busy_s + seconds))
@@ -97,7 +101,7 @@ class Queue:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """What begins now: which waiting task, on which site, and in how many s each site would have it done."""
+    """The waiting task that starts now: its place, its site, and the seconds until each site would end it."""
 
     place: int
     site: str
@@ -107,10 +111,11 @@ class Start:
 def next_start(
     predicted: Iterable[Mapping[str, float]], queues: Mapping[str, Queue], now_s: float
 ) -> Start | None:
-    """The first task that should finish earliest where it can begin now.
+    """The first task that should end earliest on a site where it can start now.
 
-    `predicted` gives the seconds of each waiting task by site, the longest task first; no more are asked for
-    than are looked at. A task that is better off on a busy site waits for it, and those after it count it.
+    `predicted` gives the seconds by site of each waiting task, the longest task first; it is only read as far
+    as needed. A task that would end earlier on a busy site waits for that site, and the tasks after it take
+    that into account.
     """
     behind_s = dict.fromkeys(queues, 0.0)
     for place, seconds in enumerate(predicted):
@@ -127,9 +132,9 @@ def next_start(
 def takeover(
     predicted: Mapping[int, Mapping[str, float]], queues: Mapping[str, Queue], now_s: float
 ) -> tuple[int, str] | None:
-    """The running task that an idle site would save most time of, and that site; None where none does.
+    """The running task for which an idle site would save most time, and that site; None if no site would.
 
-    `predicted` holds the seconds by site of the tasks that may run a second time.
+    `predicted` holds the seconds by site of the tasks that may run twice.
     """
     saved_s: dict[tuple[int, str], float] = {}
     for idle in (queue for queue in queues.values() if not queue.running):

@@ -1,6 +1,6 @@
-"""One task on the sites that were decided for: who starts when, and whose answer is used.
+"""One task on the sites of its decision: when each site starts, and whose answer is used.
 
-Which sites these are is `policies`' business, what is learnt of it the offloader's.
+The sites are chosen in `policies`; what comes of the runs is learnt in `learning`.
 """
 
 from collections.abc import Callable, Mapping
@@ -10,28 +10,34 @@ from typing import Any
 
 from offboard.common.errors import BadValue, CloudBroken, CloudError, Overtaken, TaskError
 from offboard.common.tasks import Kind, Task
+from offboard.robot_client.policies import Hedge, Probe
 from offboard.robot_client.sites.clock import Clock
 from offboard.robot_client.sites.runner import ONBOARD, Execution, Runner
 
 
 @dataclass(slots=True)
 class Plan:
-    """`first` start at once, `second` when no answer has come after `after_s`; `all`: wait for every one.
+    """When the sites of one task start.
 
-    `call`: a site that starts too once this names it.
+    `first`: the sites that start at once. `second`: a second run.
+    `all`: wait for every run, not for the first answer.
+    `call`: a future that may name one more site while the task runs; that site then starts too.
     """
 
     first: tuple[str, ...]
-    second: str | None = None
-    after_s: float = 0.0
+    second: Probe | Hedge | None = None
     all: bool = False
     call: "Future[str] | None" = None
 
 
 class Race:
-    """Runs one task. `begun` is told of every site that starts; `allowed` is asked before a second one does,
-    but not before one in place of those that failed; `late` gets, in any thread, what comes of a run that was
-    still under way when the answer was there; `meanwhile` is called once the first ones have started."""
+    """Runs one task.
+
+    `begun`: called with every site that starts.
+    `allowed`: asked before a second run starts. A fallback, which replaces failed runs, is always allowed.
+    `late`: called in any thread when a run ends after the task was answered.
+    `idle`: called once, after the first sites have started.
+    """
 
     def __init__(
         self,
@@ -43,7 +49,7 @@ class Race:
         begun: Callable[[str], None],
         allowed: Callable[[], bool],
         late: Callable[[str, Execution], None],
-        meanwhile: Callable[[], None],
+        idle: Callable[[], None],
     ) -> None:
         self._task = task
         self._runners = runners
@@ -52,19 +58,19 @@ class Race:
         self._begun = begun
         self._allowed = allowed
         self._late = late
-        self._meanwhile = meanwhile
-        self._runs: dict[str, tuple[Future[Execution], float]] = {}  # and when it began
+        self._idle = idle
+        self._runs: dict[str, tuple[Future[Execution], float]] = {}  # with its start time
 
     def run(self, plan: Plan) -> tuple[Execution, ...]:
-        """All executions in the order in which they began; those still under way as overtaken."""
+        """All executions in the order of their start; runs that are still under way count as overtaken."""
         for site in plan.first:
             self._start(site)
-        self._meanwhile()
+        self._idle()
         if plan.all:
             self._wait_for_all()
         else:
             if plan.second is not None:
-                self._start_second(plan.second, plan.after_s)
+                self._start_second(plan.second)
             self._wait_for_answer(plan.call)
         executions = {site: _finished(site, run) for site, (run, _) in self._runs.items() if run.done()}
         if ONBOARD not in self._runs and all(
@@ -75,8 +81,8 @@ class Race:
             executions[ONBOARD] = _finished(ONBOARD, self._runs[ONBOARD][0])
         for site, (run, began_s) in self._runs.items():
             if site not in executions:
-                probed = plan.second is not None and plan.after_s == 0.0
-                executions[site] = self._leave(site, run, began_s, keep=probed)
+                keep = isinstance(plan.second, Probe)
+                executions[site] = self._leave(site, run, began_s, keep=keep)
         return tuple(executions[site] for site in self._runs)
 
     def _start(self, site: str) -> None:
@@ -84,17 +90,17 @@ class Race:
         began_s = self._clock.now_s()
         self._runs[site] = self._runners[site].submit(self._task, self._timeout_s), began_s
 
-    def _start_second(self, site: str, after_s: float) -> None:
+    def _start_second(self, second: Probe | Hedge) -> None:
         late: list[str] = []
-        if after_s > 0:
+        if isinstance(second, Hedge):
             late, runs = list(self._runs), [run for run, _ in self._runs.values()]
             if not any(run.done() for run in runs):
-                self._clock.wait(runs, after_s)
+                self._clock.wait(runs, second.after_s)
             if any(run.done() for run in runs):
                 return
         if self._allowed():
-            self._start(site)
-        for first in late:  # after the start: a robot may be late for want of CPU
+            self._start(second.site)
+        for first in late:  # after the start: the robot itself may be late because its CPU is busy
             self._runners[first].hurry()
 
     def _wait_for_answer(self, call: "Future[str] | None") -> None:
@@ -122,7 +128,7 @@ class Race:
             self._clock.wait(pending)
 
     def _leave(self, site: str, run: "Future[Execution]", began_s: float, *, keep: bool) -> Execution:
-        """A run that came second: its time is learnt when it ends, now where it can be stopped."""
+        """Leave a run that lost the race; it is cancelled, unless its whole time is wanted (`keep`)."""
         run.add_done_callback(lambda done: self._late(site, _finished(site, done)))
         if not keep:
             self._runners[site].cancel(self._task)
@@ -131,7 +137,7 @@ class Race:
 
 
 def answer_of(executions: tuple[Execution, ...]) -> Execution:
-    """The first good answer; else the task's own failure; else whatever failed last."""
+    """The fastest good answer, or else the failure of the task itself, or else the last failure."""
     for execution in executions:
         if isinstance(execution.failure, BadValue):
             return execution
@@ -143,7 +149,7 @@ def answer_of(executions: tuple[Execution, ...]) -> Execution:
 
 
 def _finished(site: str, future: "Future[Execution]") -> Execution:
-    """A runner's future ends by itself within the budget; one cancelled by `close` counts as broken."""
+    """The result of a run. A runner ends every run within its budget; `close` cancels the future instead."""
     try:
         return future.result()
     except CancelledError:
@@ -151,7 +157,7 @@ def _finished(site: str, future: "Future[Execution]") -> Execution:
 
 
 def _is_answer(execution: Execution) -> bool:
-    """A failure of the task itself is the same everywhere."""
+    """Whether the race is over: if the task itself fails, it fails on every site."""
     return execution.ok or isinstance(execution.failure, TaskError)
 
 

@@ -1,4 +1,7 @@
-"""What is in the file of a `store`: JSON, checked whole before any of it is believed."""
+"""The content of a memory file: JSON, checked as a whole before any of it is used.
+
+When the file is read and written is in `store`.
+"""
 
 import json
 import math
@@ -7,7 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from offboard.common import VERSION as SOFTWARE
-from offboard.robot_client.learning.kind import OBSERVATIONS_MAX, Observation
+from offboard.robot_client.learning.site import OBSERVATIONS_MAX, Observation
 from offboard.robot_client.sites.runner import Condition
 
 FORMAT = 1
@@ -16,7 +19,7 @@ PER_SIZE, PER_WORK = "size", "work"
 
 @dataclass(frozen=True, slots=True)
 class KeptSite:
-    """The last observations of a site, oldest first, as they were at `saved_at` (Unix time)."""
+    """The last observations of one kind on one site, oldest first; `saved_at` is a Unix time."""
 
     saved_at: float
     observations: tuple[Observation, ...]
@@ -24,7 +27,11 @@ class KeptSite:
 
 @dataclass(frozen=True, slots=True)
 class KeptKind:
-    """Of one kind. `source`: hash of its source; `per`: unit of its amounts; `worked`: sizes and work."""
+    """What is kept of one kind.
+
+    `source`: the hash of its source. `per`: PER_SIZE or PER_WORK, the unit of its amounts.
+    `worked`: pairs of size and work.
+    """
 
     source: str
     per: str
@@ -33,11 +40,11 @@ class KeptKind:
 
 
 class Unreadable(Exception):
-    """The file is not one of ours, or not whole; the text says why."""
+    """The file is not a memory file, or it is damaged; the text says why."""
 
 
 def encode(kinds: Mapping[str, KeptKind]) -> bytes:
-    """The file that holds these kinds."""
+    """The bytes of a file that holds these kinds."""
     whole = {
         "v": FORMAT,
         "software": SOFTWARE,
@@ -51,17 +58,16 @@ def _plain(fields: Iterable[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def decode(text: bytes) -> dict[str, KeptKind]:
-    """The kinds that a file holds; Unreadable unless every part of it is as it should be."""
+    """The kinds that a file holds; Unreadable unless every part of it is valid."""
     try:
         whole = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise Unreadable(f"not JSON: {error}") from None
     if not isinstance(whole, dict) or "v" not in whole or "kinds" not in whole:
-        raise Unreadable("no memory of a robot-client")
+        raise Unreadable("not a memory file of a robot-client")
     if whole["v"] != FORMAT:
-        raise Unreadable(
-            f"format version {whole['v']!r} of software {whole.get('software')!r}; this reads {FORMAT}"
-        )
+        found = f"format version {whole['v']!r} of software {whole.get('software')!r}"
+        raise Unreadable(f"{found}; this version reads {FORMAT}")
     try:
         return {name: _kind(kind) for name, kind in whole["kinds"].items()}
     except (AttributeError, KeyError, TypeError, ValueError) as error:
@@ -93,21 +99,21 @@ def _observation(given: Any) -> Observation:
         waited_s=_number(given["waited_s"]),
         bytes=_number(given["bytes"]),
         cpu_s=_maybe(given["cpu_s"]),
-        ahead=int(_number(given.get("ahead", 1))),  # unknown to earlier versions
+        ahead=int(_number(given.get("ahead", 1))),  # earlier versions lack it
     )
 
 
 def _condition(given: Any) -> Condition:
     unknown = given.keys() - set(Condition._fields)
     if unknown:
-        raise ValueError(f"condition {sorted(unknown)[0]!r} is not known")
+        raise ValueError(f"unknown condition {sorted(unknown)[0]!r}")
     return Condition(
         round_trip_s=_maybe(given["round_trip_s"]),
         silent=_fact(given["silent"]),
         queue=int(_number(given["queue"])),
         load=_number(given["load"]),
         wait_s=_number(given["wait_s"]),
-        capacity=_share(given.get("capacity", 1.0)),  # unknown to earlier versions, as what follows
+        capacity=_share(given.get("capacity", 1.0)),  # earlier versions lack this and the next field
         server_load=_number(given.get("server_load", 0.0)),
     )
 

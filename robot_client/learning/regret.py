@@ -1,4 +1,7 @@
-"""How much time the robot's choices cost it, estimated live from its own shadow probes."""
+"""Live regret: how much time the robot's choices cost it, estimated while it runs, from its probes.
+
+The regret of recorded runs is computed by `loadgen`.
+"""
 
 import math
 from collections import deque
@@ -11,7 +14,7 @@ NORMAL_95 = 1.959964
 
 @dataclass(frozen=True, slots=True)
 class Regret:
-    """Mean seconds a task that the better site would have saved, with its 95 % interval."""
+    """The seconds that the better site would have saved per task: mean and 95 % interval over `probes`."""
 
     mean_s: float
     low_s: float
@@ -20,10 +23,10 @@ class Regret:
 
 
 class RegretEstimate:
-    """A probe tells both times of one task: that of the site it was meant for, and that of another.
+    """Estimates regret from probes, which give both times of one task.
 
-    Probes come after so many tasks, whatever these were, so they are a fair sample of the tasks at those
-    moments; hedges come where a site is late, and are none.
+    Probes are due after a number of tasks, whatever these tasks were, so they are a fair sample. Hedges start
+    when a site is late, so they are not.
     """
 
     def __init__(self) -> None:
@@ -31,12 +34,13 @@ class RegretEstimate:
         self._estimate: Regret | None = None
 
     def learn(self, chosen_s: float, other_s: float) -> None:
+        """Take the times of a probed task: on the chosen site, and on the probed one."""
         self._regrets.append(max(0.0, chosen_s - other_s))
         if len(self._regrets) >= PROBES_MIN:
             self._estimate = self._fresh()
 
     def estimate(self) -> Regret | None:
-        """None before PROBES_MIN probes."""
+        """The estimate; None before PROBES_MIN probes."""
         return self._estimate
 
     def _fresh(self) -> Regret:
@@ -48,6 +52,6 @@ class RegretEstimate:
 
 
 def student_95(freedom: int) -> float:
-    """Student's t that 97.5 % are below, to 2 % from 4 degrees of freedom on (Abramowitz, Stegun 26.7.5)."""
+    """The 97.5 % quantile of Student's t, to 2 % from 4 degrees of freedom (Abramowitz, Stegun 26.7.5)."""
     z = NORMAL_95
     return z + (z**3 + z) / (4 * freedom) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * freedom**2)

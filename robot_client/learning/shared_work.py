@@ -1,6 +1,7 @@
-"""How much work a task of some size is: learnt from the results of all sites, so that it is never stale.
+"""How much work a task of a given size is, learnt from the results of all sites, so that it is never stale.
 
-What the unit of work is, a kind says itself (`@task(work=...)`); the times of a site are learnt per work.
+A kind defines its unit of work itself (`@task(work=...)`); the seconds per work are learnt for each site in
+`site`.
 """
 
 from array import array
@@ -8,26 +9,26 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 
 PAIRS_MAX = 200  # (size, work) remembered
-ODD = 3.0  # times the median of those near: more work than this counts as so much
-ROUNDING = 1e-12  # of the squares of what sizes differ by: less is all of one size
-NEAR = 20  # of them, those nearest in size: the line through them tells
+OUTLIER = 3.0  # times the median work nearby: more work than this counts as this much
+ROUNDING = 1e-12  # of the squares of the size differences: with less spread, all sizes are equal
+NEIGHBOURS = 20  # pairs that are nearest in size: the line goes through these
 
 
 class SharedWork:
     """Local linear regression of work on size (Cleveland 1979, with equal weights).
 
-    Work need not grow evenly with size: a line through all of it is off where it matters, at the size where
-    two sites take as long.
+    Work need not be proportional to size. One line through all pairs would be wrong at the most important
+    size: the one where two sites take equally long.
 
-    Sizes and work are in arrays, not pairs of objects: the planner leaves nothing of those in a CPU's caches.
+    Sizes and work are in arrays, because a planner evicts lists of objects from the caches of a CPU.
     """
 
     def __init__(self) -> None:
         self._order: deque[tuple[float, float]] = deque()
-        self._sizes, self._works = array("d"), array("d")  # in order of both
+        self._sizes, self._works = array("d"), array("d")  # sorted by size, then by work
 
     def learn(self, size: float, work: float) -> None:
-        """A result said that a task of this size was so much work."""
+        """A result said that a task of this size was this much work."""
         if len(self._order) == PAIRS_MAX:
             at = self._place(*self._order.popleft())
             del self._sizes[at], self._works[at]
@@ -37,14 +38,14 @@ class SharedWork:
         self._works.insert(at, work)
 
     def predict(self, size: float) -> float | None:
-        """The work to expect; None before anything is known."""
+        """The expected work; None before anything is known."""
         count = len(self._sizes)
         if not count:
             return None
-        first = max(0, min(bisect_left(self._sizes, size) - NEAR // 2, count - NEAR))
-        sizes, works = self._sizes[first : first + NEAR], self._works[first : first + NEAR]
+        first = max(0, min(bisect_left(self._sizes, size) - NEIGHBOURS // 2, count - NEIGHBOURS))
+        sizes, works = self._sizes[first : first + NEIGHBOURS], self._works[first : first + NEIGHBOURS]
         count = len(sizes)
-        most = ODD * sorted(works)[count // 2]
+        most = OUTLIER * sorted(works)[count // 2]
         sx = sxx = sw = sxw = 0.0
         for one, work in zip(sizes, works, strict=True):
             x = one - size
@@ -60,6 +61,6 @@ class SharedWork:
         return max(0.0, (sw * sxx - sx * sxw) / spread)  # the line at x = 0
 
     def _place(self, size: float, work: float) -> int:
-        """Of the first pair that is not before this one."""
+        """The index of the first pair that is not below this one."""
         first = bisect_left(self._sizes, size)
         return bisect_left(self._works, work, first, bisect_right(self._sizes, size, first))

@@ -1,7 +1,7 @@
-"""A warm restart: what was learnt outlives the process in a file.
+"""The memory file: what was learnt outlives the process, so that a restart is warm.
 
-Kept are observations, not what a predictor made of them: whatever is configured then learns them again.
-What is in the file is `memory_file`'s business.
+Observations are kept, not what a predictor made of them, so that any predictor can learn them again.
+The content of the file is defined in `memory_file`.
 """
 
 import contextlib
@@ -16,24 +16,25 @@ from pathlib import Path
 
 from offboard.common.errors import ConfigError
 from offboard.robot_client.learning import memory_file
-from offboard.robot_client.learning.kind import KindMemory, Observation
+from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.memory_file import PER_SIZE, PER_WORK, KeptKind, KeptSite, Unreadable
-from offboard.robot_client.policies.wrappers import STALE
+from offboard.robot_client.learning.site import Observation
+from offboard.robot_client.policies.probe import STALE
 
-SAVE_EVERY_S = 30.0  # at most, between the first task and the end
-WRITE_WAIT_S = 5.0  # for a disk at the end
-HALF_LIFE_S = 3600.0  # of what is believed, while the process is away
-OBSERVATIONS_MIN = 5  # of a site; with fewer it starts knowing nothing
+SAVE_EVERY_S = 30.0  # while tasks run; the file is also saved at the end
+WRITE_WAIT_S = 5.0  # that the end of the process waits for a slow disk
+HALF_LIFE_S = 3600.0  # without the process: after this time, half as many observations are recalled
+OBSERVATIONS_MIN = 5  # of a site; with fewer, the site starts cold
 FILE_BYTES_MAX = 64 * 1024 * 1024
 
 log = logging.getLogger(__name__)
 
 
 class Store:
-    """The memory of one robot, in the file at `path`; `now` tells Unix time.
+    """The memory of one robot, in the file at `path`; `now` returns the Unix time in seconds.
 
-    A file that cannot be read, or not be written, is a warning: the robot starts cold, or goes on without.
-    `recall`, `due` and `snapshot` are called under the offloader's lock; files are written by a thread.
+    If the file cannot be read, the robot starts cold; if it cannot be written, tasks go on. Both are logged.
+    `recall`, `due` and `snapshot` are called under the offloader's lock. A thread writes the file.
     """
 
     def __init__(self, path: Path, *, now: Callable[[], float] = time.time) -> None:
@@ -48,17 +49,17 @@ class Store:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ConfigError(f"memory {path}: {error.strerror}") from error
-        self._kept = self._read()  # of kinds that were not asked for yet
-        self._away: dict[str, dict[str, KeptSite]] = {}  # of sites that this robot has not, by kind
+        self._kept = self._read()  # kinds that this process has not run yet
+        self._away: dict[str, dict[str, KeptSite]] = {}  # sites that this robot does not have now, by kind
 
     def recall(self, memory: KindMemory, sites: Collection[str]) -> None:
-        """Teach a new memory what is kept of its kind on these sites."""
+        """Teach a new memory what is kept of its kind and these sites."""
         kind = memory.kind
         kept = self._kept.pop(kind.name, None)
         if kept is None:
             return
         if not kind.source_hash or kept.source != kind.source_hash:
-            log.info("memory %s: the source of task %s has changed: it starts cold", self.path, kind.name)
+            log.info("memory %s: task %s starts cold because its source has changed", self.path, kind.name)
             return
         for size, work in kept.worked:
             memory.learn_size(size, work)
@@ -70,7 +71,7 @@ class Store:
                 log.info("%s on %s: %d observations recalled", kind.name, name, len(observations))
 
     def due(self, now_s: float) -> bool:
-        """Whether to save now: SAVE_EVERY_S after the last time, unless that still goes on."""
+        """Whether to save now: SAVE_EVERY_S after the last save, unless that one is still being written."""
         if self._due_s is None:
             self._due_s = now_s + SAVE_EVERY_S
         if now_s < self._due_s or self._writing():
@@ -79,7 +80,7 @@ class Store:
         return True
 
     def snapshot(self, memories: Mapping[str, KindMemory]) -> dict[str, KeptKind]:
-        """All that is to be in the file, as it is now."""
+        """What the file should contain now."""
         now, live = self._now(), dict[str, KeptKind]()
         for name, memory in memories.items():
             sites = dict(self._away.get(name, {}))
@@ -91,17 +92,17 @@ class Store:
         return self._kept | live
 
     def save_soon(self, kinds: Mapping[str, KeptKind]) -> None:
-        """Write the file, without making anybody wait."""
+        """Write the file in a thread."""
         writer = threading.Thread(target=self._write, args=(kinds,), name="memory", daemon=True)
         try:
             writer.start()
-        except RuntimeError as error:  # no thread is to be had
+        except RuntimeError as error:  # the system has no thread left
             self._warn(str(error))
         else:
             self._writer = writer
 
     def save_last(self, kinds: Mapping[str, KeptKind]) -> None:
-        """Write the file, after whatever is being written; a disk that hangs is not waited for longer."""
+        """Write the file and wait for it, at most WRITE_WAIT_S; called once, at the end."""
         if self._writer is not None:
             self._writer.join(WRITE_WAIT_S)
         if not self._writing():
@@ -115,8 +116,8 @@ class Store:
         return self._writer is not None and self._writer.is_alive()
 
     def _believed(self, site: KeptSite) -> tuple[Observation, ...]:
-        """The newest of a site's observations, half as many for each HALF_LIFE_S away."""
-        away_s = max(0.0, self._now() - site.saved_at)  # a clock set back says nothing of it
+        """The newest observations of a site: half as many for each HALF_LIFE_S since they were saved."""
+        away_s = max(0.0, self._now() - site.saved_at)  # the clock may have been set back
         count = math.ceil(len(site.observations) * 2 ** (-away_s / HALF_LIFE_S))
         return site.observations[-count:] if count >= OBSERVATIONS_MIN else ()
 
@@ -128,7 +129,7 @@ class Store:
             self._warn(error.strerror)
 
     def _warn(self, why: str | None) -> None:
-        """Once, until it is written again."""
+        """Warn once, until the file can be written again."""
         if not self._failed:
             log.warning("memory %s cannot be written: %s; tasks go on", self.path, why)
         self._failed = True
@@ -148,7 +149,7 @@ class Store:
             return {}
 
     def _set_aside(self) -> str:
-        """Keep the first file that could not be read; what became of it, in words."""
+        """Rename the first file that could not be read, so that it is kept; returns what happened to it."""
         aside = self.path.with_name(f"{self.path.name}.unreadable")
         if aside.exists():
             return f"it will be replaced: {aside} is there already"
@@ -160,7 +161,7 @@ class Store:
 
 
 def replace_file(path: Path, text: bytes) -> None:
-    """Atomically: whoever reads `path`, also after a crash, finds the old text or the new one, whole."""
+    """Replace a file in one step: a reader, also after a crash, finds the whole old or the whole new text."""
     fresh = path.with_name(f".{path.name}.new")
     try:
         with fresh.open("wb") as file:
@@ -180,7 +181,7 @@ def replace_file(path: Path, text: bytes) -> None:
 
 
 def _as_learnt(observations: Collection[Observation], saved_per: str, per_work: bool) -> list[Observation]:
-    """In the amounts that the memory learns now; what nobody told the work of is left out."""
+    """The observations per size or per work, as the memory learns now; those without work may not fit."""
     if not per_work:
         return [_with_amount(one, one.size) for one in observations]
     if saved_per == PER_WORK:

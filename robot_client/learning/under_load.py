@@ -1,20 +1,24 @@
-"""What a site takes while other programs load the robot, told by what it takes otherwise."""
+"""How long a site takes while other programs load it, from how long it takes otherwise.
+
+The times without load are predicted by `site`.
+"""
 
 from collections import deque
 from statistics import median
 
-KEPT = 20  # of the last times under load
-ODD = 3.0  # times their median: a longer time counts as so much
-PRIOR = 4.0  # times under load: so much does what is believed of a slope weigh, at the usual distance
+KEPT = 20  # the last times under load
+OUTLIER = 3.0  # times the median: a longer time counts as this long
+PRIOR = 4.0  # times under load that the prior of the slope counts for, at the usual distance
 
 
 class UnderLoad:
-    """A line over the times that were expected without the load.
+    """A line from the time expected without load to the time under load.
 
-    Loads come seldom and are short: the first time under one tells. The first ones are of whatever sizes come
-    by, and a line through them alone is not to be believed far from them. So its slope has a prior. What runs
-    onboard takes so many times as long (`onboard`); a server as long, but the robot is slow to send and to
-    hear. It is ridge regression, with its penalty in units of the mean (Hoerl and Kennard, 1970).
+    Loads are rare and short, so the first time under load must be enough for a prediction. But a line through
+    the first few times is unreliable for other sizes, so its slope has a prior. With `onboard`, everything
+    takes longer by the same factor; a server takes its usual time plus a constant, because the robot is slow
+    to send and receive. This is ridge regression with the penalty in units of the mean (Hoerl and Kennard,
+    1970).
     """
 
     def __init__(self, *, onboard: bool) -> None:
@@ -23,16 +27,17 @@ class UnderLoad:
 
     @property
     def known(self) -> bool:
+        """Whether a time under load was learnt yet."""
         return bool(self._kept)
 
     def learn(self, expected_s: float, seconds: float) -> None:
-        """It took so long where without the load `expected_s` was expected."""
+        """A task took `seconds` under load, where `expected_s` was expected without the load."""
         self._kept.append((expected_s, seconds))
 
     def expect(self, expected_s: float) -> float:
-        """Never less than without the load. Of at least one that was learnt."""
+        """The time under load, never below the time without it; only while `known`."""
         count = len(self._kept)
-        most = ODD * median([seconds for _, seconds in self._kept])
+        most = OUTLIER * median([seconds for _, seconds in self._kept])
         x = sum([one for one, _ in self._kept]) / count
         y = sum([min(seconds, most) for _, seconds in self._kept]) / count
         prior = y / x if self._onboard and x > 0 else 1.0

@@ -1,7 +1,7 @@
-"""Where a task should run: rules from a forecast to a decision, no clock, no socket; chance from a seed.
+"""The registry of policies, by name; and the names that a policy is written with.
 
-A policy is named by its rule, with any wrappers before it: `hedge:probe:greedy`.
-What the decision leads to is in `offloader`.
+A policy is named by its rule, with wrappers in front: `hedge:probe:greedy`. `default` stands for that name.
+Rules and wrappers are loaded when they are first made: `--help` only lists their names.
 """
 
 import importlib
@@ -10,19 +10,25 @@ from random import Random
 from typing import TYPE_CHECKING, Any
 
 from offboard.common.errors import ConfigError
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 if TYPE_CHECKING:
-    from offboard.robot_client.policies.forecast import PINNED, Decision, Forecast, Outlook, Policy
+    from offboard.robot_client.policies.decision import BOTH, PINNED, Decision, Hedge, Policy, Probe
+    from offboard.robot_client.policies.forecast import Forecast, Outlook
 
 __all__ = [
+    "BOTH",
     "DEFAULT",
     "HELP",
     "PINNED",
     "Decision",
     "Forecast",
+    "Hedge",
     "Outlook",
     "Policy",
+    "Probe",
     "check_name",
+    "full_name",
     "make",
     "names",
     "predictor_of",
@@ -30,73 +36,98 @@ __all__ = [
 ]
 
 DEFAULT = "hedge:probe:greedy"
+ALIAS = "default"
 
 
 @dataclass(frozen=True, slots=True)
 class _Rule:
-    """The predictor that a rule is meant with; how it is made is in `rules`."""
+    """Where a rule is, and what it is made with.
 
+    `home`: its file and class. `arguments`: those of the class; a rule that `draws` gets a seeded generator.
+    `predictor`: the name of the predictor that the rule is meant for.
+    `weighs_cost`: whether an objective other than the expected time changes its decisions.
+    """
+
+    home: str
+    arguments: tuple[str, ...] = ()
+    draws: bool = False
     predictor: str = "least-squares"
-    weighs_cost: bool = True  # else no objective changes what it does
+    weighs_cost: bool = True
 
 
-# Names only, so that --help, which lists them, need not load what they stand for.
 _RULES: dict[str, _Rule] = {
-    "paper": _Rule(weighs_cost=False),
-    "onboard": _Rule(weighs_cost=False),
-    "cloud": _Rule(weighs_cost=False),
-    "greedy": _Rule("work:average"),
-    "hysteresis": _Rule(),
-    "epsilon": _Rule(),
-    "linucb": _Rule("bayesian-least-squares"),
-    "thompson": _Rule("bayesian-least-squares"),
+    "paper": _Rule("paper.Paper", weighs_cost=False),
+    ONBOARD: _Rule("always.Always", (ONBOARD,), weighs_cost=False),
+    CLOUD: _Rule("always.Always", (CLOUD,), weighs_cost=False),
+    "greedy": _Rule("greedy.Greedy", predictor="work:average"),
+    "hysteresis": _Rule("greedy.Hysteresis"),
+    "epsilon": _Rule("exploration.Epsilon", draws=True),
+    "linucb": _Rule("exploration.LinUcb", predictor="bayesian-least-squares"),
+    "thompson": _Rule("exploration.Thompson", draws=True, predictor="bayesian-least-squares"),
 }
-_WRAPPERS = ("probe", "hedge", "breaker", "budget")
-HELP = f"{', '.join(_RULES)}; any of {', '.join(_WRAPPERS)} go around it: {DEFAULT}"
+_WRAPPERS: dict[str, str] = {
+    "probe": "probe.WithProbes",
+    "hedge": "hedge.WithHedges",
+    "breaker": "breaker.WithBreaker",
+    "budget": "budget.WithBudget",
+}
+HELP = f"{', '.join(_RULES)}, {ALIAS} ({DEFAULT}); any of {', '.join(_WRAPPERS)} may go in front"
 
 
 def __getattr__(name: str) -> Any:
-    """What a policy is written with; loaded where it is first asked for."""
+    """The names that a policy is written with are loaded when they are first used (PEP 562)."""
     if name not in __all__:
         raise AttributeError(name)
-    return getattr(importlib.import_module("offboard.robot_client.policies.forecast"), name)
+    return _load(f"{'forecast' if name in ('Forecast', 'Outlook') else 'decision'}.{name}")
 
 
 def make(name: str, seed: int = 0) -> "Policy":
-    """The policy of this name; the same seed draws the same."""
-    from offboard.robot_client.policies.rules import RULES
-    from offboard.robot_client.policies.wrappers import WRAPPERS
-
+    """The policy of this name; policies with the same seed draw the same numbers."""
     check_name(name)
-    *wrappers, rule = name.split(":")
-    policy = RULES[rule](Random(seed))
+    *wrappers, last = full_name(name).split(":")
+    rule = _RULES[last]
+    policy: Policy = _load(rule.home)(*([Random(seed)] if rule.draws else rule.arguments))
     for wrapper in reversed(wrappers):
-        policy = WRAPPERS[wrapper](policy)
+        policy = _load(_WRAPPERS[wrapper])(policy)
     return policy
 
 
+def full_name(name: str) -> str:
+    """The same name with `default` written out."""
+    wrappers, colon, rule = name.rpartition(":")
+    return f"{wrappers}{colon}{DEFAULT}" if rule == ALIAS else name
+
+
 def predictor_of(name: str) -> str:
-    """The name of the predictor that a policy is meant with."""
-    return _RULES[name.rpartition(":")[2]].predictor
+    """The name of the predictor that a policy is meant for."""
+    return _rule(name).predictor
 
 
 def weighs_cost(name: str) -> bool:
-    """Whether an objective other than the expected time changes what it decides."""
-    return _RULES[name.rpartition(":")[2]].weighs_cost
+    """Whether an objective other than the expected time changes the decisions of this policy."""
+    return _rule(name).weighs_cost
 
 
 def names() -> tuple[str, ...]:
-    """The rules by themselves."""
+    """The rules, without wrappers."""
     return tuple(_RULES)
 
 
 def check_name(name: str, where: str = "policy") -> None:
-    """ConfigError, naming `where` it stood, unless `make` knows it."""
-    *wrappers, rule = name.split(":")
+    """ConfigError unless `make` knows this name; `where` says where the name was given."""
+    *wrappers, rule = full_name(name).split(":")
     if rule not in _RULES:
         raise ConfigError(f"{where}: {name!r} is not one of {HELP}")
     for n, wrapper in enumerate(wrappers):
         if wrapper not in _WRAPPERS or wrapper in wrappers[:n]:
-            raise ConfigError(
-                f"{where}: {name!r}: {wrapper!r} is not one of {', '.join(_WRAPPERS)}, once each"
-            )
+            allowed = ", ".join(_WRAPPERS)
+            raise ConfigError(f"{where}: {name!r}: {wrapper!r} is not one of {allowed}, once each")
+
+
+def _rule(name: str) -> _Rule:
+    return _RULES[full_name(name).rpartition(":")[2]]
+
+
+def _load(home: str) -> Any:
+    module, _, name = home.partition(".")
+    return getattr(importlib.import_module(f"offboard.robot_client.policies.{module}"), name)

@@ -1,22 +1,27 @@
-"""What may still be spent: second runs of tasks, bytes and joules; token buckets."""
+"""What tasks may still spend: second runs, bytes and joules, each in a token bucket.
+
+The wrappers `probe`, `hedge` and `budget` ask for what is left; the offloader takes what is spent.
+"""
 
 import math
 
 from offboard.common.errors import ConfigError
 from offboard.common.token_bucket import Bucket
 
-DUPLICATES = 0.1  # second runs a task
-DUPLICATES_MAX = 6.0  # saved up at most, and owed at most
-DUPLICATES_FIRST = 6.0  # there from the start: warm-up takes about so many
+DUPLICATES = 0.1  # second runs per task
+DUPLICATES_MAX = 6.0  # second runs that can be saved up, and that can be owed
+DUPLICATES_FIRST = 6.0  # second runs at the start: about as many as a warm-up takes
 MINUTE_S = 60.0
 
 
 class Allowance:
-    """Of one robot. Called under the offloader's lock.
+    """The allowance of one robot. Called under the offloader's lock.
 
-    Second runs: `duplicates` for each task in the long run, and the `first` beyond; a warm-up without
-    end, as beside a server that is always busy, does not put off probes for ever.
-    Caps: so many bytes and joules in a minute (None: no cap), a minute's worth at once at most.
+    `duplicates`: second runs per task in the long run, from 0 to 1.
+    `first`: further second runs at the start.
+    What a warm-up owes is limited: if a server is always busy, the warm-up may never end, and probes must
+    still come.
+    `bytes_a_minute`, `joules_a_minute`: caps (None: no cap). At most the amount of one minute is saved up.
     """
 
     def __init__(
@@ -31,9 +36,9 @@ class Allowance:
             raise ConfigError(f"duplicates {duplicates}: must be a share of tasks from 0 to 1")
         for name, cap in (("bytes", bytes_a_minute), ("joules", joules_a_minute)):
             if cap is not None and not cap >= 0:
-                raise ConfigError(f"{name} a minute {cap}: must be from 0")
+                raise ConfigError(f"{name} a minute {cap}: must be 0 or more")
         self._second = Bucket(duplicates, DUPLICATES_MAX, first if duplicates else 0.0)
-        self._bytes, self._joules = _minute(bytes_a_minute), _minute(joules_a_minute)
+        self._bytes, self._joules = _of_a_minute(bytes_a_minute), _of_a_minute(joules_a_minute)
         self._at_s: float | None = None
 
     @property
@@ -42,6 +47,7 @@ class Allowance:
 
     @property
     def duplicates(self) -> float:
+        """Second runs that may start now; below 0 while they are owed."""
         return self._second.level
 
     @property
@@ -53,7 +59,7 @@ class Allowance:
         return math.inf if self._joules is None else self._joules.level
 
     def begin(self, now_s: float) -> None:
-        """A task begins."""
+        """A task starts: it adds its share of a second run, and the caps refill with the time."""
         self._second.fill(1.0)
         if not self.capped:
             return
@@ -64,17 +70,17 @@ class Allowance:
                 bucket.fill(since_s)
 
     def duplicate(self) -> None:
-        """A task runs on one site more."""
+        """A second run of a task starts."""
         self._second.take(1.0)
         self._second.level = max(-DUPLICATES_MAX, self._second.level)
 
     def spend(self, bytes_moved: float, joules: float) -> None:
-        """An execution took this."""
+        """An execution took these bytes and joules."""
         if self._bytes is not None:
             self._bytes.take(bytes_moved)
         if self._joules is not None:
             self._joules.take(joules)
 
 
-def _minute(cap: float | None) -> Bucket | None:
+def _of_a_minute(cap: float | None) -> Bucket | None:
     return None if cap is None else Bucket(cap / MINUTE_S, cap, cap)

@@ -1,4 +1,7 @@
-"""What a task costs the robot's battery: a linear model of computing, sending and waiting."""
+"""What a task costs the robot's battery: a linear model of computing, sending and waiting.
+
+Which site that makes better is decided by the objective `energy` in `objectives`.
+"""
 
 from dataclasses import dataclass
 
@@ -7,24 +10,24 @@ from offboard.common.config import check, setting
 
 @dataclass(frozen=True)
 class Energy:
-    """Joules of one task, onboard or elsewhere.
+    """The power and energy that a robot takes; measure your own robot for good values.
 
-    Defaults: a Raspberry Pi 4 B draws 2.7 W idle and 6.4 W with all four cores busy (Geerling, Power
-    Consumption Benchmarks, pidramble.com), so one core takes 0.9 W more; Wi-Fi takes 7 uJ a byte
-    (Balasubramanian et al., Energy Consumption in Mobile Phones, IMC 2009, table 4). Measure your own.
+    The defaults: a Raspberry Pi 4 B draws 2.7 W idle and 6.4 W with all four cores busy (Geerling, Power
+    Consumption Benchmarks, pidramble.com), so one core takes 0.9 W more; Wi-Fi takes 7 uJ per byte
+    (Balasubramanian et al., Energy Consumption in Mobile Phones, IMC 2009, table 4).
     """
 
-    compute_w: float = setting(0.9, "watts that one busy core takes above idle", minimum=0.0)
-    idle_w: float = setting(0.0, "watts while waiting for an answer, where waiting is not free", minimum=0.0)
-    radio_j_byte: float = setting(7e-6, "joules a byte sent or received", minimum=0.0)
+    compute_w: float = setting(0.9, "power that one busy core draws above idle, in watts", minimum=0.0)
+    idle_w: float = setting(0.0, "power drawn while waiting for an answer, in watts", minimum=0.0)
+    radio_j_byte: float = setting(7e-6, "energy per byte sent or received, in joules", minimum=0.0)
 
     def __post_init__(self) -> None:
         check(self)
 
     def onboard_j(self, cpu_s: float) -> float:
-        """Of computing for so many CPU seconds."""
+        """Joules of computing for `cpu_s` CPU seconds."""
         return self.compute_w * cpu_s
 
     def remote_j(self, seconds: float, bytes_moved: float) -> float:
-        """Of sending and receiving so many bytes, and waiting."""
+        """Joules of waiting for `seconds`, and of sending and receiving the bytes."""
         return self.idle_w * seconds + self.radio_j_byte * bytes_moved

@@ -1,35 +1,106 @@
-"""What a policy decides from, and what it decides."""
+"""What a policy decides from: an outlook for each site, with the errors of its past predictions.
+
+What it decides is in `decision`; `learning` makes the outlooks.
+"""
 
 import math
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, replace
-from typing import Protocol
+from bisect import bisect_left
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
-from offboard.robot_client.learning.intervals import Conformal
 from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition
 
-OVERDUE_SD = 2.0  # standard deviations beyond its prediction, while too few errors are known
-PINNED = "pinned"  # what stands for a policy where the caller said where to run
+ERRORS_MIN = 10  # with fewer errors, only the spread says how far a prediction may be off
+LATE_SPREADS = 2.0  # with fewer errors, a task is late this many spreads after its predicted time
+TAIL_SHARE = 0.2  # of the errors, the largest ones: they say how much longer a late task may take
+BEYOND = 0.25  # of the distance from the median to the largest error: later than that, no task has ended
 
 
-@dataclass(slots=True)
-class Outlook:
-    """What is known of one site before a task.
+@dataclass(frozen=True)
+class PredictionErrors:
+    """How wrong the last predictions for one site were; a value that never changes.
 
-    `predicted_s` and `spread_s` (None: nothing learnt); `full`: the predictor's warm-up is over; `age`: tasks
-    of this kind since the site last ran one; `failures`: in a row; `count`: observations that the prediction
-    rests on; `low_s`, `high_s`: its 90 % interval; `error_s`: the standard error of the prediction itself;
-    `cost`: what the objective makes of it (None: nothing learnt); `in_flight`: tasks of any kind there now;
-    `bytes` and `joules`: what running there is expected to take; `condition`: what was measured; `errors`:
-    those of the predictions so far; `smallest`: the site ran no task nearly as small as this one.
+    `scores`: the error of each prediction in units of `unit_s`, sorted. `usual_s`: the usual time of a task.
+    The methods return None while fewer than ERRORS_MIN errors are known.
     """
 
-    predicted_s: float | None
-    spread_s: float | None
-    full: bool
-    age: int
-    failures: int
-    count: int = 0
+    scores: tuple[float, ...] = ()
+    usual_s: float = 0.0
+
+    def overdue(self, predicted_s: float, worth_s: float) -> float | None:
+        """How old, in seconds, a running task is when it should still need more than `worth_s`."""
+        scores, count = self.scores, len(self.scores)
+        if count < ERRORS_MIN:
+            return None
+        unit, largest = unit_s(predicted_s, self.usual_s), scores[-1]
+        first = count - round(TAIL_SHARE * count)
+        score = largest + BEYOND * (largest - scores[count // 2])  # a later task may never end
+        # Otherwise no task in the tail took so much longer than another one.
+        if unit * (largest - scores[first]) > worth_s:
+            latest, longer = self._late
+            if unit * longer > worth_s:
+                score = latest
+        return max(0.0, predicted_s + unit * score)
+
+    def share_above(self, predicted_s: float, limit_s: float) -> float | None:
+        """The share of tasks with this prediction that should take longer than `limit_s`."""
+        count = len(self.scores)
+        if count < ERRORS_MIN:
+            return None
+        score = (limit_s - predicted_s) / unit_s(predicted_s, self.usual_s)
+        # Never 0 or 1: a limit that no error has reached yet may still be missed.
+        return (count - bisect_left(self.scores, score) + 0.5) / (count + 1)
+
+    def below(self, predicted_s: float, share: float) -> float | None:
+        """The time in seconds that this share of tasks with this prediction should stay below."""
+        count = len(self.scores)
+        if count < ERRORS_MIN:
+            return None
+        rank = min(count - 1, math.ceil(share * (count + 1)) - 1)
+        return max(0.0, predicted_s + unit_s(predicted_s, self.usual_s) * self.scores[rank])
+
+    @cached_property
+    def _late(self) -> tuple[float, float]:
+        """The score in the tail after which tasks took longest in the mean, and how much longer that was."""
+        first = len(self.scores) - round(TAIL_SHARE * len(self.scores))
+        latest = total = self.scores[-1]
+        longest = -math.inf
+        for n, score in enumerate(reversed(self.scores[first:-1]), 1):
+            longer = total / n - score
+            if longer >= longest:
+                latest, longest = score, longer
+            total += score
+        return latest, longest
+
+
+NO_ERRORS = PredictionErrors()
+
+
+class Outlook(NamedTuple):
+    """What is known of one site before a task runs. None means that nothing was learnt yet.
+
+    `predicted_s` and `spread_s`: the prediction and its standard deviation.
+    `error_s`: the standard error of the prediction itself. `low_s`, `high_s`: its 90 % interval.
+    `full`: the warm-up of the predictor is over. `observations`: how many the prediction rests on.
+    `age`: tasks of this kind since the site last ran one. `failures`: failed runs in a row.
+    `cost`: what the objective makes of the outlook; less is better.
+    `in_flight`: tasks of any kind that run there now.
+    `bytes`, `joules`: what running the task there should take.
+    `condition`: what was measured of the site. `errors`: how wrong its past predictions were.
+    `smallest`: the site has never run a task nearly as small as this one.
+
+    Build it with keywords. It is a named tuple because every task needs one for each site, and a frozen
+    dataclass takes twice as long to build.
+    """
+
+    predicted_s: float | None = None
+    spread_s: float | None = None
+    full: bool = False
+    age: int = 0
+    failures: int = 0
+    observations: int = 0
     low_s: float | None = None
     high_s: float | None = None
     error_s: float | None = None
@@ -38,27 +109,27 @@ class Outlook:
     bytes: float = 0.0
     joules: float = 0.0
     condition: Condition = UNMEASURED
-    errors: Conformal | None = None
+    errors: PredictionErrors = NO_ERRORS
     smallest: bool = False
 
     def overdue_s(self, worth_s: float) -> float | None:
-        """When a task that has not come back is expected to need more than `worth_s` still."""
+        """How old, in seconds, a running task is when it should still need more than `worth_s`."""
         if self.predicted_s is None:
             return None
-        after_s = None if self.errors is None else self.errors.overdue(self.predicted_s, worth_s)
+        after_s = self.errors.overdue(self.predicted_s, worth_s)
         if after_s is not None:
             return after_s
-        return None if self.spread_s is None else self.predicted_s + OVERDUE_SD * self.spread_s
+        return None if self.spread_s is None else self.predicted_s + LATE_SPREADS * self.spread_s
 
 
-@dataclass(slots=True)
-class Forecast:
-    """The size of a task and the outlook of every site that can take it now.
+class Forecast(NamedTuple):
+    """The input size of a task, and the outlook of every site that can take it now.
 
-    Onboard is always one; a wrapper may leave it out for those that it holds.
+    Onboard is always among `sites`, unless a wrapper leaves it out for the policy that it wraps.
+    `last_site`: where the last task of this kind was sent. `duplicates`: second runs that may start now.
+    `bytes_left`, `joules_left`: what the caps leave.
 
-    `last_site`: where the last task of this kind was sent; `duplicates`: second runs that may begin now;
-    `bytes_left` and `joules_left`: what the caps leave.
+    Build it with keywords. It is a named tuple for the same reason as `Outlook`.
     """
 
     size: float
@@ -69,99 +140,38 @@ class Forecast:
     joules_left: float = math.inf
 
     def only(self, sites: Collection[str]) -> "Forecast":
-        """The same with these sites alone."""
-        return replace(self, sites={name: one for name, one in self.sites.items() if name in sites})
+        """The same forecast with these sites only."""
+        return self._replace(sites={name: one for name, one in self.sites.items() if name in sites})
 
 
-@dataclass(slots=True)
-class Decision:
-    """Run on `site`, or on all sites but those `spared` in parallel where `both`; `why` is for people.
-
-    `second`: a site that starts too when no answer has come after `second_after_s`; the first good answer is
-    used. At 0 s it is a shadow probe, whose time is learnt to the end; later it is a hedge, and whoever
-    comes second is given up.
-    """
-
-    site: str
-    both: bool
-    why: str | Callable[[], str]  # called where somebody reads it: most decisions nobody asks about
-    policy: str
-    second: str | None = None
-    second_after_s: float = 0.0
-    spared: tuple[str, ...] = ()
-
-    @property
-    def reason(self) -> str:
-        return self.why if isinstance(self.why, str) else self.why()
-
-
-class Policy(Protocol):
-    """Called once a task, under the offloader's lock."""
-
-    def decide(self, forecast: Forecast) -> Decision: ...
+def unit_s(predicted_s: float, usual_s: float) -> float:
+    """The unit of the errors: a part of the noise grows with the task, and a part does not."""
+    return 0.5 * ((predicted_s if predicted_s > 0 else 0.0) + usual_s) or 1.0
 
 
 def cheapest(costs: Mapping[str, float]) -> str:
-    """The site of the least cost; a tie stays onboard."""
-    least = min(costs.values())
-    if costs.get(ONBOARD) == least:
+    """The site with the lowest cost; a tie stays onboard."""
+    lowest = min(costs.values())
+    if costs.get(ONBOARD) == lowest:
         return ONBOARD
-    return next(site for site, cost in costs.items() if cost == least)
-
-
-def cost_of(outlook: Outlook) -> float:
-    """What a site would cost; 0 where nothing is known, so that it gets known, unless it is silent."""
-    if outlook.cost is not None:
-        return outlook.cost
-    if outlook.predicted_s is None:
-        return math.inf if outlook.condition.silent else 0.0
-    return outlook.predicted_s
+    return next(site for site, cost in costs.items() if cost == lowest)
 
 
 def costs_of(forecast: Forecast) -> dict[str, float]:
-    """By site."""
-    return {site: cost_of(one) for site, one in forecast.sites.items()}
+    """The cost of each site."""
+    return {
+        site: _cost_without_objective(one) if one.cost is None else one.cost
+        for site, one in forecast.sites.items()
+    }
 
 
 def home(forecast: Forecast) -> str:
-    """Onboard; where a wrapper left that out, the cheapest of the others."""
+    """Onboard, or the cheapest site where a wrapper has left onboard out."""
     return ONBOARD if ONBOARD in forecast.sites else cheapest(costs_of(forecast))
 
 
-def explain(forecast: Forecast, site: str) -> str:
-    """Why this site: each one's prediction with its interval, what was measured, how stale the others are."""
-    sites = forecast.sites
-    parts, stale = [f"{site}: {_times(sites[site])}"], ""
-    measured = f"size {forecast.size:.3g}"
-    for name, one in sites.items():
-        if name != site:
-            parts.append(f"{name} {_times(one)}")
-            if one.age:
-                stale += f"; {name} last tried {one.age} tasks ago"
-        measured += _measured(name, one.condition, "" if len(sites) == 2 else f" {name}")
-    return f"{' against '.join(parts)}; {measured}{stale}"
-
-
-def _times(one: Outlook) -> str:
-    if one.condition.silent:
-        return "silent"
-    if one.predicted_s is None:
-        return "unknown"
-    if one.low_s is None or one.high_s is None:
-        return f"{one.predicted_s * 1e3:.3g} ms"
-    return f"{one.predicted_s * 1e3:.3g} ms [{one.low_s * 1e3:.3g}, {one.high_s * 1e3:.3g}]"
-
-
-def _measured(site: str, condition: Condition, of: str) -> str:
-    said, there = "", of if of or site == ONBOARD else " there"
-    if condition.round_trip_s is not None:
-        said = f", queue{of} {condition.queue}, rtt{of} {condition.round_trip_s * 1e3:.3g} ms"
-    if site == ONBOARD and condition.load >= 0.005:
-        said += f", load{of} {condition.load:.0%}"
-    if condition.server_load >= 0.005:
-        said += f", load{there} {condition.server_load:.0%}"
-    if condition.capacity < 1.0:
-        said += f", capacity{there} {condition.capacity:.0%}"
-    if condition.wait_s:
-        said += f", wait{of} {condition.wait_s * 1e3:.3g} ms"
-    return said
+def _cost_without_objective(outlook: Outlook) -> float:
+    """An unknown site costs nothing, so that it is tried; an unknown site that is silent is never tried."""
+    if outlook.predicted_s is None:
+        return math.inf if outlook.condition.silent else 0.0
+    return outlook.predicted_s

@@ -1,14 +1,21 @@
-"""What a policy is to make small: from an outlook of a site to one number, less is better."""
+"""Objectives: what a policy makes small, as a cost for each site. Less is better.
+
+The joules that an objective weighs are estimated in `energy`.
+"""
 
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from offboard.common.errors import ConfigError
-from offboard.robot_client.learning.intervals import NORMAL_90, Conformal
+from offboard.robot_client.policies.forecast import PredictionErrors
+
+SPREADS_90 = (
+    1.645  # standard deviations on each side that hold 90 %; 95 % of the times are below the upper end
+)
 
 
 class Expected(NamedTuple):
-    """What is expected of a task on one site."""
+    """What running a task on one site should take; `spread_s` is None while it is unknown."""
 
     seconds: float
     spread_s: float | None
@@ -16,34 +23,36 @@ class Expected(NamedTuple):
 
 
 class Objective(Protocol):
-    def cost(self, expected: Expected, errors: Conformal) -> float:
-        """`errors`: those of the site's predictions so far."""
+    """Called once for each site that a task could run on."""
+
+    def cost(self, expected: Expected, errors: PredictionErrors) -> float:
+        """The cost of a site, in the objective's own unit; `errors` are those of its past predictions."""
 
 
 class Mean:
-    """Expected seconds."""
+    """The expected time, in seconds."""
 
-    def cost(self, expected: Expected, errors: Conformal) -> float:  # noqa: ARG002
+    def cost(self, expected: Expected, errors: PredictionErrors) -> float:  # noqa: ARG002
         return expected.seconds
 
 
 class Tail:
-    """The time that 95 % of such tasks stay below."""
+    """The time that 95 % of such tasks stay below, in seconds."""
 
     SHARE = 0.95
 
-    def cost(self, expected: Expected, errors: Conformal) -> float:
+    def cost(self, expected: Expected, errors: PredictionErrors) -> float:
         below_s = errors.below(expected.seconds, self.SHARE)
-        return expected.seconds + NORMAL_90 * (expected.spread_s or 0.0) if below_s is None else below_s
+        return expected.seconds + SPREADS_90 * (expected.spread_s or 0.0) if below_s is None else below_s
 
 
 @dataclass(frozen=True)
 class Deadline:
-    """The probability to miss the deadline; between equals the faster one."""
+    """The probability to miss a deadline; between equal probabilities, the faster site wins."""
 
     deadline_s: float
 
-    def cost(self, expected: Expected, errors: Conformal) -> float:
+    def cost(self, expected: Expected, errors: PredictionErrors) -> float:
         expected_s = max(0.0, expected.seconds)
         missed = errors.share_above(expected_s, self.deadline_s)
         if missed is None:
@@ -53,11 +62,11 @@ class Deadline:
 
 @dataclass(frozen=True)
 class TimeAndEnergy:
-    """Expected seconds plus `s_a_joule` for every joule."""
+    """The expected time plus `s_a_joule` seconds for each joule."""
 
     s_a_joule: float
 
-    def cost(self, expected: Expected, errors: Conformal) -> float:  # noqa: ARG002
+    def cost(self, expected: Expected, errors: PredictionErrors) -> float:  # noqa: ARG002
         return expected.seconds + self.s_a_joule * expected.joules
 
 
@@ -65,7 +74,7 @@ OBJECTIVES = ("mean", "p95", "deadline", "energy")
 
 
 def make(name: str, *, deadline_s: float | None = None, s_a_joule: float | None = None) -> Objective:
-    """By name; ConfigError where what it needs is not given."""
+    """The objective of this name; ConfigError if its setting is missing or wrong."""
     if name == "deadline":
         if deadline_s is None or not deadline_s > 0:
             raise ConfigError(f"objective 'deadline' needs a deadline above 0 s, not {deadline_s}")

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from offboard.robot_client.learning.regret import Regret
-from offboard.robot_client.policies import Decision, Outlook
+from offboard.robot_client.policies import Decision, Hedge, Outlook
 from offboard.robot_client.records import lines
 from offboard.robot_client.records.lines import VERSION, Lines
 from offboard.robot_client.sites.own_cpu import OWN_CPU
@@ -88,10 +88,7 @@ class Record:
     started_at: datetime = field(default_factory=lambda: datetime.now(UTC))
 
 
-_DECISION_FIELDS, _LATE_FIELDS, _REGRET_FIELDS = (
-    tuple("reason" if one.name == "why" else one.name for one in fields(of))
-    for of in (Decision, Late, Regret)
-)
+_LATE_FIELDS, _REGRET_FIELDS = (tuple(one.name for one in fields(of)) for of in (Late, Regret))
 
 
 class Trace(Lines):
@@ -157,7 +154,7 @@ def as_dict(record: Record) -> dict[str, Any]:
         "size": record.size,
         "features": features(record),
         "sites": {site: _values(outlook, _OUTLOOK_FIELDS) for site, outlook in record.sites.items()},
-        "decision": _values(record.decision, _DECISION_FIELDS),
+        "decision": _decision(record.decision),
         "executions": [_values(one, _EXECUTION_FIELDS) for one in record.executions],
         "used": record.used,
         "waited_s": record.waited_s,
@@ -182,6 +179,20 @@ def features(record: Record) -> dict[str, float]:
 def read(path: Path) -> Iterator[dict[str, Any]]:
     """The fields of each line. A torn last line is skipped with a warning; any other raises DataError."""
     return lines.read(path, _FIELDS)
+
+
+def _decision(decision: Decision) -> dict[str, Any]:
+    """A probe is a second run after 0 s."""
+    second = decision.second
+    return {
+        "site": decision.site,
+        "both": decision.both,
+        "reason": decision.reason,
+        "policy": decision.policy,
+        "second": None if second is None else second.site,
+        "second_after_s": second.after_s if isinstance(second, Hedge) else 0.0,
+        "spared": decision.spared,
+    }
 
 
 def _values(of: object, names: tuple[str, ...]) -> dict[str, Any]:

@@ -6,7 +6,8 @@ The times say how much the two executions of one task disturb each other; `loadg
 from collections.abc import Callable
 from functools import partial
 
-from offboard.robot_client.offloader import BOTH, Offloader
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import BOTH
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.simulated.config import RobotConfig
 from offboard.robot_client.simulated.references import orders

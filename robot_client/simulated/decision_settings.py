@@ -7,10 +7,11 @@ from offboard.common.config import setting
 from offboard.common.errors import ConfigError
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.policies import objectives
-from offboard.robot_client.policies.allowance import DUPLICATES, Allowance
+from offboard.robot_client.policies.allowance import DUPLICATES
 from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.objectives import OBJECTIVES, Objective
+from offboard.robot_client.policies.objectives import OBJECTIVES
 from offboard.robot_client.predictors.window import WINDOW
+from offboard.robot_client.settings import Settings
 
 DECISIONS, OBJECTIVE, LIMITS = "decisions", "objective", "limits"
 MEAN = OBJECTIVES[0]
@@ -129,14 +130,15 @@ class DecisionSettings:
         if self.objective != MEAN and not policies.weighs_cost(self.policy):
             raise ConfigError(f"--objective: {self.objective} changes nothing with --policy {self.policy}")
 
-    def goal(self) -> Objective:
-        """What the policy minimises."""
-        return objectives.make(self.objective, deadline_s=self.deadline_s, s_a_joule=self.s_per_joule)
-
-    def energy(self) -> Energy:
-        """What tasks take from the battery."""
-        return Energy(self.compute_watts, self.idle_watts, self.radio_joules_byte)
-
-    def allowance(self) -> Allowance:
-        """What may be spent; a fresh one for each offloader."""
-        return Allowance(self.duplicates, self.bytes_per_minute, self.joules_per_minute)
+    def settings(self, seed: int) -> Settings:
+        """The rare options of the offloader."""
+        return Settings(
+            predictor=self.predictor,
+            objective=objectives.make(self.objective, deadline_s=self.deadline_s, s_a_joule=self.s_per_joule),
+            energy=Energy(self.compute_watts, self.idle_watts, self.radio_joules_byte),
+            duplicates=self.duplicates,
+            bytes_a_minute=self.bytes_per_minute,
+            joules_a_minute=self.joules_per_minute,
+            memory=self.memory,
+            seed=seed,
+        )

@@ -17,7 +17,8 @@ from offboard.common import errors
 from offboard.common.errors import ConfigError, TaskError
 from offboard.common.host import cpu
 from offboard.common.tasks import kind_of
-from offboard.robot_client.offloader import BOTH, Offloader
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import BOTH
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.simulated.answers import Answered, Answers
 from offboard.robot_client.simulated.config import RobotConfig

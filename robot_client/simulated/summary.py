@@ -45,8 +45,10 @@ class Summary:
         else:
             self._waited.setdefault(record.decision.site, array("d")).append(record.waited_s)
             ran = [one.site for one in record.executions]
-            self._seconds += record.decision.second in ran
-            self._fallbacks += len(ran) > 1 and record.decision.second not in ran
+            second = record.decision.second
+            twice = second is not None and second.site in ran
+            self._seconds += twice
+            self._fallbacks += len(ran) > 1 and not twice
 
     def add_failure(self, *, late_s: float = 0.0) -> None:
         """Count a task without an answer."""

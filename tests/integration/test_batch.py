@@ -1,4 +1,4 @@
-"""`Offloader.map` on real processes: robot and cloud of the same speed, and a link in between."""
+"""`Offloader.map` with real processes: a robot and a cloud of the same speed, and a link between them."""
 
 import json
 import statistics
@@ -12,11 +12,11 @@ from offboard.loadgen.testbed.testbed import Setup
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(150)]
 
-CPUS = 0.3  # of robot and cloud each: together they need less than one core
+CPUS = 0.3  # for robot and cloud each: together they need less than one core
 DELAY_MS = 5.0
-REPEATS = 3  # of each way, in turn
+REPEATS = 3  # of each way, in turns
 FASTER = 1.5
-ATTEMPTS = 2  # others use the machine too, and may take from two parts what they leave to one
+ATTEMPTS = 2  # other programs on the machine may slow down two busy parts more than one
 RUN_S = 60.0
 SETUPS = {
     "cloud": Setup({"tasks": "offboard.loadgen.scenario.hash_tasks", "workers": 2}, CPUS),
@@ -27,7 +27,7 @@ ROBOT = {**COMMANDS, "robot": (sys.executable, "-m", "tests.batch_robot")}
 
 
 def measure(out: Path) -> dict[str, float]:
-    """The median seconds of a batch by where it ran: onboard, cloud, or all sites."""
+    """The median seconds of a batch onboard, in the cloud, and on all sites."""
     with LocalTestbed(out, SETUPS, commands=ROBOT) as bed:
         bed.start()
         bed.start("robot")
@@ -41,8 +41,8 @@ def measure(out: Path) -> dict[str, float]:
     }
 
 
-def test_a_batch_over_both_sites_ends_sooner_than_on_the_better_one(tmp_path: Path) -> None:
-    """40 tasks of mixed sizes at 0.3 CPU here and there: 1.5 times sooner, where twice would be perfect."""
+def test_a_batch_on_both_sites_ends_sooner_than_on_the_better_one(tmp_path: Path) -> None:
+    """40 tasks of mixed sizes on two sites with 0.3 CPU each end 1.5 times sooner; twice would be perfect."""
     found = []
     for attempt in range(ATTEMPTS):
         seconds = measure(tmp_path / str(attempt))

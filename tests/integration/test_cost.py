@@ -1,4 +1,4 @@
-"""What an empty task costs, counted: how long that takes is for `make bench`."""
+"""What an empty task costs in messages and wake-ups; its time is measured by `make bench`."""
 
 from collections import Counter
 from threading import Thread
@@ -23,9 +23,10 @@ def costs_nothing() -> None:
     pass
 
 
-def test_an_empty_task_is_two_messages_and_wakes_nobody_else(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One request, one reply, each sent by the thread that has it; a reader that were woken for each would
-    make two of them a task. Where the answer is there before a send is over, it is woken to be sure."""
+def test_an_empty_task_is_two_messages_and_wakes_no_other_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The request and the reply are sent by the threads that make them, almost always without a wake-up.
+
+    A reader is woken only if the answer comes before the send has ended."""
     counted: Counter[str] = Counter()
     send, wake = Channel.send, Channel.wake
 

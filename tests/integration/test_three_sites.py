@@ -1,4 +1,4 @@
-"""Three real sites, each failing in turn: onboard, an edge server nearby, a faster cloud further away."""
+"""Three real sites fail in turn: onboard, an edge server nearby, and a faster cloud further away."""
 
 import contextlib
 import time
@@ -21,16 +21,16 @@ pytestmark = [pytest.mark.integration, pytest.mark.timeout(150)]
 
 EDGE_CPUS, EDGE_DELAY_MS = 0.3, 5.0
 CLOUD_CPUS, CLOUD_DELAY_MS = 2 * EDGE_CPUS, 40.0
-RUN_S = (0.009, 0.015)  # of a server's CPU, drawn evenly
+RUN_S = (0.009, 0.015)  # CPU time of a server for a task, drawn evenly
 TRIED_ROUNDS, TRIES = 20_000, 9
-ONBOARD_TIMES, SLOWED_TIMES = 15, 150  # the work of a server, and ten times that
+ONBOARD_TIMES, SLOWED_TIMES = 15, 150  # times the work of a server: normal, and ten times slower
 TIMEOUT_S = 0.5
 CONNECT_S = 20.0
 
 
 @pytest.fixture
 def servers(tmp_path: Path) -> Iterator[dict[str, LocalTestbed]]:
-    """Edge and cloud: each a server behind a relay of its own."""
+    """Edge and cloud, each a server behind its own relay."""
     with contextlib.ExitStack() as stack:
         beds = {}
         for site, cpus, delay_ms in ((EDGE, EDGE_CPUS, EDGE_DELAY_MS), (CLOUD, CLOUD_CPUS, CLOUD_DELAY_MS)):
@@ -44,7 +44,7 @@ def servers(tmp_path: Path) -> Iterator[dict[str, LocalTestbed]]:
 
 
 def rounds_a_second() -> float:
-    """Of this machine at its best: so that the best site is the same on a fast machine and on a slow one."""
+    """The speed of this machine, so that the best site is the same on fast and slow machines."""
     took_s = []
     for _ in range(TRIES):
         began_s = time.thread_time()
@@ -54,7 +54,7 @@ def rounds_a_second() -> float:
 
 
 def fail(servers: Mapping[str, LocalTestbed], failing: tuple[str, ...]) -> None:
-    """The edge crashes, the cloud's link falls silent, onboard becomes ten times as slow; others are well."""
+    """The edge crashes, the link of the cloud is cut, or onboard becomes ten times slower."""
     if EDGE in failing:
         servers[EDGE].kill("cloud")
     elif not servers[EDGE].running("cloud"):
@@ -63,10 +63,10 @@ def fail(servers: Mapping[str, LocalTestbed], failing: tuple[str, ...]) -> None:
     slow_site.times = SLOWED_TIMES if ONBOARD in failing else ONBOARD_TIMES
 
 
-def test_the_best_living_site_is_used_within_thirty_tasks_of_each_change(
+def test_the_best_remaining_site_is_used_within_thirty_tasks(
     servers: dict[str, LocalTestbed], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By the default policy, in phases of a hundred tasks; no task is lost."""
+    """The default policy finds it after each change, and no task is lost."""
     rounds = [round(run_s * rounds_a_second()) for run_s in RUN_S]
     monkeypatch.setattr(slow_site, "times", ONBOARD_TIMES)
     random, records = Random(1), list[Record]()

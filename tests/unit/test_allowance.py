@@ -1,4 +1,4 @@
-"""What may still be spent."""
+"""What tasks may still spend: second runs, bytes and joules."""
 
 import math
 
@@ -13,8 +13,8 @@ def begin(allowance: Allowance, tasks: int, every_s: float = 1.0, from_s: float 
         allowance.begin(from_s + n * every_s)
 
 
-def test_second_runs_come_by_the_share_of_tasks() -> None:
-    """Of 1,000 tasks with a share of 0.1 a hundred run twice, whenever one is left."""
+def test_second_runs_are_a_share_of_the_tasks() -> None:
+    """With a share of 0.1, about a hundred of 1,000 tasks may run twice."""
     allowance, ran = Allowance(0.1), 0
     for n in range(1_000):
         allowance.begin(float(n))
@@ -24,15 +24,15 @@ def test_second_runs_come_by_the_share_of_tasks() -> None:
     assert ran == pytest.approx(100 + DUPLICATES_FIRST, abs=1)
 
 
-def test_what_is_saved_up_is_bounded() -> None:
-    """A quiet year leaves DUPLICATES_MAX second runs."""
+def test_saved_second_runs_are_limited() -> None:
+    """After 1,000 tasks without a second run, DUPLICATES_MAX are saved up."""
     allowance = Allowance(0.5)
     begin(allowance, 1_000)
     assert allowance.duplicates == DUPLICATES_MAX
 
 
-def test_warm_up_is_paid_back() -> None:
-    """Second runs beyond what is there are owed: none is left until tasks have made up for them."""
+def test_a_warm_up_is_paid_back() -> None:
+    """Second runs beyond the level are owed, and later tasks must pay for them first."""
     allowance = Allowance(0.5)
     for _ in range(round(DUPLICATES_FIRST) + 3):
         allowance.duplicate()
@@ -42,8 +42,8 @@ def test_warm_up_is_paid_back() -> None:
     assert allowance.duplicates == pytest.approx(1.0)
 
 
-def test_what_is_owed_is_bounded() -> None:
-    """After a warm-up of a thousand tasks probes come again within a hundred, not after ten thousand."""
+def test_owed_second_runs_are_limited() -> None:
+    """After a warm-up of a thousand tasks, probes are possible again within a hundred tasks."""
     allowance = Allowance(0.1)
     for n in range(1_000):
         allowance.begin(float(n))
@@ -52,23 +52,23 @@ def test_what_is_owed_is_bounded() -> None:
     assert allowance.duplicates >= 1
 
 
-def test_without_a_share_nothing_runs_twice() -> None:
-    """Share 0 leaves nothing, not even those of the start."""
+def test_with_share_0_no_task_runs_twice() -> None:
+    """There are no second runs at the start either."""
     none = Allowance(0.0)
     begin(none, 1)
     assert none.duplicates == 0.0
 
 
-def test_without_caps_all_may_be_spent() -> None:
-    """No cap: bytes and joules are unlimited, whatever was spent."""
+def test_without_caps_bytes_and_joules_are_unlimited() -> None:
+    """Spending changes nothing."""
     allowance = Allowance()
     allowance.spend(1e12, 1e12)
     assert not allowance.capped
     assert (allowance.bytes_left, allowance.joules_left) == (math.inf, math.inf)
 
 
-def test_a_cap_refills_in_a_minute() -> None:
-    """600 bytes a minute: all at once at first, then 10 a second, and no more than a minute's worth."""
+def test_a_cap_refills_within_a_minute() -> None:
+    """A cap of 600 bytes a minute refills by 10 bytes a second, up to 600 bytes."""
     allowance = Allowance(bytes_a_minute=600.0, joules_a_minute=60.0)
     allowance.begin(1000.0)
     assert (allowance.capped, allowance.bytes_left, allowance.joules_left) == (True, 600.0, 60.0)
@@ -81,8 +81,8 @@ def test_a_cap_refills_in_a_minute() -> None:
     assert (allowance.bytes_left, allowance.joules_left) == (600.0, 60.0)
 
 
-def test_a_clock_that_stands_fills_nothing() -> None:
-    """Tasks of one instant share what is there."""
+def test_caps_do_not_refill_without_time() -> None:
+    """Tasks that start at the same instant share what is left."""
     allowance = Allowance(bytes_a_minute=600.0)
     allowance.begin(5.0)
     allowance.spend(600.0, 0.0)
@@ -92,15 +92,15 @@ def test_a_clock_that_stands_fills_nothing() -> None:
 
 
 @pytest.mark.parametrize("wrong", [-0.1, 1.1, math.nan])
-def test_a_share_is_from_0_to_1(wrong: float) -> None:
-    """Anything else is refused by name."""
+def test_a_share_outside_0_to_1_is_an_error(wrong: float) -> None:
+    """The error names the setting."""
     with pytest.raises(ConfigError, match=r"duplicates .* from 0 to 1"):
         Allowance(wrong)
 
 
 @pytest.mark.parametrize("cap", ["bytes_a_minute", "joules_a_minute"])
 @pytest.mark.parametrize("wrong", [-1.0, math.nan])
-def test_a_cap_is_not_below_zero(cap: str, wrong: float) -> None:
-    """Anything else is refused by name."""
-    with pytest.raises(ConfigError, match=r"a minute .* must be from 0"):
+def test_a_negative_cap_is_an_error(cap: str, wrong: float) -> None:
+    """The error names the setting."""
+    with pytest.raises(ConfigError, match=r"a minute .* must be 0 or more"):
         Allowance(**{cap: wrong})

@@ -12,9 +12,10 @@ from offboard.common.errors import CloudBroken, CloudTimeout, ConfigError, Overt
 from offboard.common.tasks import Task, task
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.execution.placement import SERVER_IN_FLIGHT_MAX
+from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies.allowance import DUPLICATES_MAX, Allowance
-from offboard.robot_client.policies.rules import WARM_UP
+from offboard.robot_client.policies.greedy import WARM_UP
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
 from tests.fakes import ScriptedRunner
@@ -50,7 +51,7 @@ def stamp_once(number: int) -> int:
 
 
 def answers(site: str, a_second: float = 100.0, **fields: Any) -> Callable[[Task], Execution]:
-    """Right answers, that took as long as the task is large."""
+    """Right answers that took as long as the task is large."""
 
     def script(one: Task) -> Execution:
         try:
@@ -64,7 +65,7 @@ def answers(site: str, a_second: float = 100.0, **fields: Any) -> Callable[[Task
 
 
 class HeldRunner(ScriptedRunner):
-    """Answers a task when `release` lets it, once `holding`; one that is cancelled ends, as overtaken."""
+    """While `holding`, answers a task only when the test calls `release`; a cancelled task is overtaken."""
 
     def __init__(self, site: str, script: Callable[[Task], Execution]) -> None:
         super().__init__(site, script)
@@ -90,12 +91,12 @@ class HeldRunner(ScriptedRunner):
         future.set_result(Execution(self.site, 0.01, failure=Overtaken("late"), censored=True))
 
     def wait_for(self, count: int) -> None:
-        """Until so many tasks are held."""
+        """Wait until this many tasks are held."""
         with self._changed:
             assert self._changed.wait_for(lambda: len(self.held) >= count, WAIT_S), f"{len(self.held)} held"
 
     def release(self) -> None:
-        """Answer the task that is held longest, once there is one."""
+        """Answer the task that has been held longest; wait for one if there is none."""
         self.wait_for(1)
         with self._changed:
             task, future = self.held.pop(next(iter(self.held)))
@@ -108,7 +109,7 @@ Mapped = Callable[..., "Future[list[Any]]"]
 
 @pytest.fixture
 def make() -> Iterator[Make]:
-    """Makes offloaders by least squares; `records` are what they told."""
+    """Makes offloaders with least squares; `records` gets the record of each task."""
     made: list[Offloader] = []
 
     def factory(*runners: ScriptedRunner, records: list[Record] | None = None, **options: Any) -> Offloader:
@@ -116,7 +117,7 @@ def make() -> Iterator[Make]:
             Offloader(
                 list(runners),
                 policy=policies.make("paper"),
-                predictor=lambda: predictors.make(predictors.LEAST_SQUARES, 20),
+                memories=Memories(lambda: predictors.make(predictors.LEAST_SQUARES, 20)),
                 observers=[(records if records is not None else []).append],
                 **options,
             )
@@ -135,7 +136,7 @@ def warm(offload: Offloader, function: Callable[..., Any] = doubled) -> None:
 
 
 def test_answers_come_in_the_order_of_the_items(make: Make) -> None:
-    """Whatever order and site they ran in; each one leaves a record with a decision by map and its reason."""
+    """The order and the sites of the runs do not matter; each task leaves a record with its reason."""
     records: list[Record] = []
     cloud, onboard = ScriptedRunner(CLOUD, answers(CLOUD)), ScriptedRunner(ONBOARD, answers(ONBOARD))
     offload = make(cloud, onboard, records=records)
@@ -148,7 +149,7 @@ def test_answers_come_in_the_order_of_the_items(make: Make) -> None:
 
 
 def test_an_item_is_the_argument_or_a_tuple_of_several(make: Make) -> None:
-    """A tuple is spread where the function takes several arguments, and is the one where it takes one."""
+    """A tuple is unpacked if the function takes several arguments, and is passed as it is otherwise."""
     offload = make(ScriptedRunner(ONBOARD, answers(ONBOARD)))
     assert offload.map(scaled, [(2, 3), 4, (5,)]) == [6, 4, 5]
     assert offload.map(first_of, [(7, 8)]) == [7]
@@ -157,8 +158,8 @@ def test_an_item_is_the_argument_or_a_tuple_of_several(make: Make) -> None:
         offload.map(scaled, [(1, 2), (1, 2, 3)])
 
 
-def test_the_first_error_is_raised_once_all_have_ended(make: Make) -> None:
-    """A task that fails costs the others nothing: all ran, and the first item's error is raised."""
+def test_the_first_error_is_raised_when_all_tasks_have_ended(make: Make) -> None:
+    """A failed task does not stop the others, and the error of the first failed item is raised."""
     cloud, onboard = ScriptedRunner(CLOUD, answers(CLOUD)), ScriptedRunner(ONBOARD, answers(ONBOARD))
     offload = make(cloud, onboard)
     with pytest.raises(TaskFailed, match=r"^ValueError: -2 is negative$"):
@@ -166,8 +167,8 @@ def test_the_first_error_is_raised_once_all_have_ended(make: Make) -> None:
     assert sorted(one.args[0] for one in cloud.tasks + onboard.tasks) == [-13, -2, 1, 5, 8]
 
 
-def test_every_site_is_warmed_up_with_tasks_of_its_own(make: Make) -> None:
-    """Of an unknown kind each site gets a few from all over the sizes, one at a time, none of them twice."""
+def test_every_site_is_warmed_up_with_different_tasks(make: Make) -> None:
+    """Each site first gets WARM_UP tasks of different sizes, one at a time, and no task runs twice."""
     records: list[Record] = []
     cloud, onboard = ScriptedRunner(CLOUD, answers(CLOUD)), ScriptedRunner(ONBOARD, answers(ONBOARD, 10.0))
     make(cloud, onboard, records=records).map(doubled, range(20, 60))
@@ -181,7 +182,7 @@ def test_every_site_is_warmed_up_with_tasks_of_its_own(make: Make) -> None:
 
 @pytest.fixture
 def mapped() -> Iterator[Mapped]:
-    """Maps in a thread, so that the test can release what is held."""
+    """Runs `map` in a thread, so that the test can release held tasks."""
     with ThreadPoolExecutor(1) as pool:
 
         def start(offload: Offloader, *args: Any, **options: Any) -> "Future[list[Any]]":
@@ -191,10 +192,12 @@ def mapped() -> Iterator[Mapped]:
 
 
 def test_the_largest_tasks_come_first(make: Make, mapped: Mapped) -> None:
-    """What takes long is not left for the end: the more tasks wait when one is placed, the larger it is."""
+    """The tasks start in the order of their size, so that no long task is left for the end."""
     records: list[Record] = []
     cloud = HeldRunner(CLOUD, answers(CLOUD))
-    offload = make(cloud, ScriptedRunner(ONBOARD, answers(ONBOARD, 0.01)), records=records)  # far too slow
+    offload = make(
+        cloud, ScriptedRunner(ONBOARD, answers(ONBOARD, 0.01)), records=records
+    )  # far too slow to get a task
     warm(offload)
     records.clear()
     cloud.holding = True
@@ -209,7 +212,7 @@ def test_the_largest_tasks_come_first(make: Make, mapped: Mapped) -> None:
 
 
 def test_a_server_never_has_more_than_its_limit(make: Make, mapped: Mapped) -> None:
-    """Its queue stays empty, so it gets more at once, up to the limit; onboard has one."""
+    """While its queue stays empty, a server gets more tasks at once, up to the limit; onboard gets one."""
     cloud, onboard = HeldRunner(CLOUD, answers(CLOUD)), HeldRunner(ONBOARD, answers(ONBOARD))
     offload = make(cloud, onboard)
     warm(offload)
@@ -227,7 +230,7 @@ def test_a_server_never_has_more_than_its_limit(make: Make, mapped: Mapped) -> N
 def straggling(
     make: Make, function: Callable[..., Any] = doubled, **options: Any
 ) -> tuple[Offloader, HeldRunner, HeldRunner, list[Record]]:
-    """A cloud that holds what it gets, an onboard as quick, and all second runs that may be saved up."""
+    """A cloud that holds its tasks, onboard with the same speed, and all second runs saved up."""
     records: list[Record] = []
     cloud, onboard = HeldRunner(CLOUD, answers(CLOUD)), HeldRunner(ONBOARD, answers(ONBOARD))
     offload = make(cloud, onboard, records=records, **options)
@@ -238,7 +241,7 @@ def straggling(
 
 
 def test_an_idle_site_takes_over_the_last_task(make: Make, mapped: Mapped) -> None:
-    """A server that does not answer is overtaken, in the one record of the task, and told to stop."""
+    """If a server does not answer, its run is overtaken and cancelled; the task has one record."""
     offload, cloud, onboard, records = straggling(make)
     before = len(onboard.tasks)
     assert mapped(offload, doubled, [2, 2]).result(WAIT_S) == [4, 4]
@@ -253,13 +256,13 @@ def test_an_idle_site_takes_over_the_last_task(make: Make, mapped: Mapped) -> No
     [(doubled, {"allowance": Allowance(duplicates=0.0)}), (stamp_once, {})],
     ids=["no allowance", "never twice"],
 )
-def test_no_task_runs_twice_where_none_may(
+def test_no_task_runs_twice_without_permission(
     make: Make,
     mapped: Mapped,
     function: Callable[..., Any],
     options: dict[str, Any],
 ) -> None:
-    """Without an allowance for second runs, and of a kind that allows none, the straggler is waited for."""
+    """Without an allowance, or with duplicate=False, the batch waits for the slow server."""
     offload, cloud, onboard, _ = straggling(make, function, **options)
     done = mapped(offload, function, [2, 2])
     cloud.wait_for(1)
@@ -272,8 +275,8 @@ def test_no_task_runs_twice_where_none_may(
     assert not cloud.cancelled
 
 
-def test_second_runs_are_paid_for(make: Make, mapped: Mapped) -> None:
-    """Take-overs come out of the allowance of all second runs."""
+def test_a_take_over_is_taken_from_the_allowance(make: Make, mapped: Mapped) -> None:
+    """A task that an idle site takes over costs one second run."""
     allowance = Allowance()
     offload, *_ = straggling(make, allowance=allowance)
     before = allowance.duplicates
@@ -282,8 +285,8 @@ def test_second_runs_are_paid_for(make: Make, mapped: Mapped) -> None:
     assert before - 1 <= allowance.duplicates < before - 0.5
 
 
-def test_a_pinned_batch_stays_where_it_was_pinned(make: Make) -> None:
-    """Onboard, in the cloud, or each on both; a site that is not there is the usual error, at once."""
+def test_a_pinned_batch_runs_on_its_site_only(make: Make) -> None:
+    """A batch can be pinned to onboard, the cloud or both; an unknown site is an error at once."""
     for where, sites in ((ONBOARD, [ONBOARD]), (CLOUD, [CLOUD]), ("both", [CLOUD, ONBOARD])):
         records: list[Record] = []
         offload = make(
@@ -297,8 +300,8 @@ def test_a_pinned_batch_stays_where_it_was_pinned(make: Make) -> None:
         offload.map(stamp_once, [1], where="both")
 
 
-def test_a_site_that_cannot_take_the_kind_is_left_out(make: Make) -> None:
-    """While it is absent onboard does the batch, also where it was pinned there, as with a single call."""
+def test_a_batch_leaves_out_an_unavailable_site(make: Make) -> None:
+    """While the cloud is absent, onboard runs the batch, even if it is pinned to the cloud."""
     cloud = ScriptedRunner(CLOUD, answers(CLOUD), unavailable="not connected")
     assert make(cloud, ScriptedRunner(ONBOARD, answers(ONBOARD))).map(doubled, range(20)) == [
         2 * one for one in range(20)
@@ -307,13 +310,13 @@ def test_a_site_that_cannot_take_the_kind_is_left_out(make: Make) -> None:
     assert make(cloud, ScriptedRunner(ONBOARD, answers(ONBOARD))).map(doubled, [1, 2], where=CLOUD) == [2, 4]
 
 
-def test_a_silent_site_is_left_out() -> None:
-    """Its heartbeats go unanswered: nothing is sent there."""
+def test_a_batch_leaves_out_a_silent_site() -> None:
+    """A site that does not answer heartbeats gets no task until it answers again."""
     cloud = ScriptedRunner(CLOUD, answers(CLOUD))
     offload = Offloader(
         [cloud, ScriptedRunner(ONBOARD, answers(ONBOARD, 1.0))],
         policy=policies.make(policies.DEFAULT),
-        predictor=lambda: predictors.make("average", 20),
+        memories=Memories(lambda: predictors.make("average", 20)),
     )
     with offload:
         warm(offload)
@@ -326,7 +329,7 @@ def test_a_silent_site_is_left_out() -> None:
 
 
 def test_caps_hold_for_a_batch(make: Make) -> None:
-    """Without bytes left in this minute every task runs onboard, but those that are under way by then."""
+    """When no bytes are left in this minute, all further tasks run onboard."""
     cloud = ScriptedRunner(CLOUD, answers(CLOUD, bytes_out=1000))
     offload = make(
         cloud, ScriptedRunner(ONBOARD, answers(ONBOARD, 1.0)), allowance=Allowance(bytes_a_minute=10_000)
@@ -341,7 +344,7 @@ def test_caps_hold_for_a_batch(make: Make) -> None:
 
 @pytest.mark.parametrize("failure", [CloudBroken("gone"), CloudTimeout("late")])
 def test_a_failing_site_costs_no_answer(make: Make, failure: Exception) -> None:
-    """What fails there runs onboard, and the batch is whole."""
+    """Tasks that fail in the cloud run onboard, and the batch has all its results."""
     records: list[Record] = []
     cloud = ScriptedRunner(CLOUD, lambda _: Execution(CLOUD, 2.0, failure=failure))  # type: ignore[arg-type]
     offload = make(cloud, ScriptedRunner(ONBOARD, answers(ONBOARD)), records=records)
@@ -351,7 +354,7 @@ def test_a_failing_site_costs_no_answer(make: Make, failure: Exception) -> None:
 
 
 def test_observers_and_last_see_every_task(make: Make) -> None:
-    """A record for each, numbered once, and the last of them is `last`."""
+    """Every task has one record with its own number, and `last` is one of them."""
     records: list[Record] = []
     offload = make(
         ScriptedRunner(CLOUD, answers(CLOUD)), ScriptedRunner(ONBOARD, answers(ONBOARD)), records=records

@@ -1,4 +1,4 @@
-"""Intervals that hold what they say."""
+"""Adaptive intervals hold nine of ten times, and the errors that they learn say when a task is late."""
 
 import math
 from collections.abc import Callable
@@ -6,11 +6,12 @@ from random import Random
 
 import pytest
 
-from offboard.robot_client.learning.intervals import COVERAGE, SCORES_MAX, SCORES_MIN, Conformal
+from offboard.robot_client.learning.conformal import COVERAGE, ERRORS_MAX, Conformal
+from offboard.robot_client.policies.forecast import ERRORS_MIN, NO_ERRORS
 
 TASKS = 6_000
 
-Draw = Callable[[Random, int], tuple[float, float]]  # of task i: predicted and true seconds
+Draw = Callable[[Random, int], tuple[float, float]]  # predicted and true seconds of task i
 
 
 def normal(rng: Random, _: int) -> tuple[float, float]:
@@ -24,28 +25,28 @@ def skewed(rng: Random, _: int) -> tuple[float, float]:
 
 
 def drifting(rng: Random, i: int) -> tuple[float, float]:
-    """The error's mean swings, and its spread grows fivefold over the stream."""
+    """The mean of the error swings, and its spread grows fivefold over the run."""
     predicted = rng.uniform(0.05, 0.5)
     error = 0.2 * math.sin(i / 150) + rng.gauss(0, 0.05 + 0.2 * i / TASKS)
     return predicted, max(0.0, predicted * (1 + error))
 
 
 def stepping(rng: Random, i: int) -> tuple[float, float]:
-    """Every 500 tasks the site is twice as slow as predicted, or again as it was."""
+    """Every 500 tasks the site becomes twice as slow as predicted, or returns to its old speed."""
     predicted = rng.uniform(0.05, 0.5)
     return predicted, predicted * (1 + i // 500 % 2) * rng.lognormvariate(0, 0.1)
 
 
 def widening(rng: Random, i: int) -> tuple[float, float]:
-    """The noise doubles every 50 tasks: what is remembered alone would hold 81 %."""
+    """The noise doubles every 50 tasks: an interval over the remembered errors alone would hold 81 %."""
     predicted = rng.uniform(0.05, 0.5)
     return predicted, max(0.0, predicted * (1 + rng.gauss(0, 0.02 * 2 ** (i % 250 / 50))))
 
 
 @pytest.mark.parametrize("draw", [normal, skewed, drifting, stepping, widening])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_nine_of_ten_times_are_inside(draw: Draw, seed: int) -> None:
-    """Over 6,000 tasks the realised share is within 3 points of 90 %, at constant and changing noise."""
+def test_nine_of_ten_times_are_inside_the_interval(draw: Draw, seed: int) -> None:
+    """Over 6,000 tasks the share inside is within 3 points of 90 %, with constant and with changing noise."""
     rng, conformal, inside, asked = Random(seed), Conformal(), 0, 0
     for i in range(TASKS):
         predicted, seconds = draw(rng, i)
@@ -54,30 +55,30 @@ def test_nine_of_ten_times_are_inside(draw: Draw, seed: int) -> None:
             asked += 1
             inside += ends[0] <= seconds <= ends[1]
         conformal.learn(predicted, seconds)
-    assert asked == TASKS - SCORES_MIN - 1
+    assert asked == TASKS - ERRORS_MIN - 1
     assert inside / asked == pytest.approx(COVERAGE, abs=0.03)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_what_is_given_up_past_the_end_is_among_the_one_of_ten(seed: int) -> None:
-    """One run in 20 stalls and is given up: with those counted as missed nine of ten are inside."""
+def test_a_task_stopped_after_the_upper_end_counts_as_outside(seed: int) -> None:
+    """One run in 20 hangs and is stopped; with these counted as outside, nine of ten times are inside."""
     rng, conformal, inside, asked = Random(seed), Conformal(), 0, 0
     for i in range(TASKS):
         predicted, seconds = normal(rng, i)
         ends = conformal.interval(predicted, None)
-        stalls = ends is not None and rng.random() < 0.05
+        hangs = ends is not None and rng.random() < 0.05
         if ends is not None:
             asked += 1
-            inside += not stalls and ends[0] <= seconds <= ends[1]
-        if stalls:
+            inside += not hangs and ends[0] <= seconds <= ends[1]
+        if hangs:
             conformal.miss()
         else:
             conformal.learn(predicted, seconds)
     assert inside / asked == pytest.approx(COVERAGE, abs=0.015)
 
 
-def test_of_normal_errors_the_width_is_that_of_the_normal_interval() -> None:
-    """With a constant prediction it comes to 2 x 1.645 standard deviations, to a quarter."""
+def test_normal_errors_give_the_width_of_a_normal_interval() -> None:
+    """With a constant prediction the width is 2 x 1.645 standard deviations, to a quarter."""
     rng, conformal, widths = Random(3), Conformal(), []
     for i in range(3_000):
         ends = conformal.interval(0.5, None)
@@ -87,8 +88,8 @@ def test_of_normal_errors_the_width_is_that_of_the_normal_interval() -> None:
     assert sum(widths) / len(widths) == pytest.approx(2 * 1.645 * 0.02, rel=0.25)
 
 
-def test_of_skewed_errors_the_upper_side_is_wider() -> None:
-    """Each end has a level of its own, as times have a tail on one side."""
+def test_skewed_errors_make_the_upper_side_wider() -> None:
+    """The interval is not symmetric: times have a tail on one side."""
     rng, conformal = Random(4), Conformal()
     for _ in range(500):
         conformal.learn(0.5, 0.5 * rng.lognormvariate(0, 0.6))
@@ -98,8 +99,8 @@ def test_of_skewed_errors_the_upper_side_is_wider() -> None:
 
 
 @pytest.mark.parametrize("draw", [normal, skewed, drifting, stepping])
-def test_the_ends_are_in_order_around_the_prediction(draw: Draw) -> None:
-    """0 <= low <= predicted <= high, all finite, at every step and also for predictions never seen."""
+def test_the_prediction_is_inside_its_interval(draw: Draw) -> None:
+    """0 <= low <= predicted <= high, all finite, after every task and for predictions never seen before."""
     rng, conformal = Random(5), Conformal()
     for i in range(1_000):
         predicted, seconds = draw(rng, i)
@@ -110,57 +111,72 @@ def test_the_ends_are_in_order_around_the_prediction(draw: Draw) -> None:
         conformal.learn(predicted, seconds)
 
 
-def test_before_it_knows_enough_the_spread_tells() -> None:
-    """Below ten errors the interval is the normal one, not below 0; without a spread there is none."""
+def test_with_few_errors_the_spread_gives_the_interval() -> None:
+    """With fewer than ten errors the interval is the normal one, cut at 0; without a spread there is none."""
     conformal = Conformal()
-    for _ in range(SCORES_MIN):
+    for _ in range(ERRORS_MIN):
         assert conformal.interval(0.5, None) is None
         assert conformal.interval(0.5, 0.1) == pytest.approx((0.5 - 0.1645, 0.5 + 0.1645))
         assert conformal.interval(0.1, 0.1) == pytest.approx((0.0, 0.2645))
         conformal.learn(0.5, 0.5)
 
 
-def test_memory_is_bounded() -> None:
-    """However many tasks it learnt from, the last SCORES_MAX errors are kept, and no others count."""
+def test_old_errors_are_forgotten() -> None:
+    """However many tasks were learnt, only the last ERRORS_MAX errors count."""
     conformal = Conformal()
     for _ in range(1_000):
         conformal.learn(0.5, 5.0)
-    for _ in range(SCORES_MAX):
+    for _ in range(ERRORS_MAX):
         conformal.learn(0.5, 0.5)
-    assert len(conformal._sorted) == len(conformal._order) == SCORES_MAX
-    assert sorted(conformal._order) == conformal._sorted
+    assert conformal.errors.scores == (0.0,) * ERRORS_MAX
     ends = conformal.interval(0.5, None)
     assert ends is not None
-    assert ends[1] < 0.6, "all that it remembers was exact"
+    assert ends[1] < 0.6, "all remembered errors are 0"
+
+
+def test_the_errors_are_a_value() -> None:
+    """What was read before is not changed by what is learnt later, and is made once until then."""
+    conformal = Conformal()
+    assert conformal.errors == NO_ERRORS
+    for n in range(20):
+        conformal.learn(0.5, 0.5 + 0.01 * n)
+    before = conformal.errors
+    assert conformal.errors is before
+    scores = before.scores
+    conformal.learn(0.5, 9.0)
+    assert before.scores == scores
+    assert conformal.errors.scores != scores
+    assert list(conformal.errors.scores) == sorted(conformal.errors.scores)
 
 
 def test_the_share_above_a_limit_is_that_of_the_errors() -> None:
-    """Of times spread evenly from 0.4 to 0.6 s half are above 0.5 s, hardly any above 0.7."""
+    """If times are spread evenly from 0.4 to 0.6 s, half are above 0.5 s and hardly any above 0.7 s."""
     rng, conformal = Random(6), Conformal()
-    assert conformal.share_above(0.5, 0.6) is None
+    assert conformal.errors.share_above(0.5, 0.6) is None
     for _ in range(1_000):
         conformal.learn(0.5, rng.uniform(0.4, 0.6))
+    errors = conformal.errors
     for limit, share in ((0.3, 1.0), (0.5, 0.5), (0.55, 0.25), (0.7, 0.0)):
-        assert conformal.share_above(0.5, limit) == pytest.approx(share, abs=0.1)
-    assert 0 < (conformal.share_above(0.5, 50.0) or 0) < 0.01, "nothing is certain"
+        assert errors.share_above(0.5, limit) == pytest.approx(share, abs=0.1)
+    assert 0 < (errors.share_above(0.5, 50.0) or 0) < 0.01, "nothing is certain"
 
 
-def test_a_late_task_is_overdue_where_waiting_on_is_worth_least() -> None:
-    """Times around 1 s and some around 20 s: beyond the first ones, and not while it may still be one."""
+def test_a_task_is_overdue_when_waiting_costs_more_than_the_other_site() -> None:
+    """Most tasks take about 1 s, some 20 s: a task is overdue soon after 1 s, unless 60 s are at stake."""
     conformal, random = Conformal(), Random(1)
     for n in range(100):
         conformal.learn(1.0, 20.0 if n % 25 == 24 else random.uniform(0.8, 1.2))
-    after_s = conformal.overdue(1.0, worth_s=2.0)
+    after_s = conformal.errors.overdue(1.0, worth_s=2.0)
     assert after_s is not None
     assert 1.15 < after_s < 1.5
-    alone = conformal.overdue(1.0, worth_s=60.0)
-    assert alone is not None
-    assert alone > 20.0, "nothing else is worth so much"
-    assert Conformal().overdue(1.0, 2.0) is None
+    at_last_s = conformal.errors.overdue(1.0, worth_s=60.0)
+    assert at_last_s is not None
+    assert at_last_s > 20.0, "no known task needed 60 s more"
+    assert NO_ERRORS.overdue(1.0, 2.0) is None
 
 
 def test_units_do_not_matter() -> None:
-    """Milliseconds for seconds scale the interval alike."""
+    """Times in milliseconds instead of seconds scale the interval by the same factor."""
     small, large = Conformal(), Conformal()
     rng = Random(7)
     for i in range(300):

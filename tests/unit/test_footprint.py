@@ -1,4 +1,4 @@
-"""What an offloader costs, counted: it holds no more the more tasks it has run, and calls few functions."""
+"""What an offloader costs: its memory does not grow with the tasks, and each task calls few functions."""
 
 import gc
 import sys
@@ -12,10 +12,11 @@ import pytest
 from benchmarks.decision import InstantRunner
 from offboard.common.tasks import Task, task
 from offboard.robot_client import policies, predictors
+from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 
-GROWTH_BYTES = 20_000  # of a few megabytes: dictionaries that are made anew, caches of small numbers
+GROWTH_BYTES = 20_000  # of a few megabytes: resized dictionaries, caches of small numbers
 CALLS_MAX = {"paper": 190, policies.DEFAULT: 290}
 
 
@@ -43,15 +44,17 @@ def offloader(policy: str) -> Offloader:
     return Offloader(
         [Forgetful(ONBOARD), Forgetful(CLOUD)],
         policy=policies.make(policy),
-        predictor=lambda: predictors.make(name.removeprefix(predictors.WORK), 50),
-        shared_work=name.startswith(predictors.WORK),
+        memories=Memories(
+            lambda: predictors.make(name.removeprefix(predictors.WORK), 50),
+            shared_work=name.startswith(predictors.WORK),
+        ),
     )
 
 
-@pytest.mark.timeout(60)  # traced, it takes some seconds
+@pytest.mark.timeout(60)  # slow because memory is traced
 @pytest.mark.parametrize("policy", ["paper", policies.DEFAULT])
 def test_memory_does_not_grow_with_the_tasks(policy: str) -> None:
-    """After 7,500 tasks as much is held as after 5,000, when a site seldom used has all kept of it."""
+    """After 5,000 tasks even a rarely used site is full, so 2,500 more tasks take no more memory."""
     random, held = Random(1), []
     with offloader(policy) as offload:
         tracemalloc.start()
@@ -66,8 +69,8 @@ def test_memory_does_not_grow_with_the_tasks(policy: str) -> None:
 
 
 @pytest.mark.parametrize(("policy", "calls_max"), CALLS_MAX.items())
-def test_a_task_is_few_calls(policy: str, calls_max: int) -> None:
-    """So many Python functions are called from a task to its answer, whatever is known by then."""
+def test_a_task_calls_few_functions(policy: str, calls_max: int) -> None:
+    """The mean number of Python functions called for a task is at most CALLS_MAX."""
     random, calls = Random(1), 0
 
     def count(_frame: FrameType, event: str, _argument: object) -> None:

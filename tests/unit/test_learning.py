@@ -1,4 +1,4 @@
-"""When executions are learnt: news at once, what went as expected together while a task is under way."""
+"""When executions are learnt: surprises at once, expected times together while a task is under way."""
 
 from collections.abc import Callable
 from random import Random
@@ -6,17 +6,19 @@ from random import Random
 import pytest
 
 from offboard.common.errors import CloudTimeout, OffloadError
-from offboard.common.tasks import task
+from offboard.common.tasks import kind_of, task
 from offboard.robot_client import policies, predictors
-from offboard.robot_client.learning.kind import SiteMemory
-from offboard.robot_client.learning.lessons import TOGETHER
-from offboard.robot_client.offloader import BOTH, Offloader
+from offboard.robot_client.learning.learner import TOGETHER
+from offboard.robot_client.learning.memories import Memories
+from offboard.robot_client.learning.site import SiteMemory
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import BOTH
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.predictors import AVERAGE, LEAST_SQUARES
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.virtual import VirtualClock, VirtualRunner
 
-ONBOARD_S, CLOUD_S = 0.1, 0.05  # a unit of size
+ONBOARD_S, CLOUD_S = 0.1, 0.05  # per unit of size
 WARM = 40
 
 
@@ -26,26 +28,27 @@ def learning_echo(number: float) -> float:
 
 
 class Scene:
-    """A robot that knows both sites; tasks are pinned to a site, and each next one has another size."""
+    """A robot that knows both sites; tasks of random sizes are pinned to a site."""
 
     def __init__(self, predictor: str = AVERAGE, allowance: Allowance | None = None) -> None:
         self.clock = VirtualClock()
         self.sites = {site: VirtualRunner(site, self.clock) for site in (ONBOARD, CLOUD)}
         self.random = Random(1)
+        self.memories = Memories(lambda: predictors.make(predictor, 20))
         self.offload = Offloader(
             list(self.sites.values()),
             policy=policies.make("greedy"),
-            predictor=lambda: predictors.make(predictor, 20),
+            memories=self.memories,
             allowance=allowance,
             clock=self.clock,
         )
         for _ in range(WARM):
             self.ask(ONBOARD)
             self.ask(CLOUD)
-        self.offload._learning.catch_up()
+        self.offload._learner.catch_up()
 
     def ask(self, where: str = CLOUD, times: float = 1.0, failure: OffloadError | None = None) -> None:
-        """A task that takes so many times as long as it should."""
+        """Run a task that takes `times` as long as predicted."""
         size = self.random.uniform(1.0, 2.0)
         for site, seconds in ((ONBOARD, ONBOARD_S), (CLOUD, CLOUD_S)):
             noise = self.random.uniform(0.98, 1.02)
@@ -56,14 +59,14 @@ class Scene:
             runner.scripts.clear()
 
     def site(self, name: str = CLOUD) -> SiteMemory:
-        return self.offload._memories["learning_echo"].site(name)
+        return self.memories.of(kind_of(learning_echo), self.sites).site(name)
 
     def learnt(self, name: str = CLOUD) -> int:
         return len(self.site(name).observations) - WARM
 
 
-def test_what_goes_as_expected_is_learnt_together_while_the_next_task_is_under_way() -> None:
-    """TOGETHER tasks wait; the next one has been sent when they are learnt, before its answer is there."""
+def test_expected_times_are_learnt_together_while_the_next_task_is_under_way() -> None:
+    """TOGETHER times are learnt after the next task was sent, and before its answer is there."""
     scene = Scene()
     for _ in range(TOGETHER):
         scene.ask()
@@ -84,8 +87,8 @@ def test_what_goes_as_expected_is_learnt_together_while_the_next_task_is_under_w
         pytest.param(lambda scene: scene.ask(failure=CloudTimeout("late"), times=9.0), id="failed"),
     ],
 )
-def test_news_are_learnt_at_once_and_after_what_waited(news: Callable[[Scene], None]) -> None:
-    """A run that failed, was late or early, or came with another site's, is known to the next decision."""
+def test_surprises_are_learnt_at_once_after_the_times_that_wait(news: Callable[[Scene], None]) -> None:
+    """The next decision knows a run that failed, was late or early, or ran on both sites."""
     scene = Scene()
     scene.ask(), scene.ask()
     assert scene.learnt() == 0
@@ -95,8 +98,8 @@ def test_news_are_learnt_at_once_and_after_what_waited(news: Callable[[Scene], N
     assert sizes[-3:] == [one.size for one in scene.sites[CLOUD].tasks[-3:]]
 
 
-def test_a_site_that_comes_into_use_again_is_learnt_at_once() -> None:
-    """However well it was foretold, it is the first that was heard of it for a while."""
+def test_the_first_time_of_a_site_after_a_pause_is_learnt_at_once() -> None:
+    """Even if it was predicted well, it is the first time of this site for some tasks."""
     scene = Scene()
     for _ in range(2 * TOGETHER):
         scene.ask(ONBOARD)
@@ -105,24 +108,24 @@ def test_a_site_that_comes_into_use_again_is_learnt_at_once() -> None:
 
 
 def test_the_published_rule_learns_each_task_before_the_next() -> None:
-    """As in the paper's Algorithm 1: its windows wait for nothing."""
+    """As in Algorithm 1, the windows of least squares hold every time before the next task."""
     scene = Scene(LEAST_SQUARES)
     for n in range(1, TOGETHER + 3):
         scene.ask()
         assert scene.learnt() == n
 
 
-def test_waiting_changes_neither_what_is_learnt_nor_how_old_it_is() -> None:
-    """Together or one by one: the same observations, predictions and ages."""
+def test_learning_together_gives_the_same_result() -> None:
+    """Observations, predictions and ages are the same as if each time were learnt at once."""
     waiting, prompt = Scene(), Scene()
     for n in range(5 * TOGETHER + 1):
         where = ONBOARD if n % 7 == 0 else CLOUD
         for scene in (waiting, prompt):
             scene.ask(where)
-        prompt.offload._learning.catch_up()
+        prompt.offload._learner.catch_up()
         for site in (ONBOARD, CLOUD):
             assert waiting.site(site).age == prompt.site(site).age
-    waiting.offload._learning.catch_up()
+    waiting.offload._learner.catch_up()
     for site in (ONBOARD, CLOUD):
         one, other = waiting.site(site), prompt.site(site)
         assert [(o.seconds, o.ahead) for o in one.observations] == [
@@ -131,8 +134,8 @@ def test_waiting_changes_neither_what_is_learnt_nor_how_old_it_is() -> None:
         assert one.predictor.predict(1.5, 1) == other.predictor.predict(1.5, 1)
 
 
-def test_what_waits_is_learnt_at_the_end() -> None:
-    """The memory file of a robot that ends holds all of its tasks."""
+def test_times_that_wait_are_learnt_at_the_end() -> None:
+    """`close` learns all times, so that the memory file holds all tasks."""
     scene = Scene()
     scene.ask()
     assert scene.learnt() == 0
@@ -140,11 +143,12 @@ def test_what_waits_is_learnt_at_the_end() -> None:
     assert scene.learnt() == 1
 
 
-def test_bytes_are_counted_at_once() -> None:
-    """A cap holds for the next task, whenever this one is learnt."""
-    scene = Scene(allowance=Allowance(bytes_a_minute=1e6))
+def test_bytes_are_taken_from_the_caps_at_once() -> None:
+    """The caps count a task when it ends, even if its time is learnt later."""
+    allowance = Allowance(bytes_a_minute=1e6)
+    scene = Scene(allowance=allowance)
     scene.sites[CLOUD].fields = {"bytes_out": 1000, "bytes_in": 0}
-    before = scene.offload._allowance.bytes_left
+    before = allowance.bytes_left
     scene.ask()
     assert scene.learnt() == 0
-    assert scene.offload._allowance.bytes_left < before
+    assert allowance.bytes_left < before

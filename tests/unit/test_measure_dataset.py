@@ -29,7 +29,7 @@ def test_exported_rows_are_read_back_exactly(tmp_path: Path) -> None:
     for i in range(5):
         sites = {"onboard": 0.1 + i / 3, "cloud": 0.2 + i / 7} if i != 2 else {"onboard": 0.1}
         executions = tuple(Execution(site, seconds) for site, seconds in sites.items())
-        decision = Decision("onboard", len(sites) > 1, "", "pinned")
+        decision = Decision("onboard", "", "pinned", both=len(sites) > 1)
         trace.write(Record(i, str(i), "plan", i / 9, {}, decision, executions, "onboard", 0.1))
     trace.close()
     out = tmp_path / "new" / "d.csv"

@@ -16,7 +16,7 @@ HEADER = "size,onboard_s,cloud_s\n"
 
 
 def record(i: int, *executions: Execution, size: float = 1.0, kind: str = "plan_path") -> Record:
-    decision = Decision(ONBOARD, len(executions) > 1, "test", "paper")
+    decision = Decision(ONBOARD, "test", "paper", both=len(executions) > 1)
     return Record(i, str(i), kind, size, {}, decision, executions, ONBOARD, 0.1)
 
 

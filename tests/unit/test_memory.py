@@ -1,4 +1,4 @@
-"""What a kind's memory learns of each execution, and what it says of a site."""
+"""What the memory of a kind learns from each execution, and what it then knows of a site."""
 
 import math
 from random import Random
@@ -8,7 +8,8 @@ import pytest
 from offboard.common.errors import CloudBroken, CloudBusy, CloudError, CloudTimeout, Overtaken, TaskFailed
 from offboard.common.tasks import kind_of, task
 from offboard.robot_client import predictors
-from offboard.robot_client.learning.kind import WAY_LEAST_OF, KindMemory
+from offboard.robot_client.learning.kind import KindMemory
+from offboard.robot_client.learning.site import WAYS_MAX
 from offboard.robot_client.policies import Outlook, objectives
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.sites.own_cpu import LATE_MAX
@@ -49,12 +50,12 @@ def learn(
 ) -> None:
     site = of.site(execution.site)
     expected = outlook(of, execution.site, condition, in_flight=in_flight)
-    of.pass_by()
+    of.count_task()
     site.learn(1.0, execution, expected, silent=silent, size=1.0, beside=beside)
 
 
 def known(predictor: str = predictors.AVERAGE) -> KindMemory:
-    """The cloud takes 0.2 s."""
+    """A memory that knows that the cloud takes 0.2 s."""
     one = memory(predictor)
     for _ in range(20):
         learn(one, Execution(CLOUD, 0.2))
@@ -66,8 +67,8 @@ def lost(failure: CloudError, seconds: float) -> Execution:
 
 
 @pytest.mark.parametrize("failure", [CloudBusy("full"), CloudBroken("gone"), CloudTimeout("late")])
-def test_a_site_that_refuses_at_once_is_not_taken_for_a_fast_one(failure: CloudError) -> None:
-    """The time until a refusal, or until a short budget was over, is no time of a task: predictions stay."""
+def test_a_site_that_refuses_at_once_does_not_look_fast(failure: CloudError) -> None:
+    """The time until a refusal, or until a short timeout, does not change the predictions."""
     one = known()
     for n in range(50):
         learn(one, lost(failure, 0.004))
@@ -79,8 +80,8 @@ def test_a_site_that_refuses_at_once_is_not_taken_for_a_fast_one(failure: CloudE
     assert outlook(fresh).predicted_s is None
 
 
-def test_by_the_published_rule_every_lost_time_is_learnt() -> None:
-    """A plain predictor learns the time until the run was given up, however short."""
+def test_a_plain_predictor_learns_every_lost_time() -> None:
+    """The published rule learns the time until the run was given up, however short it is."""
     one = memory(predictors.LEAST_SQUARES)
     learn(one, lost(CloudBusy("full"), 0.004))
     assert outlook(one).predicted_s == 0.004
@@ -97,7 +98,7 @@ def test_a_lost_time_that_is_longer_than_expected_is_learnt() -> None:
 
 
 def test_an_overtaken_run_takes_at_least_what_was_expected() -> None:
-    """Given up early it teaches the prediction itself, given up late its own time; and it is no failure."""
+    """Stopped early it changes no prediction, stopped late its time is learnt; it is never a failure."""
     one = known()
     for _ in range(20):
         learn(one, lost(Overtaken("late"), 0.05))
@@ -111,7 +112,7 @@ def test_an_overtaken_run_takes_at_least_what_was_expected() -> None:
 
 
 def width(of: KindMemory) -> float:
-    """Of the interval, over the predicted time."""
+    """The width of the interval over the predicted time."""
     found = outlook(of)
     assert found.predicted_s is not None
     assert found.low_s is not None
@@ -119,8 +120,8 @@ def width(of: KindMemory) -> float:
     return (found.high_s - found.low_s) / found.predicted_s
 
 
-def test_runs_that_are_given_up_past_their_interval_widen_it() -> None:
-    """They missed it; of one that is given up before its end nothing is known."""
+def test_runs_that_are_stopped_after_their_interval_widen_it() -> None:
+    """They missed the interval; a run that is stopped inside the interval says nothing."""
     rng, one = Random(1), memory()
     for _ in range(60):
         learn(one, Execution(CLOUD, 0.2 + rng.gauss(0, 0.01)))
@@ -136,16 +137,16 @@ def test_runs_that_are_given_up_past_their_interval_widen_it() -> None:
 @pytest.mark.parametrize(
     ("predictor", "seconds", "run_s", "learnt_s"),
     [
-        (predictors.AVERAGE, 0.3, None, 0.2),  # heard late, perhaps
-        (predictors.AVERAGE, 0.1, None, 0.1),  # quicker than expected, however late it was heard
-        (predictors.AVERAGE, 0.39, 0.3, 0.3),  # the server says that it took longer
-        ("least-squares", 0.3, None, 0.3),  # learns what is measured
+        (predictors.AVERAGE, 0.3, None, 0.2),  # the answer may have been received late
+        (predictors.AVERAGE, 0.1, None, 0.1),  # faster than predicted, even if it was received late
+        (predictors.AVERAGE, 0.39, 0.3, 0.3),  # the server reports that it took longer
+        ("least-squares", 0.3, None, 0.3),  # learns the measured time
     ],
 )
-def test_what_was_heard_beside_an_own_run_is_a_bound(
+def test_the_time_of_a_server_during_an_onboard_run_is_an_upper_bound(
     predictor: str, seconds: float, run_s: float | None, learnt_s: float
 ) -> None:
-    """To a predictor of measured features; it is news of the site all the same."""
+    """This holds for predictors of measured features; the age of the site starts anew in any case."""
     one = known(predictor)
     for _ in range(100):
         learn(one, Execution(CLOUD, seconds, run_s=run_s), beside=True)
@@ -153,19 +154,19 @@ def test_what_was_heard_beside_an_own_run_is_a_bound(
     assert outlook(one).predicted_s == pytest.approx(learnt_s, rel=0.05)
 
 
-def test_probes_heard_late_lower_what_was_too_high() -> None:
-    """To the server's part, the round trip and the shortest of the last ways, though most were held up."""
+def test_probes_that_were_received_late_still_lower_a_prediction() -> None:
+    """The prediction becomes the time of the server, the round trip and the shortest of the last ways."""
     one, near = memory(), Condition(round_trip_s=0.03)
     for _ in range(20):
         learn(one, Execution(CLOUD, 0.05, run_s=0.003), condition=near)
     for n in range(40):
-        seconds = 0.055 if n % WAY_LEAST_OF else 0.035
+        seconds = 0.055 if n % WAYS_MAX else 0.035
         learn(one, Execution(CLOUD, seconds, run_s=0.003), condition=near, beside=True)
     assert outlook(one, condition=near).predicted_s == pytest.approx(0.035, rel=0.05)
 
 
-def test_half_of_the_least_that_a_site_ran_is_no_guess() -> None:
-    """Only what is smaller is; nothing is too small for a site that ran such a task, or none."""
+def test_a_task_below_half_of_the_smallest_is_marked() -> None:
+    """`smallest` is true only below SMALL of the smallest amount that the site ran."""
     site = memory().site(CLOUD)
     for ran, asked, smallest in ((None, 0.1, False), (1.0, 0.5, False), (1.0, 0.4, True), (0.4, 0.4, False)):
         if ran is not None:
@@ -174,8 +175,8 @@ def test_half_of_the_least_that_a_site_ran_is_no_guess() -> None:
         assert found.smallest == smallest, (ran, asked)
 
 
-def test_own_runs_do_not_explain_what_is_far_later() -> None:
-    """Beyond LATE_MAX times as long as expected it is learnt."""
+def test_an_onboard_run_does_not_explain_a_very_late_answer() -> None:
+    """A time above LATE_MAX times the prediction is learnt."""
     one = known()
     learn(one, Execution(CLOUD, 1.01 * LATE_MAX * 0.2), beside=True)
     found = outlook(one).predicted_s
@@ -184,7 +185,7 @@ def test_own_runs_do_not_explain_what_is_far_later() -> None:
 
 
 def test_failures_of_a_silent_site_teach_nothing() -> None:
-    """While heartbeats go unanswered the timeout is expected anyway, and over when they are heard again."""
+    """A silent site is predicted to take the timeout, and its old time when it answers again."""
     one = known()
     for _ in range(30):
         learn(one, lost(CloudTimeout("late"), 2.0), silent=True, condition=SILENT)
@@ -192,17 +193,17 @@ def test_failures_of_a_silent_site_teach_nothing() -> None:
     assert outlook(one).predicted_s == pytest.approx(0.2)
 
 
-def test_the_tasks_own_failure_is_no_time() -> None:
-    """It is news of the site and nothing else."""
+def test_a_failure_of_the_task_itself_changes_no_prediction() -> None:
+    """It is no failure of the site, and the age of the site starts anew."""
     one = known()
-    one.pass_by()
+    one.count_task()
     learn(one, Execution(CLOUD, 0.001, failure=TaskFailed("no")))
     assert outlook(one).predicted_s == pytest.approx(0.2)
     assert (outlook(one).age, outlook(one).failures) == (0, 0)
 
 
-def test_age_counts_tasks_without_news() -> None:
-    """Of each site by itself."""
+def test_age_counts_tasks_since_a_site_ran_one() -> None:
+    """Each site has its own age."""
     one = known()
     learn(one, Execution(ONBOARD, 0.5))
     for _ in range(3):
@@ -210,8 +211,8 @@ def test_age_counts_tasks_without_news() -> None:
     assert (outlook(one, CLOUD).age, outlook(one, ONBOARD).age) == (4, 0)
 
 
-def test_own_waiting_is_added_and_not_learnt() -> None:
-    """Time in the robot's own queue is told by what is under way: learnt is the run alone."""
+def test_the_wait_for_own_tasks_is_predicted_but_not_learnt() -> None:
+    """The tasks under way say how long the wait is, so only the run itself is learnt."""
     one = memory()
     for _ in range(10):
         learn(one, Execution(ONBOARD, 0.7, queue_s=0.5), in_flight=1)
@@ -219,20 +220,20 @@ def test_own_waiting_is_added_and_not_learnt() -> None:
     assert outlook(one, ONBOARD, Condition(wait_s=0.3)).predicted_s == pytest.approx(0.5)
 
 
-def test_time_until_a_run_begins_with_nothing_before_it_is_learnt() -> None:
-    """The robot's CPU was not to be had: that is what a run onboard takes."""
+def test_the_wait_for_the_cpu_is_learnt() -> None:
+    """If no own task was before it, a run that waits for the CPU takes this long onboard."""
     one = memory()
     for _ in range(10):
         learn(one, Execution(ONBOARD, 0.7, queue_s=0.5))
     assert outlook(one, ONBOARD).predicted_s == pytest.approx(0.7)
 
 
-def test_work_is_told_by_results_and_shared() -> None:
-    """One result on any site tells all of them what a size is; a failed run tells nothing."""
+def test_the_work_of_a_size_is_shared_by_all_sites() -> None:
+    """A result from any site says the work of a size for all of them; a failed run does not."""
     one = memory(shared_work=True)
     assert one.amount(3.0) is None
-    assert one.work_told([lost(CloudTimeout("late"), 2.0)]) is None
-    told = one.work_told([lost(CloudTimeout("late"), 2.0), Execution(ONBOARD, 0.1, {"work": 30.0})])
+    assert one.work_of_any([lost(CloudTimeout("late"), 2.0)]) is None
+    told = one.work_of_any([lost(CloudTimeout("late"), 2.0), Execution(ONBOARD, 0.1, {"work": 30.0})])
     assert told == 30.0
     one.learn_size(3.0, told)
     assert one.amount(3.0) == 30.0
@@ -240,14 +241,14 @@ def test_work_is_told_by_results_and_shared() -> None:
 
 
 def test_a_work_function_that_fails_costs_no_answer(caplog: pytest.LogCaptureFixture) -> None:
-    """It is the user's own: logged, and the work unknown."""
+    """The failure is logged, and the work is unknown."""
     one = memory(shared_work=True)
-    assert one.work_told([Execution(ONBOARD, 0.1, {})]) is None
-    assert "cannot be told" in caplog.text
+    assert one.work_of_any([Execution(ONBOARD, 0.1, {})]) is None
+    assert "cannot read the work" in caplog.text
 
 
-def test_bytes_and_joules_are_those_that_were_usual() -> None:
-    """The mean of the first ones, then one that fades; joules onboard by CPU time, away by bytes."""
+def test_bytes_and_joules_are_the_usual_ones() -> None:
+    """Bytes are a running mean; joules come from CPU time onboard, and from bytes on a server."""
     one = memory()
     for bytes_out in (100, 300):
         learn(one, Execution(CLOUD, 0.2, bytes_out=bytes_out, bytes_in=50))
@@ -259,8 +260,8 @@ def test_bytes_and_joules_are_those_that_were_usual() -> None:
     assert math.isfinite(outlook(one, ONBOARD).cost or 0.0)
 
 
-def test_what_a_server_takes_while_the_robot_is_loaded_is_learnt_apart() -> None:
-    """What is expected of it after that is what it was before; and while it lasts, what it was meanwhile."""
+def test_times_of_a_server_under_load_of_the_robot_are_learnt_apart() -> None:
+    """Predictions under load are those under load, and predictions after it are those before it."""
     one, loaded = known(), Condition(load=0.6)
     for _ in range(30):
         learn(one, Execution(CLOUD, 0.5), condition=loaded)
@@ -268,8 +269,8 @@ def test_what_a_server_takes_while_the_robot_is_loaded_is_learnt_apart() -> None
     assert outlook(one).predicted_s == pytest.approx(0.2)
 
 
-def test_a_round_trip_that_a_loaded_robot_measured_is_not_the_servers() -> None:
-    """It is taken to be as before: else what the load adds would be counted twice."""
+def test_the_round_trip_of_a_loaded_robot_is_not_used() -> None:
+    """The last round trip without load is used, because the load would be counted twice otherwise."""
     one, quiet = memory(), Condition(round_trip_s=0.03)
     for _ in range(20):
         learn(one, Execution(CLOUD, 0.05), condition=quiet)
@@ -281,8 +282,8 @@ def test_a_round_trip_that_a_loaded_robot_measured_is_not_the_servers() -> None:
     assert outlook(one, condition=quiet).predicted_s == pytest.approx(0.05, rel=0.05)
 
 
-def test_what_was_learnt_on_half_a_cpu_tells_of_a_whole_one() -> None:
-    """Spread and interval too; a predictor that knows of no features learns what it sees, as published."""
+def test_times_on_half_a_cpu_predict_times_on_a_whole_one() -> None:
+    """The spread scales too; a predictor without features learns the measured time, as published."""
     one, half = memory(), Condition(capacity=0.5)
     for n in range(30):
         learn(one, Execution(ONBOARD, 0.2 + 0.01 * (n % 3 - 1)), condition=half)
@@ -295,8 +296,8 @@ def test_what_was_learnt_on_half_a_cpu_tells_of_a_whole_one() -> None:
     assert outlook(published, ONBOARD).predicted_s == pytest.approx(0.2)
 
 
-def test_what_a_server_takes_while_others_have_its_cpu_is_learnt_apart() -> None:
-    """At the first time under load it is expected to need longer; what it needs alone stays what it was."""
+def test_times_of_a_loaded_server_are_learnt_apart() -> None:
+    """A loaded server is predicted to take longer from the start; its times without load stay the same."""
     one, alone = memory(), Condition(round_trip_s=0.03)
     busy = Condition(round_trip_s=0.03, server_load=1.0)
     for _ in range(20):
@@ -308,8 +309,8 @@ def test_what_a_server_takes_while_others_have_its_cpu_is_learnt_apart() -> None
     assert outlook(one, condition=alone).predicted_s == pytest.approx(0.05, rel=0.02)
 
 
-def test_half_of_a_servers_cpu_doubles_its_part_and_not_the_way_there() -> None:
-    """What was learnt before and after tells of the same server."""
+def test_half_of_the_cpu_of_a_server_does_not_double_the_round_trip() -> None:
+    """Times with half of the CPU and with all of it predict each other."""
     one = memory()
     for _ in range(20):
         learn(one, Execution(CLOUD, 0.07), condition=Condition(round_trip_s=0.03))
@@ -321,8 +322,8 @@ def test_half_of_a_servers_cpu_doubles_its_part_and_not_the_way_there() -> None:
     assert whole.predicted_s == pytest.approx(0.07, rel=0.02)
 
 
-def test_a_server_that_is_first_used_by_a_loaded_robot_gets_known() -> None:
-    """Else the warm-up would not end while the load lasts."""
+def test_the_first_times_of_a_server_are_learnt_under_load_too() -> None:
+    """Otherwise the warm-up would not end while the robot is loaded."""
     one = memory()
     for _ in range(20):
         learn(one, Execution(CLOUD, 0.2), condition=Condition(load=0.6))

@@ -1,4 +1,4 @@
-"""Algorithm 1 as published, against a literal transcription of it."""
+"""The policy `paper` is Algorithm 1 as published, compared with a literal transcription of it."""
 
 import random
 from fractions import Fraction
@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from offboard.common.errors import ConfigError
 from offboard.common.tasks import task
 from offboard.robot_client import policies
+from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Forecast, Outlook
 from offboard.robot_client.predictors.least_squares import LeastSquares
@@ -27,7 +28,7 @@ Queue = list[tuple[Fraction, Fraction]]
 
 
 def transcription(rows: list[Row], n: int) -> list[tuple[str, Queue, Queue]]:
-    """Algorithm 1, line by line, in rational numbers; after each task the decision and both queues."""
+    """Algorithm 1, line by line, in rational numbers: the decision and both queues after each task."""
     b_l: Queue = []
     b_c: Queue = []
     seen = []
@@ -62,7 +63,7 @@ def psi(queue: Queue, d: Fraction) -> Fraction:
 
 
 def offloaded(rows: list[Row], n: int) -> list[tuple[str, Queue, Queue]]:
-    """The same rows through the real offloader, with runners that answer the row's times."""
+    """The same rows with the real offloader, and runners that take the times of the rows."""
     made: list[LeastSquares] = []
 
     def remember() -> LeastSquares:
@@ -75,7 +76,7 @@ def offloaded(rows: list[Row], n: int) -> list[tuple[str, Queue, Queue]]:
     seen = []
     # The order of the runners is the order in which their memories are made.
     with Offloader(
-        [answer(ONBOARD, 1), answer(CLOUD, 2)], policy=policies.make("paper"), predictor=remember
+        [answer(ONBOARD, 1), answer(CLOUD, 2)], policy=policies.make("paper"), memories=Memories(remember)
     ) as offload:
         for row in rows:
             offload(paper_probe, *row)
@@ -89,7 +90,7 @@ def offloaded(rows: list[Row], n: int) -> list[tuple[str, Queue, Queue]]:
 
 @st.composite
 def row_streams(draw: st.DrawFn) -> list[Row]:
-    """Times that grow with size, cross, tie and jump."""
+    """Rows whose times grow with size; sites cross and tie."""
     rng = random.Random(draw(st.integers(0, 2**32)))
     top = draw(st.sampled_from([5.0, 1e3, 1e7]))
     grain = draw(st.sampled_from([0, 1]))  # whole sizes and tenths of seconds make ties likely
@@ -104,11 +105,11 @@ def row_streams(draw: st.DrawFn) -> list[Row]:
 @given(row_streams(), st.integers(2, 25))
 @settings(max_examples=150, deadline=None)
 def test_decisions_and_queues_equal_the_transcription(rows: list[Row], n: int) -> None:
-    """After every task the decision and the contents of both queues are those of Algorithm 1."""
+    """After every task, the decision and both queues are those of Algorithm 1."""
     wanted, got = transcription(rows, n), offloaded(rows, n)
     for i, ((decision, b_l, b_c), (ours, our_l, our_c)) in enumerate(zip(wanted, got, strict=True)):
         if ours != decision and near_tie(wanted[i - 1], rows[i]):
-            return  # a tie in rational numbers that rounding broke: the streams part here
+            return  # rounding broke a tie of the rational numbers: from here on the two differ
         assert (ours, our_l, our_c) == (decision, b_l, b_c), f"task {i}"
 
 
@@ -118,44 +119,48 @@ def near_tie(before: tuple[str, Queue, Queue], row: Row) -> bool:
 
 
 def outlook(predicted_s: float | None, full: bool = True) -> Outlook:
-    return Outlook(predicted_s, None, full, age=0, failures=0)
+    return Outlook(predicted_s=predicted_s, full=full)
 
 
 def test_a_tie_stays_onboard() -> None:
-    """Eq. 1: the cloud only where it is strictly faster."""
-    decision = policies.make("paper").decide(Forecast(1.0, {CLOUD: outlook(0.1), ONBOARD: outlook(0.1)}))
+    """Eq. 1: the cloud is chosen only if it is strictly faster."""
+    decision = policies.make("paper").decide(
+        Forecast(size=1.0, sites={CLOUD: outlook(0.1), ONBOARD: outlook(0.1)})
+    )
     assert (decision.site, decision.both) == (ONBOARD, False)
 
 
-def test_the_smaller_prediction_wins_and_the_reason_says_both() -> None:
-    """The cloud is chosen where its prediction is smaller, and the reason shows the two times."""
-    decision = policies.make("paper").decide(Forecast(1.0, {CLOUD: outlook(0.0999), ONBOARD: outlook(0.1)}))
+def test_the_smaller_prediction_wins_and_the_reason_shows_both() -> None:
+    """The cloud is chosen if its prediction is smaller, and the reason shows both times."""
+    decision = policies.make("paper").decide(
+        Forecast(size=1.0, sites={CLOUD: outlook(0.0999), ONBOARD: outlook(0.1)})
+    )
     assert decision.site == CLOUD
     assert decision.reason == "cloud 99.9 ms against onboard 100.0 ms"
 
 
 @pytest.mark.parametrize(("cloud", "onboard"), [(True, False), (False, True), (False, False)])
-def test_both_sites_until_both_windows_are_full(cloud: bool, onboard: bool) -> None:
-    """Warm-up lasts while either queue is short of N."""
-    forecast = Forecast(1.0, {CLOUD: outlook(0.1, cloud), ONBOARD: outlook(0.2, onboard)})
+def test_both_sites_run_until_both_windows_are_full(cloud: bool, onboard: bool) -> None:
+    """The warm-up lasts while one of the queues has fewer than N observations."""
+    forecast = Forecast(size=1.0, sites={CLOUD: outlook(0.1, cloud), ONBOARD: outlook(0.2, onboard)})
     assert policies.make("paper").decide(forecast).both
 
 
-def test_the_rule_takes_the_fastest_of_three_sites() -> None:
-    """With more servers the smallest prediction of all wins."""
+def test_the_rule_chooses_the_fastest_of_three_sites() -> None:
+    """With more servers, the smallest prediction of all sites wins."""
     sites = {CLOUD: outlook(0.3), "edge": outlook(0.1), ONBOARD: outlook(0.2)}
-    assert policies.make("paper").decide(Forecast(1.0, sites)).site == "edge"
+    assert policies.make("paper").decide(Forecast(size=1.0, sites=sites)).site == "edge"
 
 
 @pytest.mark.parametrize("site", [ONBOARD, CLOUD])
-def test_a_constant_policy_never_moves(site: str) -> None:
-    """`onboard` and `cloud` choose their site whatever is predicted."""
-    forecast = Forecast(1.0, {CLOUD: outlook(0.9), ONBOARD: outlook(0.1)})
+def test_a_constant_policy_always_chooses_its_site(site: str) -> None:
+    """The policies `onboard` and `cloud` ignore the predictions."""
+    forecast = Forecast(size=1.0, sites={CLOUD: outlook(0.9), ONBOARD: outlook(0.1)})
     assert policies.make(site).decide(forecast).site == site
     assert not policies.make(site).decide(forecast).both
 
 
 def test_an_unknown_policy_names_the_known_ones() -> None:
-    """A misspelt policy gets the list."""
+    """The error for a misspelt name lists all rules."""
     with pytest.raises(ConfigError, match="'papr' is not one of paper, onboard, cloud"):
         policies.make("papr")

@@ -1,7 +1,7 @@
-"""Faults in every phase: no answer lost, none given twice, and each site learns of its own tasks only.
+"""Faults in every phase of a task: each task is answered once, and each site learns its own times only.
 
 Time is virtual. Each case runs three tasks of different sizes: a plain one, the one with the fault, and a
-plain one while what is left of it may still be under way.
+plain one while runs of the second task may still be under way.
 """
 
 from collections.abc import Callable
@@ -13,8 +13,9 @@ import pytest
 from offboard.common.errors import CloudBroken, CloudBusy, CloudTimeout, OffloadError, TaskFailed
 from offboard.common.tasks import task
 from offboard.robot_client import policies, predictors
+from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.policies import Decision, Forecast, Policy
+from offboard.robot_client.policies import Decision, Forecast, Hedge, Policy, Probe
 from offboard.robot_client.policies.allowance import DUPLICATES_MAX, Allowance
 from offboard.robot_client.predictors.least_squares import LeastSquares
 from offboard.robot_client.records.trace import Late, Record
@@ -22,20 +23,20 @@ from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition
 from tests.virtual import VirtualClock, VirtualRunner
 
 EDGE = "edge"
-PLAIN_S = {ONBOARD: 0.01, CLOUD: 0.02}  # of tasks without a fault
+PLAIN_S = {ONBOARD: 0.01, CLOUD: 0.02}  # time of a task without a fault
 TIMEOUT_S = 2.0
 HEDGE_S = 0.4
 
-WARM_UP = Decision(ONBOARD, True, "warm-up", "scripted")
-PROBE = Decision(ONBOARD, False, "probe", "scripted", CLOUD)
-PROBE_BACK = Decision(CLOUD, False, "probe", "scripted", ONBOARD)
-HEDGE = Decision(CLOUD, False, "hedge", "scripted", ONBOARD, HEDGE_S)
-HEDGE_AWAY = Decision(ONBOARD, False, "hedge", "scripted", CLOUD, HEDGE_S)
+WARM_UP = Decision(ONBOARD, "warm-up", "scripted", both=True)
+PROBE = Decision(ONBOARD, "probe", "scripted", second=Probe(CLOUD))
+PROBE_BACK = Decision(CLOUD, "probe", "scripted", second=Probe(ONBOARD))
+HEDGE = Decision(CLOUD, "hedge", "scripted", second=Hedge(ONBOARD, HEDGE_S))
+HEDGE_AWAY = Decision(ONBOARD, "hedge", "scripted", second=Hedge(CLOUD, HEDGE_S))
 
 BROKEN, BUSY, LATE = CloudBroken("gone"), CloudBusy("full"), CloudTimeout("late")
 FAILED = TaskFailed("ValueError: no")
 OK = None
-NEVER = (None, None)  # no answer: a server is given up at the end of the budget
+NEVER = (None, None)  # the server does not answer, and is given up after the timeout
 
 
 @task("phase_echo", size=lambda number: number)
@@ -44,17 +45,17 @@ def phase_echo(number: int) -> int:
 
 
 class Scripted:
-    """Decides as it is told."""
+    """Decides what the test has set as `next`."""
 
     def __init__(self) -> None:
-        self.next = Decision(ONBOARD, False, "plain", "scripted")
+        self.next = Decision(ONBOARD, "plain", "scripted")
 
     def decide(self, forecast: Forecast) -> Decision:  # noqa: ARG002
         return self.next
 
 
 class Scene:
-    """An offloader in virtual time, with the window of each site in sight."""
+    """An offloader in virtual time, with access to the window of each site."""
 
     def __init__(self, policy: Policy | None = None) -> None:
         self.clock = VirtualClock()
@@ -66,7 +67,7 @@ class Scene:
         self.offload = Offloader(
             list(self.sites.values()),
             policy=policy or self.policy,
-            predictor=self._remember,
+            memories=Memories(self._remember),
             allowance=self.allowance,
             timeout_s=TIMEOUT_S,
             observers=[self.records.append],
@@ -78,7 +79,7 @@ class Scene:
         return self._made[-1]
 
     def ask(self, number: int, decision: Decision) -> int | str:
-        """The answer, or the type of what was raised."""
+        """The answer, or the name of the exception."""
         self.policy.next = decision
         try:
             answer: int = self.offload(phase_echo, number)
@@ -87,20 +88,22 @@ class Scene:
         return answer
 
     def learnt(self, site: str) -> list[tuple[float, float]]:
-        """Size and seconds, in microseconds; memories are made in the order of the runners."""
+        """Size and seconds of each observation; the windows are made in the order of the runners."""
         return [(size, round(seconds, 6)) for size, seconds in self._made[[*self.sites].index(site)].window]
 
     def in_flight(self) -> int:
-        return sum(len(flights) for flights in self.offload._flights.values())
+        return sum(self.offload._flights.count(site) for site in self.sites)
 
 
 Run = tuple[float | None, OffloadError | None]
 
 
 class Case(NamedTuple):
-    """What the sites do with task 2, and what must come of it.
+    """What the sites do with task 2, and what must be recorded and learnt.
 
-    `runs`: in the order in which they began, each with its failure; seconds are those learnt, None: nothing.
+    `onboard`, `cloud`: how long the site takes, and its failure.
+    `runs`: the executions in the order of their start, with their failures.
+    `onboard_s`, `cloud_s`: the time that the site learns (None: it learns nothing).
     """
 
     name: str
@@ -115,7 +118,7 @@ class Case(NamedTuple):
 
 
 def lost(fault: OffloadError) -> list[Case]:
-    """The cases of a cloud that is broken, busy or late: alike but for the name of the failure."""
+    """The cases of a cloud that is broken, busy or late; they differ only in the name of the failure."""
     name = type(fault).__name__
     onboard_first, cloud_first = f"onboard, cloud {name}", f"cloud {name}, onboard"
     left = "onboard, cloud Overtaken"
@@ -130,7 +133,7 @@ def lost(fault: OffloadError) -> list[Case]:
     ]
 
 
-OWN = "TaskFailed"  # the task's own failure is raised, from whichever site it comes first
+OWN = "TaskFailed"  # a failure of the task itself is raised, from the site that reports it first
 CASES = [
     *(case for fault in (BROKEN, BUSY, LATE) for case in lost(fault)),
     Case("warm-up", WARM_UP, (0.3, OK), (0.2, OK), "onboard, cloud", 0.3, 0.2),
@@ -179,17 +182,17 @@ CASES = [
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_a_fault_costs_no_answer_and_teaches_nobody_a_wrong_time(case: Case) -> None:
-    """Answers, records, executions, duplicates and what was learnt are those of the case, no more."""
+def test_a_fault_costs_no_answer_and_no_site_learns_a_wrong_time(case: Case) -> None:
+    """Answers, records, executions, second runs and learnt times are exactly those of the case."""
     scene = Scene()
     sites = scene.sites
-    assert scene.ask(1, Decision(CLOUD, False, "plain", "scripted")) == 100
+    assert scene.ask(1, Decision(CLOUD, "plain", "scripted")) == 100
     sites[ONBOARD].scripts.append(case.onboard)
     sites[CLOUD].scripts.append(case.cloud)
     assert scene.ask(2, case.decision) == case.answer
     for site in sites.values():
         site.scripts.clear()
-    assert scene.ask(3, Decision(CLOUD, False, "plain", "scripted")) == 300
+    assert scene.ask(3, Decision(CLOUD, "plain", "scripted")) == 300
     scene.clock.run_out()
 
     assert [(one.size, one.waited_s >= 0) for one in scene.records] == [(1, True), (2, True), (3, True)]
@@ -212,8 +215,8 @@ def test_a_fault_costs_no_answer_and_teaches_nobody_a_wrong_time(case: Case) -> 
     "decision", [WARM_UP, PROBE, PROBE_BACK, HEDGE, HEDGE_AWAY], ids=lambda one: one.reason
 )
 @pytest.mark.parametrize("at_s", [0.1, 0.5])
-def test_a_close_ends_the_task_under_way_and_teaches_nothing(decision: Decision, at_s: float) -> None:
-    """In every phase the caller gets one error, no site learns anything, and no run is left."""
+def test_close_ends_the_task_under_way_and_nothing_is_learnt(decision: Decision, at_s: float) -> None:
+    """In every phase the caller gets one error, no site learns a time, and no run is left."""
     scene = Scene()
     for site in scene.sites.values():
         site.takes = 1.0
@@ -225,13 +228,13 @@ def test_a_close_ends_the_task_under_way_and_teaches_nothing(decision: Decision,
     assert scene.in_flight() == 0
 
 
-def test_what_ended_late_is_in_the_next_record_with_its_own_tasks_id() -> None:
-    """The trace tells of it once, under the task that it belongs to."""
+def test_a_late_run_is_in_the_next_record_with_the_id_of_its_own_task() -> None:
+    """The trace has each late run once, with the id of the task that it belongs to."""
     scene = Scene()
     scene.sites[CLOUD].scripts.append((0.7, OK))
     scene.ask(1, PROBE)
     scene.clock.run_out()
-    plain = Decision(ONBOARD, False, "plain", "scripted")
+    plain = Decision(ONBOARD, "plain", "scripted")
     scene.ask(2, plain)
     scene.ask(3, plain)
     first, second, third = scene.records
@@ -240,7 +243,7 @@ def test_what_ended_late_is_in_the_next_record_with_its_own_tasks_id() -> None:
 
 
 def test_an_interrupted_call_leaves_nothing_in_flight() -> None:
-    """Ctrl-C while a task waits: the site is not taken to be busy with it for ever."""
+    """After Ctrl-C during a task, its site does not count as busy."""
     scene = Scene()
 
     def interrupt() -> None:
@@ -254,10 +257,10 @@ def test_an_interrupted_call_leaves_nothing_in_flight() -> None:
 
 
 @pytest.mark.parametrize(
-    ("where", "cloud"), [("both", OK), (CLOUD, BROKEN)], ids=["measured on both", "fallen back"]
+    ("where", "cloud"), [("both", OK), (CLOUD, BROKEN)], ids=["measured on both", "fallback"]
 )
-def test_what_is_no_choice_of_the_policys_is_no_duplicate(where: str, cloud: OffloadError | None) -> None:
-    """Neither measuring, which the caller asked for, nor a fallback after a failure eats the allowance."""
+def test_only_second_runs_of_the_policy_cost_allowance(where: str, cloud: OffloadError | None) -> None:
+    """A measurement on both sites is free, and so is a fallback after a failure."""
     scene = Scene()
     scene.sites[CLOUD].failure = cloud
     for number in range(30):
@@ -265,8 +268,8 @@ def test_what_is_no_choice_of_the_policys_is_no_duplicate(where: str, cloud: Off
     assert scene.allowance.duplicates == DUPLICATES_MAX
 
 
-def test_an_overtaken_site_did_not_fail() -> None:
-    """Three lost hedges in a row are no reason to break with a site."""
+def test_an_overtaken_run_is_no_failure() -> None:
+    """A site that lost several hedges in a row has no failures."""
     scene = Scene()
     scene.sites[CLOUD].takes = 1.0
     for number in range(4):
@@ -289,7 +292,7 @@ FAULTS: list[Callable[[Random], Run]] = [
 )
 @pytest.mark.parametrize("seed", [1, 2])
 def test_no_answer_is_lost_among_random_faults(policy: str, seed: int) -> None:
-    """Of 600 tasks on three sites with faults of all kinds each is answered once, by its own result."""
+    """With faults of all kinds on three sites, each of 600 tasks is answered once, by its own result."""
     rng, clock = Random(seed), VirtualClock()
     sites = {site: VirtualRunner(site, clock) for site in (ONBOARD, CLOUD, EDGE)}
     records: list[Record] = []
@@ -297,7 +300,7 @@ def test_no_answer_is_lost_among_random_faults(policy: str, seed: int) -> None:
     offload = Offloader(
         list(sites.values()),
         policy=policies.make(policy, seed),
-        predictor=lambda: predictors.make(name, 20),
+        memories=Memories(lambda: predictors.make(name, 20)),
         timeout_s=TIMEOUT_S,
         observers=[records.append],
         clock=clock,
@@ -314,7 +317,7 @@ def test_no_answer_is_lost_among_random_faults(policy: str, seed: int) -> None:
     offload(phase_echo, 600, where=ONBOARD)
     assert [one.size for one in records] == list(range(601))
     assert all(len({run.site for run in one.executions}) == len(one.executions) for one in records)
-    assert all(not flights for flights in offload._flights.values())
+    assert not any(offload._flights.count(site) for site in sites)
     overtaken = sum("Overtaken" in (run.error or "") for one in records for run in one.executions)
     assert sum(len(one.late) for one in records) == overtaken
     assert overtaken > 0 or policy == "paper"

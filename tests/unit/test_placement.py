@@ -1,4 +1,4 @@
-"""Where a batch's tasks go, by hand-made predictions and in virtual time."""
+"""Where the tasks of a batch go, with given predictions and in virtual time."""
 
 import heapq
 import itertools
@@ -30,7 +30,7 @@ def makespan(
     true: Sequence[Mapping[str, float]] | None = None,
     workers: Mapping[str, int] | None = None,
 ) -> float:
-    """When the last task ends where each takes its true time, each site first come first served."""
+    """When the last task ends, if each task takes its true time and each site runs tasks in their order."""
     true = true or predicted
     held = queues(*sites)
     waiting = sorted(range(len(predicted)), key=lambda n: -min(predicted[n].values()))
@@ -52,15 +52,15 @@ def makespan(
 
 
 def shortest(times: Sequence[float], sites: int) -> float:
-    """The least makespan on so many equal sites, by trying all."""
+    """The shortest makespan on this many equal sites, found by trying all orders."""
     return min(
         max(sum(one for one, at in zip(times, places, strict=True) if at == site) for site in range(sites))
         for places in itertools.product(range(sites), repeat=len(times))
     )
 
 
-def test_the_longest_come_first_as_in_grahams_example() -> None:
-    """Two tasks of 5, 4 and 3 s and one more of 3 s on three equal sites: 11 s where 9 s is the shortest."""
+def test_grahams_example_takes_as_long_as_he_says() -> None:
+    """Seven tasks on three equal sites take 11 s with the longest first, where 9 s is the optimum."""
     times = [5.0, 5.0, 4.0, 4.0, 3.0, 3.0, 3.0]
     sites = ("onboard", "edge", "cloud")
     found = makespan([dict.fromkeys(sites, one) for one in times], sites)
@@ -70,7 +70,7 @@ def test_the_longest_come_first_as_in_grahams_example() -> None:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_the_last_task_ends_within_grahams_bound(seed: int) -> None:
-    """On equal sites at most 4/3 - 1/(3 m) of the shortest time (Graham 1969)."""
+    """On m equal sites, a batch takes at most 4/3 - 1/(3 m) of the optimum (Graham 1969)."""
     random = Random(seed)
     sites = ("onboard", "edge", "cloud")[: random.choice((2, 3))]
     times = [random.uniform(0.1, 1.0) for _ in range(random.randrange(3, 9))]
@@ -81,7 +81,7 @@ def test_the_last_task_ends_within_grahams_bound(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_two_sites_of_any_speed_share_the_work(seed: int) -> None:
-    """Of many tasks the last ends within a tenth of what perfectly shared work would take."""
+    """A batch of 60 tasks takes at most a tenth longer than perfectly shared work."""
     random = Random(seed)
     factor = random.uniform(1, 8)
     predicted = [{"onboard": factor * one, "cloud": one} for one in (random.uniform(1, 3) for _ in range(60))]
@@ -90,7 +90,7 @@ def test_two_sites_of_any_speed_share_the_work(seed: int) -> None:
 
 
 def test_a_site_that_is_too_slow_gets_nothing() -> None:
-    """Three tasks that the cloud has done before onboard were done with one of them."""
+    """Onboard gets no task if the cloud ends all three before onboard could end one."""
     predicted = [{"onboard": 10.0, "cloud": 1.0}] * 3
     held = queues("onboard", "cloud")
     placed = []
@@ -100,28 +100,28 @@ def test_a_site_that_is_too_slow_gets_nothing() -> None:
     assert placed == ["cloud"] * SERVER_IN_FLIGHT
 
 
-def test_a_task_waits_for_a_better_site_and_the_next_does_not() -> None:
-    """Onboard takes the task that would be done there before the cloud has done those ahead of it."""
+def test_a_task_waits_for_a_better_site_and_a_later_task_may_not() -> None:
+    """Onboard gets the first task that it would end before the cloud, behind the tasks that wait for it."""
     predicted = [{"onboard": 4.0, "cloud": 1.0}] * 6
     held = queues("onboard", "cloud")
     for task in range(SERVER_IN_FLIGHT):
         held["cloud"].start(task, 1.0, 0.0)
     assert next_start(predicted[:1], held, 0.0) is None
-    # Behind two others the first is done there after 3 s, the second after 4 s as onboard: a tie.
+    # Behind two others the cloud ends the first task after 3 s and the second after 4 s, as onboard: a tie.
     start = next_start(predicted, held, 0.0)
     assert start is not None
     assert (start.place, start.site) == (1, "onboard")
 
 
-def test_wrong_predictions_are_mended_by_what_has_ended() -> None:
-    """A cloud that takes three times what was predicted gets its share of the rest only."""
+def test_wrong_predictions_are_corrected_by_tasks_that_ended() -> None:
+    """A cloud that takes three times as long as predicted gets fewer of the remaining tasks."""
     predicted = [{"onboard": 1.0, "cloud": 1.0}] * 80
     true = [{"onboard": 1.0, "cloud": 3.0}] * 80
     assert makespan(predicted, ("onboard", "cloud"), true) <= 1.1 * 80 / (1 + 1 / 3)
 
 
 def test_a_server_of_several_workers_gets_several_tasks() -> None:
-    """Its pace is learnt: four workers and onboard make five of the work."""
+    """With four workers and onboard, a batch takes about a fifth of the time."""
     predicted = [{"onboard": 1.0, "cloud": 1.0}] * 100
     found = makespan(predicted, ("onboard", "cloud"), workers={"cloud": 4})
     assert 20 <= found <= 1.25 * 20
@@ -130,18 +130,18 @@ def test_a_server_of_several_workers_gets_several_tasks() -> None:
 @pytest.mark.parametrize(
     ("heard", "limit"),
     [
-        ([(0.0, 1.0)], SERVER_IN_FLIGHT + 1),  # it was idle when the task came
+        ([(0.0, 1.0)], SERVER_IN_FLIGHT + 1),  # the server was idle when the task came
         ([(0.0, 1.0)] * 20, SERVER_IN_FLIGHT_MAX),
         ([(0.5, 1.0)] * 20, SERVER_IN_FLIGHT),
         ([(0.0, 1.0)] * 2 + [(2.0, 1.0)], SERVER_IN_FLIGHT + 1),
         ([(2.0, 1.0)] * 20, SERVER_IN_FLIGHT),
-        ([(None, None)], 1),  # it failed
+        ([(None, None)], 1),  # the task failed
     ],
 )
-def test_its_own_queue_tells_how_many_a_server_gets(
+def test_the_queue_of_a_server_sets_how_many_tasks_it_gets(
     heard: list[tuple[float | None, float | None]], limit: int
 ) -> None:
-    """One more where a task did not wait there, one less where it waited longer than it ran."""
+    """It gets one more if a task did not wait there, and one less if a task waited longer than it ran."""
     queue = Queue("cloud", WITHIN_S)
     for one in heard:
         queue.running = dict.fromkeys(range(queue.limit), 1.0)
@@ -149,8 +149,8 @@ def test_its_own_queue_tells_how_many_a_server_gets(
     assert queue.limit == limit
 
 
-def test_onboard_runs_one_at_a_time() -> None:
-    """Whatever it says of its queue."""
+def test_onboard_gets_one_task_at_a_time() -> None:
+    """The limit of onboard stays 1, whatever its queue was."""
     queue = Queue("onboard", WITHIN_S)
     queue.hear(0.0, 1.0)
     queue.start(1, 1.0, 0.0)
@@ -158,8 +158,8 @@ def test_onboard_runs_one_at_a_time() -> None:
     assert not queue.can_begin(1.0, 0.0)
 
 
-def test_no_task_is_put_behind_others_until_its_answer_would_be_given_up() -> None:
-    """A server that needs long for each gets one at a time."""
+def test_a_slow_server_gets_one_task_at_a_time() -> None:
+    """A task is not queued on a server if it might reach its timeout there."""
     timeout_s = 2.0
     queue = Queue("cloud", BUDGET_SHARE * timeout_s)
     assert queue.can_begin(0.6, 0.0)
@@ -169,8 +169,8 @@ def test_no_task_is_put_behind_others_until_its_answer_would_be_given_up() -> No
     assert Queue("cloud", BUDGET_SHARE * timeout_s).can_begin(5.0, 0.0)
 
 
-def test_an_idle_site_takes_over_what_it_would_finish_sooner() -> None:
-    """Of two tasks in the cloud the one that waits longer; none where the cloud is sooner."""
+def test_an_idle_site_takes_over_a_task_that_it_would_end_sooner() -> None:
+    """It takes the task that would wait longest in the cloud, and none that the cloud would end sooner."""
     held = queues("onboard", "cloud")
     held["cloud"].start(1, 4.0, 0.0)
     held["cloud"].start(2, 4.0, 0.0)
@@ -180,11 +180,11 @@ def test_an_idle_site_takes_over_what_it_would_finish_sooner() -> None:
     assert takeover({1: {"onboard": 5.0, "cloud": 4.0}}, held, 0.0) is None
     assert takeover({1: {"onboard": 3.0, "cloud": 4.0}}, held, 2.0) is None  # 2 s are left
     held["onboard"].start(3, 1.0, 0.0)
-    assert takeover(both, held, 0.0) is None, "nobody is idle"
+    assert takeover(both, held, 0.0) is None, "no site is idle"
 
 
-def test_a_task_that_is_overdue_is_taken_over() -> None:
-    """It may need as long again as it is late: after that the idle site is sooner."""
+def test_an_overdue_task_is_taken_over() -> None:
+    """An overdue task should need as long again as it is late, so an idle site is sooner at some time."""
     held = queues("onboard", "cloud")
     held["cloud"].start(1, 1.0, 0.0)
     slow = {1: {"onboard": 3.0, "cloud": 1.0}}

@@ -1,4 +1,4 @@
-"""Regret, estimated from probes."""
+"""Live regret, estimated from probes."""
 
 from random import Random
 
@@ -9,8 +9,8 @@ from offboard.robot_client.learning.regret import PROBES_MAX, PROBES_MIN, Regret
 REPETITIONS = 1_000
 
 
-def test_too_few_probes_tell_nothing() -> None:
-    """Before PROBES_MIN of them there is no estimate."""
+def test_too_few_probes_give_no_estimate() -> None:
+    """The first estimate comes with PROBES_MIN probes."""
     estimate = RegretEstimate()
     for _ in range(PROBES_MIN - 1):
         estimate.learn(0.3, 0.1)
@@ -22,8 +22,8 @@ def test_too_few_probes_tell_nothing() -> None:
     assert found.probes == PROBES_MIN
 
 
-def test_a_right_choice_costs_nothing() -> None:
-    """Where the chosen site was the faster one its lead does not make up for others' regrets."""
+def test_a_right_choice_has_no_regret() -> None:
+    """Time gained by a right choice does not reduce the regret of wrong choices."""
     estimate = RegretEstimate()
     for _ in range(10):
         estimate.learn(0.1, 9.0)
@@ -36,7 +36,7 @@ def test_a_right_choice_costs_nothing() -> None:
 
 @pytest.mark.parametrize("probes", [PROBES_MIN, 8, 20, 50, 200])
 def test_the_interval_holds_the_truth_in_95_of_100_runs(probes: int) -> None:
-    """Of regrets spread evenly around 0.1 s the mean is inside in 95 % of runs, to 3 points."""
+    """The true mean is inside the interval in 95 % of runs, to 3 points."""
     rng, held = Random(1), 0
     for _ in range(REPETITIONS):
         estimate = RegretEstimate()
@@ -50,12 +50,12 @@ def test_the_interval_holds_the_truth_in_95_of_100_runs(probes: int) -> None:
 
 @pytest.mark.parametrize(("freedom", "t"), [(4, 2.776), (9, 2.262), (29, 2.045), (199, 1.972)])
 def test_few_probes_widen_the_interval(freedom: int, t: float) -> None:
-    """By Student's t, as any table has it."""
+    """The quantiles of Student's t are those of the usual tables."""
     assert student_95(freedom) == pytest.approx(t, rel=0.02)
 
 
 def test_old_probes_are_forgotten() -> None:
-    """The last PROBES_MAX count."""
+    """Only the last PROBES_MAX probes count."""
     estimate = RegretEstimate()
     for _ in range(500):
         estimate.learn(9.0, 0.0)

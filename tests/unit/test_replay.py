@@ -46,8 +46,8 @@ def trace_of(folder: Path, *records: tuple[str, str, dict[str, float], float]) -
     written = Trace(path)
     for i, (policy, site, seconds, waited_s) in enumerate(records):
         executions = tuple(Execution(name, s) for name, s in seconds.items())
-        decision = Decision(site, len(seconds) > 1, "", policy)
-        sites = {name: Outlook(None, None, False, 0, 0) for name in seconds}
+        decision = Decision(site, "", policy, both=len(seconds) > 1)
+        sites = {name: Outlook() for name in seconds}
         written.write(Record(i, f"t-{i}", "plan", 1.0 + i % 3, sites, decision, executions, site, waited_s))
     written.close()
     return path
@@ -82,7 +82,7 @@ def test_a_task_on_both_sites_takes_as_long_as_the_first_answer(tmp_path: Path) 
 
     class Twice:
         def decide(self, forecast: Forecast) -> Decision:  # noqa: ARG002
-            return Decision("onboard", True, "", "twice")
+            return Decision("onboard", "", "twice", both=True)
 
     rows = read(dataset(tmp_path, TWELVE))
     predictor = partial(predictors.make, "least-squares", 3, 1)

@@ -13,7 +13,7 @@ from offboard.robot_client import policies
 from offboard.robot_client.policies.allowance import DUPLICATES_MAX
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.objectives import Mean, TimeAndEnergy
-from offboard.robot_client.policies.wrappers import STALE
+from offboard.robot_client.policies.probe import STALE
 from offboard.robot_client.records import trace
 from offboard.robot_client.simulated.config import CallConfig, DriveConfig, RobotConfig
 
@@ -100,9 +100,9 @@ def test_flags_that_fit_together_are_accepted(settings: dict[str, Any]) -> None:
 def test_objective_energy_and_limits_are_made_from_the_flags() -> None:
     """Without flags they are the defaults of the library."""
     plain = DriveConfig(**MAP)
-    assert isinstance(plain.goal(), Mean)
-    assert plain.energy() == Energy()
-    assert not plain.allowance().capped
+    assert isinstance(plain.settings(1).objective, Mean)
+    assert plain.settings(1).energy == Energy()
+    assert not plain.settings(1).allowance().capped
     flags = "--objective energy --s-per-joule 2 --compute-watts 3 --idle-watts 0.5 --radio-joules-byte 1e-6"
     caps = "--policy greedy --bytes-per-minute 6000 --joules-per-minute 60 --duplicates 0.5"
     config = load(
@@ -113,9 +113,9 @@ def test_objective_energy_and_limits_are_made_from_the_flags() -> None:
         environ={},
         prefix="R",
     )
-    assert config.goal() == TimeAndEnergy(2.0)
-    assert config.energy() == Energy(3.0, 0.5, 1e-6)
-    allowance = config.allowance()
+    assert config.settings(1).objective == TimeAndEnergy(2.0)
+    assert config.settings(1).energy == Energy(3.0, 0.5, 1e-6)
+    allowance = config.settings(1).allowance()
     allowance.begin(0.0)
     assert (allowance.duplicates, allowance.bytes_left, allowance.joules_left) == (
         DUPLICATES_MAX,

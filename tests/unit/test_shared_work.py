@@ -1,4 +1,4 @@
-"""From sizes to work."""
+"""The work of a size, learnt from results."""
 
 from collections.abc import Callable
 from random import Random
@@ -9,7 +9,7 @@ from offboard.robot_client.learning.shared_work import PAIRS_MAX, SharedWork
 
 
 def test_nothing_is_known_at_first() -> None:
-    """Before any result the work of a size is unknown; one result makes it known."""
+    """The work of a size is unknown before the first result."""
     work = SharedWork()
     assert work.predict(3.0) is None
     work.learn(3.0, 70.0)
@@ -21,8 +21,8 @@ def bent(size: float) -> float:
 
 
 @pytest.mark.parametrize("truth", [lambda size: 10 + 20 * size, bent], ids=["line", "bent"])
-def test_what_sizes_are_is_learnt(truth: Callable[[float], float]) -> None:
-    """Work that grows with size, evenly or not, is told to 6 % among noisy results; a line is off by 30 %."""
+def test_the_work_of_a_size_is_learnt(truth: Callable[[float], float]) -> None:
+    """It is predicted to 6 % from noisy results, also if work is not proportional to size."""
     rng, work = Random(1), SharedWork()
     for _ in range(300):
         size = rng.uniform(1, 5)
@@ -32,17 +32,16 @@ def test_what_sizes_are_is_learnt(truth: Callable[[float], float]) -> None:
 
 
 def test_only_the_last_results_count() -> None:
-    """In a building where plans are twice the work that is all that is known after PAIRS_MAX results."""
+    """If the work doubles, the old results are forgotten after PAIRS_MAX new ones."""
     rng, work = Random(3), SharedWork()
     for n in range(2 * PAIRS_MAX):
         size = rng.uniform(1, 5)
         work.learn(size, 20 * size * (2.0 if n >= PAIRS_MAX else 1.0))
     assert work.predict(3.0) == pytest.approx(120.0)
-    assert len(work._order) == len(work._sizes) == len(work._works) == PAIRS_MAX
 
 
-def test_one_odd_result_does_not_sway() -> None:
-    """A result of a hundred times the work moves the next expectation by less than half."""
+def test_an_outlier_has_little_influence() -> None:
+    """A result with a hundred times the work changes the prediction by less than half."""
     rng, work = Random(2), SharedWork()
     for _ in range(100):
         size = rng.uniform(1, 5)
@@ -54,7 +53,7 @@ def test_one_odd_result_does_not_sway() -> None:
 
 
 def test_work_is_never_below_zero() -> None:
-    """Far below the sizes seen a rising line would go under."""
+    """A steep line would predict negative work for sizes far below those seen."""
     work = SharedWork()
     for size in range(5, 25):
         work.learn(size, 100.0 * (size - 5) + 1e-3)

@@ -20,8 +20,9 @@ from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
 from offboard.loadgen.simulation.simulated_testbed import SimulatedTestbed
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client import predictors
+from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.policies import Decision, Forecast
+from offboard.robot_client.policies import Decision, Forecast, Hedge, Probe
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.heartbeat import ServerReport
 
@@ -160,11 +161,11 @@ def race(tmp_path: Path) -> Callable[..., tuple[list[Record], float]]:
         tasks = {ROBOT: find_tasks(scenario.workload, 1, 2)}
         testbed = SimulatedTestbed(scenario, tasks, clock, heartbeat_s=0.0, noise=0.0)
         records: list[Record] = []
-        policy = Scripted(Decision("cloud", False, "", "test"))
+        policy = Scripted(Decision("cloud", "", "test"))
         offload = Offloader(
             [testbed.cloud, testbed.onboard],
             policy=policy,
-            predictor=lambda: predictors.make("least-squares", 5),
+            memories=Memories(lambda: predictors.make("least-squares", 5)),
             observers=[records.append],
             clock=clock,
         )
@@ -184,7 +185,7 @@ def race(tmp_path: Path) -> Callable[..., tuple[list[Record], float]]:
 def test_a_hedge_by_hand(race: Callable[..., tuple[list[Record], float]]) -> None:
     """The link is silent: onboard starts after the wait of the hedge and answers; the cloud is cancelled."""
     silent = Event("link", {"outage": True})
-    records, _ = race(Decision("cloud", False, "", "test", second="onboard", second_after_s=0.1), silent)
+    records, _ = race(Decision("cloud", "", "test", second=Hedge("onboard", 0.1)), silent)
     first = records[0]
     assert first.waited_s == pytest.approx(0.1 + ONBOARD_S)
     cloud, onboard = first.executions
@@ -196,14 +197,14 @@ def test_a_hedge_by_hand(race: Callable[..., tuple[list[Record], float]]) -> Non
 
 def test_an_early_answer_prevents_the_hedge(race: Callable[..., tuple[list[Record], float]]) -> None:
     """The cloud answers before the wait of the hedge is over, so onboard does not start."""
-    records, took_s = race(Decision("cloud", False, "", "test", second="onboard", second_after_s=0.1))
+    records, took_s = race(Decision("cloud", "", "test", second=Hedge("onboard", 0.1)))
     assert [len(record.executions) for record in records] == [1, 1]
     assert took_s == pytest.approx(2 * CLOUD_S)
 
 
 def test_a_probe_by_hand(race: Callable[..., tuple[list[Record], float]]) -> None:
     """Both sites start at once; the first answer is used, and the other time is learned when it is known."""
-    records, _ = race(Decision("cloud", False, "", "test", second="onboard", second_after_s=0.0))
+    records, _ = race(Decision("cloud", "", "test", second=Probe("onboard")))
     assert CLOUD_S < ONBOARD_S < 2 * CLOUD_S
     # During the run onboard, unpacking the reply takes twice as long.
     assert records[0].waited_s == pytest.approx(CLOUD_S + HASH.sending_s / 2 / 0.2)

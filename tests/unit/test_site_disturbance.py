@@ -26,7 +26,7 @@ def cloud(seconds: float, network_s: float = 0.01, cpu_s: float | None = None) -
 
 
 def record(size: float, *executions: Execution) -> Record:
-    decision = Decision(executions[0].site, len(executions) > 1, "pinned by the caller", "pinned")
+    decision = Decision(executions[0].site, "pinned by the caller", "pinned", both=len(executions) > 1)
     return Record(0, "0", "plan_path", size, {}, decision, executions, ONBOARD, 0.1)
 
 

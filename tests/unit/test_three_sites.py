@@ -7,8 +7,9 @@ import pytest
 from offboard.common.errors import CloudTimeout
 from offboard.common.tasks import Task, task
 from offboard.robot_client import policies, predictors
+from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.policies.wrappers import PROBE_EVERY
+from offboard.robot_client.policies.probe import PROBE_EVERY
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution
 from tests.fakes import ScriptedRunner
@@ -52,7 +53,7 @@ def test_the_best_living_site_is_used_soon_after_each_change(
     with Offloader(
         [*servers, runner(ONBOARD)],
         policy=policies.make(policies.DEFAULT),
-        predictor=lambda: predictors.make("average", 50),
+        memories=Memories(lambda: predictors.make("average", 50)),
         observers=[records.append],
     ) as offload:
         for fail, _ in PHASES:
@@ -64,8 +65,8 @@ def test_the_best_living_site_is_used_soon_after_each_change(
     check(records, within)
 
 
-def test_a_switch_point_is_the_first_task_from_which_on_most_are_right() -> None:
-    """By hand: two wrong of ten are tries, three are not; what is over too soon tells nothing."""
+def test_a_switch_point_is_the_first_task_after_which_most_are_right() -> None:
+    """Two other sites in ten tasks count as tries, three do not; a sequence that is too short has none."""
     assert switch_point(["a"] * 10, "a") == 0
     assert switch_point(["b"] * 5 + ["a"] * 20, "a") == 5
     assert switch_point(["b"] * 2 + ["a"] * 20 + ["b"] + ["a"] * 9, "a") == 2

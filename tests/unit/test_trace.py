@@ -14,7 +14,7 @@ import pytest
 
 from offboard.common.errors import CloudTimeout, ConfigError, DataError
 from offboard.robot_client.learning.regret import Regret
-from offboard.robot_client.policies import Decision, Outlook
+from offboard.robot_client.policies import Decision, Hedge, Outlook
 from offboard.robot_client.records.trace import WAITING_MAX, Late, Record, Trace, read
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution
 
@@ -28,10 +28,10 @@ def record(i: int = 0) -> Record:
         kind="plan_path",
         size=1.5,
         sites={
-            ONBOARD: Outlook(0.1, 0.01, True, 3, 0, low_s=0.08, high_s=0.15),
-            CLOUD: Outlook(None, None, False, 0, 1, condition=Condition(round_trip_s=0.03, queue=2)),
+            ONBOARD: Outlook(predicted_s=0.1, spread_s=0.01, full=True, age=3, low_s=0.08, high_s=0.15),
+            CLOUD: Outlook(failures=1, condition=Condition(round_trip_s=0.03, queue=2)),
         },
-        decision=Decision(CLOUD, False, "cloud 1 ms against onboard 2 ms", "paper", ONBOARD, 0.5),
+        decision=Decision(CLOUD, "cloud 1 ms against onboard 2 ms", "paper", second=Hedge(ONBOARD, 0.5)),
         executions=(
             Execution(CLOUD, 2.0, failure=CloudTimeout("late"), censored=True, bytes_out=10),
             Execution(ONBOARD, 0.1, queue_s=0.0, run_s=0.1, network_s=0.0, cpu_s=0.02),

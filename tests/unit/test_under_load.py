@@ -1,10 +1,10 @@
-"""What a site takes under load, told by what it takes otherwise."""
+"""How long a site takes under load, from how long it takes otherwise."""
 
 from random import Random
 
 import pytest
 
-from offboard.robot_client.learning.under_load import KEPT, ODD, UnderLoad
+from offboard.robot_client.learning.under_load import KEPT, OUTLIER, UnderLoad
 
 
 def taught(*times: tuple[float, float], onboard: bool = False) -> UnderLoad:
@@ -14,8 +14,8 @@ def taught(*times: tuple[float, float], onboard: bool = False) -> UnderLoad:
     return one
 
 
-def test_one_time_under_load_tells_of_all_sizes() -> None:
-    """Before it nothing is known."""
+def test_one_time_under_load_predicts_all_sizes() -> None:
+    """Nothing is known before the first time under load."""
     one = UnderLoad(onboard=True)
     assert not one.known
     one.learn(0.02, 0.28)
@@ -23,21 +23,21 @@ def test_one_time_under_load_tells_of_all_sizes() -> None:
     assert one.expect(0.04) == pytest.approx(0.56)
 
 
-def test_a_server_takes_so_much_longer_and_onboard_so_many_times_as_long() -> None:
-    """Where all that was seen was one kind of task."""
+def test_load_adds_time_to_a_server_and_multiplies_time_onboard() -> None:
+    """This is the prior for other sizes if all times seen were of one size."""
     times = [(0.04, 0.12)] * 3
     assert taught(*times).expect(0.02) == pytest.approx(0.12 - 0.02)
     assert taught(*times, onboard=True).expect(0.02) == pytest.approx(0.06)
 
 
-def test_a_few_times_of_large_tasks_say_little_of_small_ones() -> None:
-    """Three on a server, the slowest by chance the smallest: a line through them says a second for none."""
+def test_a_few_times_do_not_make_a_steep_line() -> None:
+    """If the smallest of three tasks was the slowest by chance, small tasks are still predicted well."""
     one = taught((0.045, 0.109), (0.0455, 0.209), (0.050, 0.090))
     assert 0.09 < one.expect(0.035) < 0.15
 
 
-def test_many_times_tell_the_line() -> None:
-    """Whatever was believed before: 0.07 s and five times what is expected without the load."""
+def test_many_times_show_the_true_line() -> None:
+    """With KEPT times, the prior has little influence on the line."""
     rng = Random(1)
     one = UnderLoad(onboard=True)
     for _ in range(KEPT):
@@ -47,14 +47,14 @@ def test_many_times_tell_the_line() -> None:
     assert one.expect(0.09) == pytest.approx(0.52, rel=0.1)
 
 
-def test_one_odd_time_counts_as_a_few_of_the_usual_ones() -> None:
-    """A second run beside it, or a stall."""
+def test_an_outlier_is_limited() -> None:
+    """A time far above the median counts as OUTLIER times the median."""
     one = taught(*[(0.04, 0.1)] * 4, (0.04, 9.0))
-    assert one.expect(0.04) == pytest.approx((4 * 0.1 + ODD * 0.1) / 5)
+    assert one.expect(0.04) == pytest.approx((4 * 0.1 + OUTLIER * 0.1) / 5)
 
 
-def test_it_is_never_quicker_than_without_the_load() -> None:
-    """Nor where far larger tasks are asked for, or times of 0 were seen."""
+def test_load_never_makes_a_site_faster() -> None:
+    """This also holds for very large tasks, and if times of 0 were seen."""
     assert taught((0.04, 0.01)).expect(0.04) == 0.04
     assert taught((0.0, 0.0), onboard=True).expect(0.5) == 0.5
     assert taught((0.04, 0.3), (0.05, 0.2), (0.06, 0.1)).expect(5.0) >= 5.0

@@ -1,0 +1,108 @@
+"""Adaptive conformal intervals: they hold 90 % of the measured times, whatever the predictor.
+
+What a policy reads from the errors, such as when a task is overdue, is in `policies/forecast.py`.
+"""
+
+import math
+import operator
+from bisect import bisect_left, insort
+from collections import deque
+
+from offboard.robot_client.policies.forecast import ERRORS_MIN, PredictionErrors, unit_s
+from offboard.robot_client.policies.objectives import SPREADS_90
+
+COVERAGE = 0.9
+OUTSIDE = 1 - COVERAGE
+OUTSIDE_MIN, OUTSIDE_MAX = -0.1, 0.5  # below 0, the interval is wider than all errors seen
+ERRORS_MAX = 100  # the last ones
+RATE = 0.03  # of the adaptation
+USUAL_FROM = 20  # times: the usual time is their mean; from then on, old times fade from it
+
+
+class Conformal:
+    """Learns the errors of the predictions for one site, and adapts its interval to them.
+
+    After Gibbs and Candès, Adaptive Conformal Inference Under Distribution Shift (2021): the interval is made
+    narrower after a time that it held and wider after a time that it missed, so that the share that it holds
+    stays at COVERAGE. Times are skewed, so the interval is the shortest one that holds enough of the last
+    errors, not a symmetric one.
+    """
+
+    def __init__(self) -> None:
+        self._order: deque[float] = deque()
+        self._sorted: list[float] = []
+        self._usual_s = 0.0
+        self._count = 0
+        self._outside = OUTSIDE  # the share of errors that the interval leaves out
+        self._ends: tuple[float, float] | None = None  # of the interval, as scores
+        self._errors: PredictionErrors | None = None
+
+    @property
+    def errors(self) -> PredictionErrors:
+        """The errors until now, as a value; made again only after something was learnt."""
+        if self._errors is None:
+            self._errors = PredictionErrors(tuple(self._sorted), self._usual_s)
+        return self._errors
+
+    def learn(self, predicted_s: float, seconds: float) -> None:
+        """Learn from a prediction and the time that the task then took."""
+        if self._count:
+            score = (seconds - predicted_s) / unit_s(predicted_s, self._usual_s)
+            if len(self._sorted) >= ERRORS_MIN:
+                low, high = self._ends or self._interval()
+                self._adapt(missed=not low <= score <= high)
+            self._add(score)
+        if self._count < USUAL_FROM:
+            self._count += 1
+        slower_s = seconds if seconds > predicted_s else predicted_s
+        self._usual_s += (slower_s - self._usual_s) * (1 / self._count)
+        self._errors = None
+
+    def miss(self) -> None:
+        """Learn that a task was stopped after the upper end; how late it would have been is unknown."""
+        if len(self._sorted) >= ERRORS_MIN:
+            self._adapt(missed=True)
+
+    def interval(self, predicted_s: float, spread_s: float | None) -> tuple[float, float] | None:
+        """Lower and upper end in seconds; None while too few errors are known and there is no spread."""
+        if len(self._sorted) < ERRORS_MIN:
+            if spread_s is None:
+                return None
+            return max(0.0, predicted_s - SPREADS_90 * spread_s), predicted_s + SPREADS_90 * spread_s
+        unit, (low, high) = unit_s(predicted_s, self._usual_s), self._ends or self._interval()
+        low_s = predicted_s + unit * low if low < 0 else predicted_s
+        high_s = predicted_s + unit * high if high > 0 else predicted_s
+        return (low_s if low_s > 0 else 0.0), (high_s if high_s > 0 else 0.0)
+
+    def _adapt(self, *, missed: bool) -> None:
+        outside = self._outside + RATE * (OUTSIDE - missed)
+        self._outside = min(OUTSIDE_MAX, max(OUTSIDE_MIN, outside))
+        self._ends = None
+
+    def _add(self, score: float) -> None:
+        ordered = self._sorted
+        if len(self._order) == ERRORS_MAX:
+            del ordered[bisect_left(ordered, self._order.popleft())]
+        self._order.append(score)
+        insort(ordered, score)
+        self._ends = None
+
+    def _interval(self) -> tuple[float, float]:
+        self._ends = _shortest(self._sorted, 1 - self._outside)
+        return self._ends
+
+
+def _shortest(ordered: list[float], share: float) -> tuple[float, float]:
+    """Ends of the shortest window that holds this share, by the finite-sample rank of conformal prediction.
+
+    If the share is more than all errors seen, the window is wider than all of them, by the same amount on
+    both sides.
+    """
+    count = len(ordered)
+    held = math.ceil(share * (count + 1))
+    if held >= count:
+        beyond = (share * (count + 1) / count - 1) * (ordered[-1] - ordered[0])
+        return ordered[0] - max(0.0, beyond), ordered[-1] + max(0.0, beyond)
+    widths = list(map(operator.sub, ordered[held - 1 :], ordered))
+    first = widths.index(min(widths))
+    return ordered[first], ordered[first + held - 1]

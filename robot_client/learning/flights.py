@@ -1,0 +1,46 @@
+"""The runs that are under way on each site, and how long they should still take.
+
+They are started and ended by the offloader.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+OVERDUE = 0.5  # of its time so far: an overdue run should still need this long
+
+
+@dataclass(slots=True)
+class _Flight:
+    began_s: float
+    predicted_s: float
+
+    def left_s(self, now_s: float) -> float:
+        so_far_s = now_s - self.began_s
+        return max(self.predicted_s - so_far_s, OVERDUE * so_far_s)
+
+
+class Flights:
+    """The runs under way, by site and task. Called under the offloader's lock."""
+
+    def __init__(self, sites: Iterable[str]) -> None:
+        self._flights: dict[str, dict[int, _Flight]] = {site: {} for site in sites}
+
+    def begin(self, site: str, task: int, *, predicted_s: float, now_s: float) -> None:
+        """A run of the task with this id starts."""
+        self._flights[site][task] = _Flight(now_s, predicted_s)
+
+    def end(self, site: str, task: int) -> None:
+        """The run has ended. Safe to call twice."""
+        self._flights[site].pop(task, None)
+
+    def end_all(self, task: int) -> None:
+        """All runs of the task were given up."""
+        for flights in self._flights.values():
+            flights.pop(task, None)
+
+    def count(self, site: str) -> int:
+        return len(self._flights[site])
+
+    def left_s(self, site: str, now_s: float) -> float:
+        """How long the runs on this site should still take, one after the other."""
+        return sum([one.left_s(now_s) for one in self._flights[site].values()])

@@ -1,0 +1,76 @@
+"""The memories of all kinds of tasks, and when they are saved.
+
+What is known of one kind is in `kind`; the file that memories are saved to is in `store`.
+"""
+
+from collections.abc import Callable, Collection
+
+from offboard.common.tasks import Kind
+from offboard.robot_client.learning.kind import KindMemory
+from offboard.robot_client.learning.memory_file import KeptKind
+from offboard.robot_client.learning.store import Store
+from offboard.robot_client.policies.energy import Energy
+from offboard.robot_client.policies.objectives import Mean, Objective
+from offboard.robot_client.predictors import Predictor
+
+Snapshot = dict[str, KeptKind]
+
+
+class Memories:
+    """One memory for each kind, made when the kind is first seen. Called under the offloader's lock.
+
+    `predictor`: makes the predictor of one kind on one site.
+    `shared_work`: the sites learn seconds per unit of work for kinds that tell the work of their results.
+    `objective`: what the policy makes small (None: the mean time).
+    `energy`: what tasks take from the battery.
+    `store`: the file in which the memories outlive the process (None: they do not).
+    """
+
+    def __init__(
+        self,
+        predictor: Callable[[], Predictor],
+        *,
+        shared_work: bool = False,
+        objective: Objective | None = None,
+        energy: Energy | None = None,
+        store: Store | None = None,
+    ) -> None:
+        self._predictor = predictor
+        self._shared_work = shared_work
+        self._objective = objective or Mean()
+        self._energy = energy or Energy()
+        self._store = store
+        self._kinds: dict[str, KindMemory] = {}
+
+    def of(self, kind: Kind, sites: Collection[str]) -> KindMemory:
+        """The memory of this kind; a new one recalls what the file holds for `sites`."""
+        found = self._kinds.get(kind.name)
+        if found is None:
+            found = self._kinds[kind.name] = KindMemory(
+                kind,
+                self._predictor,
+                objective=self._objective,
+                energy=self._energy,
+                shared_work=self._shared_work,
+            )
+            if self._store is not None:
+                self._store.recall(found, sites)
+        return found
+
+    def due(self, now_s: float) -> bool:
+        """Whether the memories should be saved now."""
+        return self._store is not None and self._store.due(now_s)
+
+    def save_soon(self) -> None:
+        """Save the memories in a thread."""
+        if self._store is not None:
+            self._store.save_soon(self._store.snapshot(self._kinds))
+
+    def snapshot(self) -> Snapshot:
+        """What to save when the process ends."""
+        return {} if self._store is None else self._store.snapshot(self._kinds)
+
+    def save_last(self, last: Snapshot) -> None:
+        """Save a snapshot before the process ends, and wait for the disk. Called without the lock."""
+        if self._store is not None:
+            self._store.save_last(last)

@@ -1,0 +1,71 @@
+"""What a policy decides, and the contract of every policy.
+
+What a decision is based on is in `forecast`; `execution/race.py` carries it out.
+"""
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+from offboard.robot_client.policies.forecast import Forecast
+
+PINNED = "pinned"  # stands for the policy where the caller said where to run
+BOTH = "both"  # `where=BOTH`: the caller measures the task on all sites
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """Run the task on `site` too, from the start, to learn how long it takes there.
+
+    The first good answer is used. The slower run goes on to its end, so that its time is learnt.
+    """
+
+    site: str
+
+
+@dataclass(frozen=True, slots=True)
+class Hedge:
+    """Run the task on `site` too if no answer has come after `after_s` seconds.
+
+    The first good answer is used, and the other run is cancelled.
+    """
+
+    site: str
+    after_s: float
+
+
+class Decision(NamedTuple):
+    """Run the task on `site`; with `both`, on all sites except those in `spared`, in parallel.
+
+    `why` is the reason for people, or a function that makes it: few reasons are ever read.
+    `policy` is the name of the rule that decided. `second` is a second run on another site.
+    """
+
+    site: str
+    why: str | Callable[[], str]
+    policy: str
+    both: bool = False
+    second: Probe | Hedge | None = None
+    spared: tuple[str, ...] = ()
+
+    @property
+    def reason(self) -> str:
+        return self.why if isinstance(self.why, str) else self.why()
+
+
+class Policy(Protocol):
+    """Decides where a task runs. Called once for each task, under the offloader's lock.
+
+    A policy uses no clock, no socket and no global randomness: rules that draw get a seeded generator.
+    """
+
+    def decide(self, forecast: Forecast) -> Decision: ...
+
+
+def decide_among(sites: Collection[str], forecast: Forecast, policy: Policy) -> Decision:
+    """What the policy decides if only these sites are offered; a decision for all sites spares the others."""
+    decision = policy.decide(forecast.only(sites))
+    if not decision.both:
+        return decision
+    left_out = [site for site in forecast.sites if site not in sites]
+    return decision._replace(spared=(*decision.spared, *left_out))

@@ -1,0 +1,95 @@
+"""The rule `greedy`, and `hysteresis`, which is greedy but changes the site less often.
+
+The rules that try worse sites on purpose are in `exploration`.
+"""
+
+from functools import partial
+
+from offboard.robot_client.policies.decision import Decision
+from offboard.robot_client.policies.forecast import Forecast, Outlook, cheapest, costs_of, home
+from offboard.robot_client.sites.runner import ONBOARD, Condition
+
+WARM_UP = 6  # observations of each site before sites are compared
+MARGIN = 0.1  # of the cost of the last site: another site must cost less by this much
+
+
+class Greedy:
+    """Runs each task on the site with the lowest cost, after a short warm-up on all sites."""
+
+    name = "greedy"
+
+    def decide(self, forecast: Forecast) -> Decision:
+        for outlook in forecast.sites.values():
+            if outlook.observations < WARM_UP and (warming := self._warm_up(forecast)) is not None:
+                return warming
+        site = self._choose(forecast, costs_of(forecast))
+        return Decision(site, partial(explain, forecast, site), self.name)
+
+    def _choose(self, forecast: Forecast, costs: dict[str, float]) -> str:  # noqa: ARG002 - other rules use it
+        return cheapest(costs)
+
+    def _warm_up(self, forecast: Forecast) -> Decision | None:
+        """Run on all sites except silent ones, unless tasks under way will soon tell enough."""
+        heard = {site: one for site, one in forecast.sites.items() if not one.condition.silent}
+        cold = [site for site, one in heard.items() if _is_cold(one)]
+        if not cold or len(heard) == 1:
+            return None
+        reason = f"warm-up: too little is known of {' and '.join(sorted(cold))}"
+        silent = tuple(site for site in forecast.sites if site not in heard)
+        return Decision(home(forecast.only(heard)), reason, self.name, both=True, spared=silent)
+
+
+class Hysteresis(Greedy):
+    """Stays on the last site until another one costs less by MARGIN, so that equal sites do not alternate."""
+
+    name = "hysteresis"
+
+    def _choose(self, forecast: Forecast, costs: dict[str, float]) -> str:
+        best, last = cheapest(costs), forecast.last_site
+        if last in costs and costs[best] > (1 - MARGIN) * costs[last]:
+            return last
+        return best
+
+
+def explain(forecast: Forecast, site: str) -> str:
+    """The reason to choose this site: predictions, what was measured, how old the other sites are."""
+    sites = forecast.sites
+    parts, stale = [f"{site}: {_times(sites[site])}"], ""
+    measured = f"size {forecast.size:.3g}"
+    for name, one in sites.items():
+        if name != site:
+            parts.append(f"{name} {_times(one)}")
+            if one.age:
+                stale += f"; {name} last tried {one.age} tasks ago"
+        measured += _measured(name, one.condition, "" if len(sites) == 2 else f" {name}")
+    return f"{' against '.join(parts)}; {measured}{stale}"
+
+
+def _is_cold(one: Outlook) -> bool:
+    """A task that is under way will soon add an observation: it is waited for."""
+    return one.observations < WARM_UP and not (one.full or one.in_flight)
+
+
+def _times(one: Outlook) -> str:
+    if one.condition.silent:
+        return "silent"
+    if one.predicted_s is None:
+        return "unknown"
+    if one.low_s is None or one.high_s is None:
+        return f"{one.predicted_s * 1e3:.3g} ms"
+    return f"{one.predicted_s * 1e3:.3g} ms [{one.low_s * 1e3:.3g}, {one.high_s * 1e3:.3g}]"
+
+
+def _measured(site: str, condition: Condition, of: str) -> str:
+    said, there = "", of if of or site == ONBOARD else " there"
+    if condition.round_trip_s is not None:
+        said = f", queue{of} {condition.queue}, rtt{of} {condition.round_trip_s * 1e3:.3g} ms"
+    if site == ONBOARD and condition.load >= 0.005:
+        said += f", load{of} {condition.load:.0%}"
+    if condition.server_load >= 0.005:
+        said += f", load{there} {condition.server_load:.0%}"
+    if condition.capacity < 1.0:
+        said += f", capacity{there} {condition.capacity:.0%}"
+    if condition.wait_s:
+        said += f", wait{of} {condition.wait_s * 1e3:.3g} ms"
+    return said

@@ -1,0 +1,30 @@
+"""The published rule, exactly: Algorithm 1 of Penmetcha, Kannan and Min.
+
+The windows and the least squares that it was published with are in `predictors`.
+"""
+
+from collections.abc import Mapping
+from functools import partial
+
+from offboard.robot_client.policies.decision import Decision
+from offboard.robot_client.policies.forecast import Forecast, cheapest, home
+
+
+class Paper:
+    """Runs each task on the site with the lowest prediction, after a warm-up on all sites."""
+
+    def decide(self, forecast: Forecast) -> Decision:
+        cold = [site for site, outlook in forecast.sites.items() if not outlook.full]
+        if cold:
+            # Algorithm 1, warm-up branch: both sites, until both queues are full.
+            reason = f"warm-up: the window of {' and '.join(sorted(cold))} is not full"
+            return Decision(home(forecast), reason, "paper", both=len(forecast.sites) > 1)
+        predicted = {site: outlook.predicted_s or 0.0 for site, outlook in forecast.sites.items()}
+        # Eq. 1: the cloud only where it is strictly faster; a tie stays onboard.
+        site = cheapest(predicted)
+        return Decision(site, partial(_compared, predicted, site), "paper")
+
+
+def _compared(predicted: Mapping[str, float], site: str) -> str:
+    names = [site, *(name for name in predicted if name != site)]
+    return " against ".join(f"{name} {predicted[name] * 1e3:.1f} ms" for name in names)

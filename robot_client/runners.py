@@ -1,0 +1,34 @@
+"""Makes the runners of an offloader: one for each server, and one for onboard.
+
+What a runner does is in `sites`.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from offboard.common.errors import ConfigError
+from offboard.common.security.keys import robot_keys
+from offboard.robot_client.sites.cloud import CloudRunner
+from offboard.robot_client.sites.onboard import OnboardRunner
+from offboard.robot_client.sites.runner import Runner
+
+
+def make_runners(
+    servers: Mapping[str, str], *, keys: Path | str | None, heartbeat_s: float, seed: int
+) -> list[Runner]:
+    """Connected runners; `servers` holds the endpoint of each server by name.
+
+    `keys`: the folder with the keys (None: no encryption).
+    `heartbeat_s`: seconds between heartbeats (0: no heartbeats).
+    """
+    runners: list[Runner] = []
+    try:
+        for site, endpoint in servers.items():
+            own = None if keys is None else robot_keys(Path(keys), site)
+            runners.append(CloudRunner(endpoint, site=site, heartbeat_s=heartbeat_s, seed=seed, keys=own))
+        runners.append(OnboardRunner())
+    except ConfigError:
+        for runner in runners:
+            runner.close()
+        raise
+    return runners

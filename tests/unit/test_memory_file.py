@@ -1,0 +1,151 @@
+"""The content of a memory file: it is bounded, and a bad file is set aside as a whole."""
+
+import json
+import logging
+import tracemalloc
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from offboard.robot_client.learning import store
+from offboard.robot_client.learning.site import OBSERVATIONS_MAX
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED
+from tests.memory_robot import Robot, store_plain, store_worked
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Robot:
+    return Robot(tmp_path)
+
+
+def test_the_file_is_bounded(robot: Robot) -> None:
+    """It holds the last OBSERVATIONS_MAX observations of each site, and as many sizes with their work."""
+    with robot.started("work:average") as offload:
+        robot.ask(offload, 2 * OBSERVATIONS_MAX, store_worked)
+    kind = json.loads(robot.path.read_bytes())["kinds"]["store_worked"]
+    assert len(kind["worked"]) == OBSERVATIONS_MAX
+    assert [len(site["observations"]) for site in kind["sites"].values()] == [OBSERVATIONS_MAX] * 2
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (b"", "not JSON"),
+        (b'{"v":1,"kinds":{"store_plain":{"sou', "not JSON"),
+        (b"\x00\xff\x00", "not JSON"),
+        (b"[" * 100_000, "not JSON"),
+        (b"[1, 2]", "not a memory file of a robot-client"),
+        (b'{"name": "small"}', "not a memory file of a robot-client"),
+        (
+            b'{"v": 2, "software": "9.0", "kinds": {}}',
+            "format version 2 of software '9.0'; this version reads 1",
+        ),
+        (b'{"v": 1, "kinds": []}', "AttributeError"),
+        (b'{"v": 1, "kinds": {"store_plain": {}}}', "KeyError: 'per'"),
+        (
+            b'{"v":1,"kinds":{"a":{"source":"","per":"work","worked":[[1,NaN]],"sites":{}}}}',
+            "nan where a finite",
+        ),
+        (
+            b'{"v":1,"kinds":{"a":{"source":"","per":"work","worked":[[1,true]],"sites":{}}}}',
+            "True where a number",
+        ),
+        (b'{"v":1,"kinds":{"a":{"source":"","per":"ell","worked":[],"sites":{}}}}', "per 'ell'"),
+    ],
+)
+def test_a_file_that_cannot_be_read_is_renamed(
+    robot: Robot, caplog: pytest.LogCaptureFixture, text: bytes, reason: str
+) -> None:
+    """A torn, foreign or newer file gives one warning with its name and the reason, and a cold start."""
+    robot.path.write_bytes(text)
+    with robot.started() as offload:
+        assert offload(store_plain, 2.0) == 2.0
+    (warning,) = (one for one in caplog.records if one.levelno == logging.WARNING)
+    assert reason in warning.getMessage()
+    assert str(robot.path) in warning.getMessage()
+    assert "\n" not in warning.getMessage()
+    aside = robot.path.with_name("memory.json.unreadable")
+    assert aside.read_bytes() == text
+    assert json.loads(robot.path.read_bytes())["v"] == 1
+
+
+def test_only_the_first_bad_file_is_kept(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
+    """A second bad file is replaced, and the warning says so."""
+    aside = robot.path.with_name("memory.json.unreadable")
+    for text in (b"first", b"second"):
+        robot.path.write_bytes(text)
+        robot.started().close()
+    assert aside.read_bytes() == b"first"
+    assert f"it will be replaced: {aside} is there already" in caplog.text
+
+
+@pytest.mark.parametrize("at", ["seconds", "amount", "size"])
+def test_one_bad_number_makes_the_file_unreadable(
+    robot: Robot, caplog: pytest.LogCaptureFixture, at: str
+) -> None:
+    """The whole file is checked before anything is recalled, so no memory is half of one."""
+    with robot.started() as offload:
+        robot.ask(offload, 20)
+    whole = json.loads(robot.path.read_bytes())
+    whole["kinds"]["store_plain"]["sites"][CLOUD]["observations"][-1][at] = -1.0
+    robot.path.write_text(json.dumps(whole))
+    with robot.started() as offload:
+        assert robot.outlooks(offload)[ONBOARD].predicted_s is None
+    assert "-1.0 where a finite number from 0 was expected" in caplog.text
+
+
+@pytest.mark.parametrize("capacity", [0.0, 1.5])
+def test_a_capacity_outside_0_to_1_makes_the_file_unreadable(
+    robot: Robot, caplog: pytest.LogCaptureFixture, capacity: float
+) -> None:
+    """Times are divided by the capacity, so it must be above 0 and at most 1."""
+    with robot.started() as offload:
+        robot.ask(offload, 20)
+    whole = json.loads(robot.path.read_bytes())
+    whole["kinds"]["store_plain"]["sites"][ONBOARD]["observations"][-1]["condition"]["capacity"] = capacity
+    robot.path.write_text(json.dumps(whole))
+    with robot.started() as offload:
+        assert robot.outlooks(offload)[ONBOARD].predicted_s is None
+    assert f"{capacity} where a share above 0 to 1 was expected" in caplog.text
+
+
+def test_a_file_of_an_earlier_version_is_read(robot: Robot) -> None:
+    """Fields that an earlier version did not write have their defaults: a whole CPU without load."""
+    robot.sites[0].measured = UNMEASURED
+    with robot.started() as offload:
+        robot.ask(offload, 20)
+        before = robot.outlooks(offload)
+    whole = json.loads(robot.path.read_bytes())
+    for site in whole["kinds"]["store_plain"]["sites"].values():
+        for one in site["observations"]:
+            del one["condition"]["capacity"], one["condition"]["server_load"], one["ahead"]
+    robot.path.write_text(json.dumps(whole))
+    with robot.started() as offload:
+        assert robot.outlooks(offload)[ONBOARD].predicted_s == before[ONBOARD].predicted_s
+
+
+def test_a_file_that_is_too_large_is_not_read(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
+    """A sparse file of 1 GiB is renamed, and at most FILE_BYTES_MAX of it are read."""
+    with robot.path.open("wb") as file:
+        file.truncate(2**30)
+    tracemalloc.start()
+    robot.started().close()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2 * store.FILE_BYTES_MAX
+    assert f"over {store.FILE_BYTES_MAX} bytes" in caplog.text
+
+
+def test_a_damaged_file_never_stops_the_robot(robot: Robot) -> None:
+    """If any one byte of a good file is changed, the robot still starts and answers."""
+    with robot.started(window=5) as offload:
+        robot.ask(offload, 6)
+    good, rng = robot.path.read_bytes(), Random(3)
+    for _ in range(300):
+        spoilt = bytearray(good)
+        spoilt[rng.randrange(len(spoilt))] = rng.randrange(256)
+        robot.path.write_bytes(spoilt)
+        offload = robot.started(window=5)
+        assert offload(store_plain, 2.0) == 2.0
+        robot.path.with_name("memory.json.unreadable").unlink(missing_ok=True)
