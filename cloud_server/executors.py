@@ -18,7 +18,7 @@ from typing import Protocol
 from offboard.cloud_server.outcome import Blobs, Outcome, run_task, warm_kinds
 from offboard.cloud_server.worker_pool import Call, Died, Setup, Worker
 from offboard.common.errors import CloudBroken
-from offboard.common.host.cpu import process_s
+from offboard.common.host.cpu_time import process_s
 from offboard.common.threads import join_all
 from offboard.common.wanted import always
 from offboard.common.wire.blobs import Buffer

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from offboard.common import tasks
 from offboard.common.errors import ProtocolError, Unwanted, describe
-from offboard.common.host import cpu
+from offboard.common.host import cpu_time
 from offboard.common.wanted import always, call_while
 from offboard.common.wire.blobs import Buffer, StoredBlob
 from offboard.common.wire.values import decode, encode
@@ -35,7 +35,7 @@ def run_task(
     kind_name: str, frames: Sequence[Buffer], blobs: Blobs, wanted: Callable[[], bool] = always
 ) -> Outcome:
     """Decode the arguments, call the task, encode its result; whatever it raises becomes the outcome."""
-    cpu_before_s, started = cpu.used_s(), time.perf_counter()
+    cpu_before_s, started = cpu_time.used_s(), time.perf_counter()
     status, failure, unwanted = "ok", "", False
     result: list[Buffer] = []
     try:
@@ -47,12 +47,12 @@ def run_task(
     except BaseException as error:  # noqa: BLE001 - a task may raise anything
         status, failure, unwanted = "failed", describe(error), isinstance(error, Unwanted)
     run_s = time.perf_counter() - started
-    return Outcome(status, failure, run_s, cpu.used_s() - cpu_before_s, result, server_fault=unwanted)
+    return Outcome(status, failure, run_s, cpu_time.used_s() - cpu_before_s, result, server_fault=unwanted)
 
 
 def warm_kinds() -> None:
     """Run the warm of each kind, once a process."""
-    cpu.used_s()  # the first call looks for what to read
+    cpu_time.used_s()  # the first call looks for what to read
     for kind in tasks.kinds():
         if kind.warm is not None:
             kind.warm()

@@ -23,8 +23,9 @@ from offboard.cloud_server.reply_queue import Outbox
 from offboard.cloud_server.tcp_connections import Backlog, end, other_end
 from offboard.common import VERSION, tasks
 from offboard.common.errors import ConfigError, OffloadError, ProtocolError
-from offboard.common.host.cpu import SELF
-from offboard.common.host.load import SERVER_EVERY_S, Load, LoadWatch
+from offboard.common.host.cgroup import SELF
+from offboard.common.host.load import SERVER_EVERY_S, Load
+from offboard.common.host.load_watch import LoadWatch
 from offboard.common.security.keys import KeyPair
 from offboard.common.wire.blobs import BlobStore, Buffer
 from offboard.common.wire.channel import Channel

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from offboard.common import errors
 from offboard.common.errors import ConfigError, TaskError
-from offboard.common.host import cpu
+from offboard.common.host import cpu_time
 from offboard.common.tasks import kind_of
 from offboard.robot_client.offloader import BOTH, Offloader
 from offboard.robot_client.records.trace import Record
@@ -86,7 +86,7 @@ class Drive:
         kind = kind_of(self._work.function)
         if kind.warm is not None:
             kind.warm()
-        cpu.used_s()  # the first call looks for what to read
+        cpu_time.used_s()  # the first call looks for what to read
         if kind.duplicate:
             with contextlib.suppress(TaskError):  # task 0 will say it again
                 offload(self._work.function, *self._work.request(), where=BOTH)
