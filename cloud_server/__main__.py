@@ -54,8 +54,9 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
     from offboard.cloud_server.http_api import Web, create_app
     from offboard.cloud_server.metrics import Metrics
     from offboard.cloud_server.server import Server
-    from offboard.common.security.guard import read_token, warn_each_minute
+    from offboard.common.security.exposure import warn_each_minute
     from offboard.common.security.keys import server_keys
+    from offboard.common.security.private_files import read_token
     from offboard.common.tasks import kinds, load_modules
 
     sys.setswitchinterval(SWITCH_S)

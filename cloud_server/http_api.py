@@ -13,7 +13,7 @@ from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_l
 from offboard.cloud_server.metrics import Status
 from offboard.common import VERSION, tasks
 from offboard.common.errors import ConfigError, MissingExtra
-from offboard.common.security.guard import Guard
+from offboard.common.security.http_guard import HttpGuard
 from offboard.common.token_bucket import Bucket
 
 try:
@@ -46,7 +46,7 @@ def create_app(
     """
     app = FastAPI(title="Offboard cloud server", version=VERSION, redoc_url=None)
     open_paths = ("/health", "/ready", *(["/metrics"] if loopback else []))
-    app.add_middleware(Guard, token=token, open_paths=open_paths, loopback=loopback)
+    app.add_middleware(HttpGuard, token=token, open_paths=open_paths, loopback=loopback)
 
     @app.get("/health", summary="200 while the loop turns; version and details with the token")
     async def health(request: Request) -> JSONResponse:

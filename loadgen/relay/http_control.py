@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Any, Protocol
 
 from offboard.common.errors import ConfigError, MissingExtra
-from offboard.common.security.guard import Guard
+from offboard.common.security.http_guard import HttpGuard
 from offboard.loadgen.relay.link.link import NAMES
 from offboard.loadgen.relay.schedule import Linked, Schedule, parse_schedule
 
@@ -116,7 +116,7 @@ def control_app(
         redoc_url=None,
     )
     app.add_middleware(BoundedBody)
-    app.add_middleware(Guard, token=token, open_paths=("/health",), loopback=loopback)
+    app.add_middleware(HttpGuard, token=token, open_paths=("/health",), loopback=loopback)
 
     @app.get("/health")
     async def health() -> dict[str, Any]:

@@ -31,7 +31,7 @@ from offboard.common.errors import (
     ProtocolError,
     TaskFailed,
 )
-from offboard.common.security.guard import on_loopback
+from offboard.common.security.exposure import on_loopback
 from offboard.common.security.keys import RobotKeys
 from offboard.common.tasks import Kind, Task, kinds
 from offboard.common.wire import messages as wire
