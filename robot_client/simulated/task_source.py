@@ -129,7 +129,8 @@ def make_work(config: RobotConfig) -> Work:
 
 def read_prior(path: Path, resolution: float) -> "GridMap":
     """The map that the robot was given; ROS maps at the planning resolution."""
-    from offboard.common.planning.maps import read_map, resampled
+    from offboard.common.planning.map_files import read_map
+    from offboard.common.planning.maps import resampled
 
     grid = read_map(path)
     return grid if path.suffix == ".map" else resampled(grid, resolution)
