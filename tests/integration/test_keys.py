@@ -390,7 +390,7 @@ def test_a_wrong_folder_of_robots_is_refused(keys: Keys) -> None:
     assert done.returncode == 2
     assert done.stderr == (
         f"cloud-server: --robots: {keys.robots}: No such file or directory; "
-        "the public key of each robot is wanted there\n"
+        "it must hold the public key of each robot\n"
     )
 
 

@@ -68,10 +68,9 @@ OWNERS = {
         "common/wire/channel.py",
         "common/security/keys.py",
         "robot_client/sites/cloud.py",
-        "cloud_server/reply_queue.py",
         "cloud_server/authorisation.py",
+        "cloud_server/robot_socket.py",
         "cloud_server/server.py",
-        "cloud_server/unsent_replies.py",
     },
     "fastapi": {
         "cloud_server/http_api.py",
