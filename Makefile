@@ -36,7 +36,7 @@ type: $(DEV_READY) ## mypy, strict, on the unpacked wheel
 	cd $(CACHE)/typed && $(BIN_ABS)/python -m zipfile -e offboard-*.whl . && $(BIN_ABS)/mypy --config-file $(CURDIR)/pyproject.toml --cache-dir $(CACHE)/mypy -p offboard
 
 # Tests that do not mind another one beside them.
-CROWDED := tests/unit $(addprefix tests/integration/test_,$(addsuffix .py,alone attacks blobs compare crashes dataset demo fuzz keys own_task processes robot_workload toxiproxy wheel))
+CROWDED := tests/unit tests/integration/executors $(addprefix tests/integration/test_,$(addsuffix .py,alone attacks blobs channel compare cpu_time crashes dataset demo fuzz keys own_task processes robot_workload toxiproxy wheel))
 test: $(DEV_READY) ## every test that this machine can run; what is skipped says why
 	$(BIN)/pytest --numprocesses 2 $(CROWDED)
 	$(BIN)/pytest $(addprefix --ignore ,$(CROWDED))

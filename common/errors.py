@@ -10,7 +10,7 @@ def describe(error: BaseException) -> str:
     try:
         return f"{type(error).__name__}: {error}"
     except Exception:  # noqa: BLE001 - a user's __str__ may raise anything
-        return f"{type(error).__name__}: (its text cannot be had)"
+        return f"{type(error).__name__}: (it has no readable text)"
 
 
 class ConfigError(OffloadError):
