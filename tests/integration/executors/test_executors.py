@@ -41,7 +41,7 @@ def test_a_task_runs_and_its_result_comes_back(executor: Executor) -> None:
         (
             "exec_object",
             [],
-            "BadValue: a value of type builtins.object cannot cross the wire",
+            "BadValue: a value of type builtins.object cannot be sent; ",
         ),
         ("exec_echo", [1, 2], "TypeError: exec_echo() takes 1 positional argument but 2 were given"),
         ("exec_unheard_of", [], "UnknownTask: no task named 'exec_unheard_of'; known:"),
