@@ -1,4 +1,4 @@
-"""All errors that Offboard raises. Each one says what its catcher does."""
+"""All errors that Offboard raises, and what happens when each one is caught."""
 
 
 class OffloadError(Exception):

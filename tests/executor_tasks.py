@@ -60,7 +60,7 @@ def exec_wait_for_file(path):
 
 @task("exec_burn", size=lambda seconds: seconds)
 def exec_burn(seconds):
-    """Compute until this thread has used so many CPU seconds; returns those that it used."""
+    """Compute until this thread has used this many CPU seconds; returns the exact number."""
     start = time.thread_time()
     while (used := time.thread_time() - start) < seconds:
         pass

@@ -1,4 +1,4 @@
-"""What a search gets beside its map, and what it returns: scan hits and routes, in cells.
+"""The input and the result of a search: hits of a scan, and routes, both in cells.
 
 `planner` turns scans in metres into hits, and routes into plans.
 """

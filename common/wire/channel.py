@@ -1,8 +1,8 @@
 """A ZMQ socket that one thread reads and any thread sends on.
 
 Several threads may use a ZMQ socket if a lock lets only one of them in at a time. The reader must then not
-wait inside the socket; it waits for the file descriptor on which libzmq signals. What is sent is decided
-elsewhere.
+wait inside the socket; it waits for the file descriptor on which libzmq signals. `messages` says what the
+frames mean.
 """
 
 import contextlib

@@ -59,8 +59,8 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Keys:
 
 
 @pytest.fixture(scope="module")
-def wicked(keys: Keys) -> Path:
-    return keys.add("wicked")
+def attacker(keys: Keys) -> Path:
+    return keys.add("attacker")
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def good(keys: Keys) -> Path:
 
 
 @pytest.fixture(scope="module")
-def served(keys: Keys, wicked: Path, good: Path) -> Iterator[Served]:  # noqa: ARG001 - the keys must exist before
+def served(keys: Keys, attacker: Path, good: Path) -> Iterator[Served]:  # noqa: ARG001 - the keys must exist before
     """One server for all attacks: what one attack breaks, the next one finds."""
     unbounded = ("--robot-mib-s", "65536")  # so that no attack is cut off for its rate
     served = Served(
@@ -87,8 +87,8 @@ def served(keys: Keys, wicked: Path, good: Path) -> Iterator[Served]:  # noqa: A
 
 
 @pytest.fixture
-def target(served: Served, wicked: Path) -> Target:
-    return Target(served.endpoint, int(served.http.rpartition(":")[2]), wicked)
+def target(served: Served, attacker: Path) -> Target:
+    return Target(served.endpoint, int(served.http.rpartition(":")[2]), attacker)
 
 
 def memory(served: Served) -> int:
@@ -232,11 +232,11 @@ def test_unread_replies_are_limited(served: Served, target: Target, good: Path) 
     is_served(served, good)
 
 
-def test_bytes_a_second_are_bounded(keys: Keys, wicked: Path, good: Path) -> None:
+def test_bytes_per_second_are_limited(keys: Keys, attacker: Path, good: Path) -> None:
     """Above --robot-mib-s requests are answered `busy`; another robot is served."""
     served = Served("--keys", str(keys.server), *SIZES, "--robot-mib-s", "1")
     try:
-        with dealer(Target(served.endpoint, 0, wicked)) as client:
+        with dealer(Target(served.endpoint, 0, attacker)) as client:
             body = wire.encode([bytes(60_000)]).frames
             statuses = []
             for _ in range(350):  # 64 KiB each; the first 16 MiB are free
@@ -252,18 +252,18 @@ def test_bytes_a_second_are_bounded(keys: Keys, wicked: Path, good: Path) -> Non
         served.close()
 
 
-def test_a_flood_is_cut_off(keys: Keys, wicked: Path, good: Path) -> None:
+def test_a_flood_is_cut_off(keys: Keys, attacker: Path, good: Path) -> None:
     """A robot that keeps flooding is disconnected and shut out for a while; other robots are served."""
     served = Served("--keys", str(keys.server), *SIZES)
     try:
-        with contextlib.closing(ATTACKS["flood"](Target(served.endpoint, 0, wicked))) as attack:
+        with contextlib.closing(ATTACKS["flood"](Target(served.endpoint, 0, attacker))) as attack:
             until_s = time.monotonic() + WAIT_S
-            while not served.logged("cut off robot wicked") and time.monotonic() < until_s:
+            while not served.logged("cut off robot attacker") and time.monotonic() < until_s:
                 next(attack)
-        assert served.logged("cut off robot wicked") == 1
-        assert not is_let_in(served, wicked)
+        assert served.logged("cut off robot attacker") == 1
+        assert not is_let_in(served, attacker)
         is_served(served, good)
-        until(lambda: is_let_in(served, wicked), CUT_OFF_S + WAIT_S)
+        until(lambda: is_let_in(served, attacker), CUT_OFF_S + WAIT_S)
     finally:
         served.close()
 
@@ -325,12 +325,12 @@ def test_slow_http_connections_are_closed(served: Served) -> None:
             client.close()
 
 
-def test_five_thousand_robots_can_be_idle(keys: Keys, wicked: Path, good: Path) -> None:
+def test_five_thousand_robots_can_be_idle(keys: Keys, attacker: Path, good: Path) -> None:
     """The server raises its limit of open files, serves another robot, and takes the documented memory."""
     served = Served("--keys", str(keys.server), *SIZES, files=1024)
     try:
         at_first = memory(served)
-        attack = ATTACKS["idle"](Target(served.endpoint, 0, wicked))
+        attack = ATTACKS["idle"](Target(served.endpoint, 0, attacker))
         with contextlib.closing(attack):
             for _ in range(IDLE):
                 next(attack)

@@ -111,14 +111,14 @@ def test_a_crash_fails_its_own_task_alone(
     """
     changes: list[str] = []
     executor = make(2, "offboard.common.planning.planner", changes=changes)
-    beside = submit(executor, "nap", 0.5)
+    at_the_same_time = submit(executor, "nap", 0.5)
     outcome = run(executor, kind, *args)
     assert (outcome.status, outcome.error) == ("failed", f"the worker {how} while this task ran")
     assert (outcome.crashed, outcome.server_fault, outcome.cpu_s) == (True, server_fault, None)
     replaced_s = outcome.run_s + until(lambda: executor.up == 2, "another worker")
     assert value(run(executor, "echo", 1)) == 1
     assert replaced_s <= REPLACED_S, f"{replaced_s:.2f} s"
-    assert value(beside.result(WAIT_S)) == 0.5
+    assert value(at_the_same_time.result(WAIT_S)) == 0.5
     both = [submit(executor, "nap", 0.2) for _ in range(2)]
     assert [value(one.result(WAIT_S)) for one in both] == [0.2, 0.2]
     until(lambda: len(changes) == 5, "another spare one")
@@ -333,12 +333,12 @@ def test_a_robot_gets_the_reason_and_others_are_served(
         (crashes.grab, (10 * GIB,), "MemoryError: Unable to allocate 10.0 GiB"),
     ):
         answers: list[float] = []
-        beside = threading.Thread(target=lambda: answers.append(other(nap, 0.5)))  # noqa: B023
-        beside.start()
+        at_the_same_time = threading.Thread(target=lambda: answers.append(other(nap, 0.5)))  # noqa: B023
+        at_the_same_time.start()
         time.sleep(0.1)
         with pytest.raises(TaskFailed, match=re.escape(reason)):
             offload(fatal, *args)
-        beside.join()
+        at_the_same_time.join()
         assert answers == [0.5]
         assert other.last is not None
         assert (other.last.used, len(other.last.executions)) == (CLOUD, 1)
