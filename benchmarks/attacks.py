@@ -15,7 +15,8 @@ from benchmarks.measure import Requirement, Table, each_of
 from benchmarks.servers import READY_S, cloud_server, running
 from benchmarks.tasks import nothing
 from offboard.common.planning import planner
-from offboard.common.planning.maps import free_pairs, read_map
+from offboard.common.planning.map_files import read_map
+from offboard.common.planning.maps import free_pairs
 from offboard.common.planning.planner import Point, Pose, plan_path
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.sites.runner import CLOUD

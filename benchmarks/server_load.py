@@ -14,7 +14,8 @@ import numpy as np
 from benchmarks.measure import Requirement, Table
 from benchmarks.servers import cloud_server, running, serve
 from offboard.common.planning import planner
-from offboard.common.planning.maps import free_pairs, read_map
+from offboard.common.planning.map_files import read_map
+from offboard.common.planning.maps import free_pairs
 from offboard.common.planning.planner import Point, Pose
 from offboard.common.tasks import Task, kind_of
 from offboard.robot_client.sites.cloud import CloudRunner

@@ -1,1 +1,1 @@
-"""Runs tasks for robots and says how it is doing."""
+"""Runs tasks for robots and reports its state."""

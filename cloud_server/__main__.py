@@ -58,11 +58,12 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
     sys.path.insert(0, str(Path.cwd()))  # as `python -m` does, so that --tasks finds modules of the user
     # These load heavy libraries, which --help and a wrong flag do not need.
     from offboard.cloud_server.executors import EXECUTORS
-    from offboard.cloud_server.http_api import Web, create_app
+    from offboard.cloud_server.http_api import HttpServer, create_app
     from offboard.cloud_server.metrics import Metrics
-    from offboard.cloud_server.server import Server
-    from offboard.common.security.guard import read_token, warn_each_minute
+    from offboard.cloud_server.server import Limits, Server
+    from offboard.common.security.exposure import warn_each_minute
     from offboard.common.security.keys import server_keys
+    from offboard.common.security.private_files import read_token
     from offboard.common.tasks import kinds, load_modules
 
     sys.setswitchinterval(SWITCH_S)
@@ -83,11 +84,13 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
         config.listen,
         executor(config.workers, modules, config.blob_bytes_max, config.worker_memory_bytes),
         metrics,
-        queue_max=config.queue_max,
-        blob_bytes_max=config.blob_bytes_max,
-        message_bytes_max=config.message_bytes_max,
-        robot_bytes_a_s=config.robot_bytes_a_s,
-        drain_s=config.drain_s,
+        Limits(
+            queue_max=config.queue_max,
+            blob_bytes_max=config.blob_bytes_max,
+            message_bytes_max=config.message_bytes_max,
+            robot_bytes_per_s=config.robot_bytes_a_s,
+            drain_s=config.drain_s,
+        ),
         on_ready=lambda: log.info("ready: listening on %s, http://%s", server.endpoint, web.address),
         keys=keys,
         robots=config.robots_folder,
@@ -100,7 +103,7 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
         loopback=config.http_on_loopback,
         insecure=bool(config.open_ways),
     )
-    web = Web(app, config.http_address)
+    web = HttpServer(app, config.http_address)
     web.start()
     if config.open_ways:
         warn_each_minute(config.open_ways)

@@ -1,6 +1,6 @@
-"""Who may talk to the server: a folder of public keys, asked at each handshake and at each message.
+"""Which robots may talk to the server: those whose public keys are in a folder.
 
-libzmq asks at the handshake alone, so who is removed later is found here: its connection is closed.
+libzmq asks at each handshake only. If a robot is removed later, this file closes its connection.
 """
 
 import logging
@@ -8,7 +8,7 @@ import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import zmq
 from zmq.utils import z85
@@ -18,22 +18,54 @@ from offboard.cloud_server.tcp_connections import end, other_end
 from offboard.common.errors import ConfigError
 from offboard.common.security.keys import PUBLIC, read_public
 
-ZAP = "inproc://zeromq.zap.01"  # where libzmq asks (RFC 27)
+ZAP = "inproc://zeromq.zap.01"  # the address where libzmq asks (RFC 27)
 ZAP_VERSION = b"1.0"
 ZAP_DOMAIN = b"offboard"
 ZAP_FRAMES = 7  # version, id, domain, address, routing id, mechanism, key
-RELOAD_S = 1.0  # between two looks at the folder
-SETTLED_NS = 2_000_000_000  # age at which the time of a file tells whether it was changed since
-ROBOTS_MAX = 10_000  # files; those beyond it, by name, are not known
-CUT_KEPT = 4096  # connections that were cut, and whose waiting tasks shall not run
-LOG_PAUSE_S = 10.0  # least time between two warnings about refused robots
+RELOAD_S = 1.0  # between two checks of the folder
+SETTLED_NS = 2_000_000_000  # from this age on, the time stamp of a file shows every later change
+ROBOTS_MAX = 10_000  # key files; those beyond it, in the order of their names, are ignored
+CUT_KEPT = 4096  # connections remembered as cut off, so that their waiting tasks do not run
+LOG_PAUSE_S = 10.0  # at least, between two warnings about refused robots
 
 log = logging.getLogger("offboard.cloud_server")
 
 
+class Access(Protocol):
+    """Answers questions about connections. All methods may be called from any thread."""
+
+    def lets_in(self, peer: zmq.Frame) -> bool:
+        """True if the server may read messages of the connection that this frame names."""
+
+    def robot_of(self, peer: bytes) -> bytes:
+        """The robot of this connection. A robot may have several connections."""
+
+    def shut_out(self, peer: bytes, seconds: float) -> str:
+        """Refuse new connections of this robot for a while; returns its name."""
+
+    def knows(self, peer: bytes) -> bool:
+        """True if tasks of this connection may still run and be answered."""
+
+
+class Everyone:
+    """Access to a server without keys: every connection counts as a robot of its own."""
+
+    def lets_in(self, peer: zmq.Frame) -> bool:  # noqa: ARG002
+        return True
+
+    def robot_of(self, peer: bytes) -> bytes:
+        return peer
+
+    def shut_out(self, peer: bytes, seconds: float) -> str:  # noqa: ARG002 - it cannot be recognised
+        return "robot without a key"
+
+    def knows(self, peer: bytes) -> bool:  # noqa: ARG002
+        return True
+
+
 @dataclass(frozen=True, slots=True)
 class _Connection:
-    """Whose it is: public key and name; its file, and what the kernel calls the other end of it."""
+    """A connection of a robot: `user` is its public key, `file` and `other_end` are known to the kernel."""
 
     user: str
     name: str
@@ -41,22 +73,22 @@ class _Connection:
     other_end: Any
 
 
-class Robots:
-    """The robots of a folder. `lets_in` and `knows` may be called from any thread, and cost a microsecond.
+class Authorisation:
+    """Access for the robots whose public keys are in a folder. A question costs about a microsecond.
 
-    A thread of its own answers libzmq's questions, looks at the folder every RELOAD_S, and cuts off whoever
-    is no longer in it. It ends with the context.
+    A thread answers libzmq, reads the folder again every RELOAD_S, and closes the connections of robots that
+    were removed. It ends with the ZMQ context.
     """
 
     def __init__(self, context: "zmq.Context[Any]", folder: Path, metrics: Metrics) -> None:
         self._folder = folder
         self._metrics = metrics
-        self._known: dict[str, str] = {}  # name of the robot by its public key
-        self._seen: object = None  # the folder, as it was last read whole
+        self._known: dict[str, str] = {}  # names of robots by their public keys
+        self._seen: object = None  # the state of the folder when it was last read completely
         self._problems: list[str] = []
         self._connections: dict[bytes, _Connection] = {}
         self._cut: dict[bytes, None] = {}
-        self._shut_out: dict[str, float] = {}  # public keys, until when
+        self._shut_out: dict[str, float] = {}  # for a public key, until when it is shut out
         self._last_warning = -float("inf")
         for problem in self._reload():
             raise ConfigError(f"--robots: {problem}")
@@ -67,7 +99,6 @@ class Robots:
         threading.Thread(target=self._run, name="robots", daemon=True).start()
 
     def lets_in(self, peer: zmq.Frame) -> bool:
-        """Whether a message of this connection, named by its first frame, is to be read."""
         user = _user(peer)
         name = self._known.get(user)
         if name is None:
@@ -80,26 +111,23 @@ class Robots:
             self._cut.pop(peer.bytes, None)
         return True
 
-    def of(self, peer: bytes) -> bytes:
-        """Whose connection this is, however many of his there are."""
+    def robot_of(self, peer: bytes) -> bytes:
         connection = self._connections.get(peer)
         return peer if connection is None else connection.user.encode()
 
     def shut_out(self, peer: bytes, seconds: float) -> str:
-        """Refuse the handshakes of this robot for a while; its name."""
         connection = self._connections.get(peer)
-        if connection is None:  # it is gone
-            return "a robot"
+        if connection is None:
+            return "robot that has left"
         self._shut_out = {user: until for user, until in self._shut_out.items() if until > time.monotonic()}
         self._shut_out[connection.user] = time.monotonic() + seconds
-        return connection.name
+        return f"robot {connection.name}"
 
     def knows(self, peer: bytes) -> bool:
-        """Whether a connection that was let in may still have tasks run, and hear of them."""
         return peer not in self._cut
 
     def _run(self) -> None:
-        """Until the context ends."""
+        """Answer libzmq and check the folder until the context ends."""
         try:
             while True:
                 if self._socket.poll(int(RELOAD_S * 1000)):
@@ -108,11 +136,11 @@ class Robots:
         except zmq.ContextTerminated:
             pass
         finally:
-            self._known = {}  # should this thread ever end before the server does, nobody is let in
+            self._known = {}  # if this thread ever ends before the server, no robot is let in
             self._socket.close(linger=0)
 
     def _tend(self) -> None:
-        """Look at the folder when it is time, cut off who left it, forget connections that are closed."""
+        """If a check is due: read the folder, cut off removed robots, forget closed connections."""
         now = time.monotonic()
         if now < self._look_due:
             return
@@ -128,10 +156,9 @@ class Robots:
                 self._connections.pop(peer, None)
 
     def _reload(self) -> list[str]:
-        """Read the folder again if it changed; what is wrong in it. Unreadable: nobody is known."""
+        """Read the folder if it has changed; returns what is wrong in it. Unreadable: no robot is known."""
         self._look_due = time.monotonic() + RELOAD_S
         problems: list[str] = []
-        known: dict[str, str] = {}
         try:
             files = sorted(
                 path
@@ -140,32 +167,33 @@ class Robots:
             )
         except OSError as error:
             files = []
-            problems.append(f"{self._folder}: {error.strerror}; the public key of each robot is wanted there")
+            problems.append(f"{self._folder}: {error.strerror}; it must hold the public key of each robot")
         seen = [(path, _state(path)) for path in files]
         if seen == self._seen:
             return []
         if len(files) > ROBOTS_MAX:
             problems.append(f"{self._folder}: {len(files)} keys, at most {ROBOTS_MAX} are allowed")
+        known: dict[str, str] = {}
         for path in files[:ROBOTS_MAX]:
             try:
                 known[read_public(path).decode()] = path.stem
             except ConfigError as error:
                 problems.append(str(error))
-        # A file that was changed lately may change once more without a later time: then look again.
-        lately_ns = time.time_ns() - SETTLED_NS
-        self._seen = None if problems or any(state[-1] > lately_ns for _, state in seen) else seen
-        self._say_changes(known)
+        # A recently changed file may change again without a later time stamp: then read it again.
+        recent_ns = time.time_ns() - SETTLED_NS
+        self._seen = None if problems or any(state[-1] > recent_ns for _, state in seen) else seen
+        self._log_changes(known)
         self._known = known
         return problems
 
-    def _say_changes(self, known: dict[str, str]) -> None:
+    def _log_changes(self, known: dict[str, str]) -> None:
         for what, some, others in (("known", known, self._known), ("removed", self._known, known)):
             names = [name for key, name in some.items() if key not in others]
             if names:
                 log.info("robots %s: %s", what, ", ".join(names))
 
     def _judge(self, asked: list[bytes]) -> list[bytes]:
-        """Answer libzmq; the user of a connection is its public key."""
+        """The answer to a question of libzmq. The user id of a connection is its public key."""
         request_id = asked[1] if len(asked) > 1 else b""
         well_formed = len(asked) == ZAP_FRAMES and asked[0] == ZAP_VERSION and asked[5] == b"CURVE"
         user = z85.encode(asked[6]).decode() if well_formed and len(asked[6]) == 32 else ""
@@ -176,12 +204,12 @@ class Robots:
         if now - self._last_warning >= LOG_PAUSE_S:
             self._last_warning = now
             where = asked[3].decode(errors="replace") if well_formed else "?"
-            why = "is shut out for a while" if user in self._known else f"is not in {self._folder}"
+            why = "was cut off a moment ago" if user in self._known else f"is not in {self._folder}"
             log.warning("refused a robot at %s: its key %s %s", where, user, why)
         return [ZAP_VERSION, request_id, b"400", b"unknown robot", b"", b""]
 
     def _cut_off(self, peer: bytes, connection: _Connection) -> None:
-        """End the connection; what it waits for shall not run, and what runs not be answered."""
+        """Close the connection. Its waiting tasks do not run, and its running tasks are not answered."""
         if peer in self._cut:
             return
         self._cut[peer] = None
@@ -194,12 +222,12 @@ class Robots:
 def _user(peer: zmq.Frame) -> str:
     try:
         return str(peer.get("User-Id"))
-    except zmq.ZMQError:  # it has none
+    except zmq.ZMQError:  # the connection has none
         return ""
 
 
 def _state(path: Path) -> tuple[int, ...]:
-    """Of a file: another one after any change; none where it was removed at this moment."""
+    """A value that differs after every change of the file; (0,) if the file was removed just now."""
     try:
         found = path.stat()
     except OSError:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError
-from offboard.common.security.guard import OPEN_REMEDY, on_loopback
+from offboard.common.security.exposure import OPEN_REMEDY, on_loopback
 
 MIB = 1024 * 1024
 ROBOTS = "robots"  # default folder for the keys of robots, inside the folder of --keys

@@ -1,41 +1,42 @@
-"""The bounded lines of accepted requests, one for each robot, and requests that are not let in again."""
+"""The queue of accepted requests: one line per robot, and the next robot is the one that had the least time.
 
-from collections import Counter, OrderedDict, deque
+It reads no clock and no socket; `scheduler` decides which requests enter it.
+"""
+
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from offboard.common.wire.blobs import StoredBlob
 from offboard.common.wire.messages import Request, byte_count
 
-USUAL_RATE = 0.1  # of the usual run time, with each run
-ROBOTS_MAX = 1024  # of which it is known what they had; beyond it those are forgotten that ask for nothing
-CRASHES_MAX = 3  # of one request
-CRASHED_KEPT = 1024  # requests whose crashes are remembered
+USUAL_RATE = 0.1  # share of each new run time in the usual run time
+ROBOTS_MAX = 1024  # robots whose worker time is remembered; beyond it those without requests are forgotten
 
 
 @dataclass(slots=True, eq=False)
 class Work:
-    """An accepted request; it pins its blobs. Times are on the server's monotonic clock."""
+    """An accepted request with its blobs. Times are on the monotonic clock of the server."""
 
     peer: bytes
     request: Request
     blobs: dict[bytes, StoredBlob]
     arrived: float
-    robot: bytes  # its public key, or the connection where there are no keys
+    robot: bytes  # its public key; the connection if there are no keys
     queue_s: float = 0.0
     wanted: bool = True
-    charged_s: float = 0.0  # to its robot, when it began
+    charged_s: float = 0.0  # worker time that its robot was charged at the start
 
     def expired(self, now: float) -> bool:
         return now - self.arrived >= self.request.budget_s
 
 
-class Waiting:
-    """Fair between robots, first come, first served for each; at most `queue_max` requests in all.
+class FairQueue:
+    """At most `queue_max` requests. It is fair between robots; each robot is served first come, first served.
 
-    Next is the robot that has had the least of the workers' time, where time without requests counts as
-    served (start-time fair queueing, Goyal, Vin and Cheng 1996, with what runs usually take until they are
-    over). Where all is taken, the longest line gives way.
+    The next request is that of the robot that has had the least worker time. Time without requests counts as
+    served, and a running request counts with the usual run time until it ends (start-time fair queueing,
+    Goyal, Vin and Cheng 1996). If the queue is full, the longest line loses its newest request.
     """
 
     def __init__(self, queue_max: int) -> None:
@@ -43,21 +44,21 @@ class Waiting:
         self._lines: dict[bytes, deque[Work]] = {}
         self._running: dict[bytes, int] = {}
         self._had_s: dict[bytes, float] = {}  # worker time of each robot
-        self._least_s = 0.0  # of the robot that was last chosen: who comes anew begins there
+        self._least_s = 0.0  # worker time of the robot chosen last; a returning robot starts with it
         self._usual_s = 0.0
         self._count = 0
-        self._held = _Held()
+        self._held = _HeldBytes()
 
     def bytes_with(self, work: Work) -> int:
-        """In memory for all requests that wait or run, once this one does."""
+        """Memory of all waiting and running requests, in bytes, if this one is added."""
         return self._held.byte_count + self._held.more(work)
 
     def closed_to(self, robot: bytes) -> bool:
-        """Whether all is taken, and no other robot's line is longer than this one's would be."""
+        """True if the queue is full and no other robot's line would be longer than this robot's."""
         return self._count >= self.queue_max and len(self._longest()) <= len(self._lines.get(robot, ())) + 1
 
     def add(self, work: Work) -> Work | None:
-        """Put it in line, unless that is closed to its robot; the request that had to go for it."""
+        """Add a request, unless the queue is closed to its robot; returns the request that had to leave."""
         evicted = None
         if self._count >= self.queue_max:
             line = self._longest()
@@ -74,7 +75,7 @@ class Waiting:
         return max(self._lines.values(), key=len)
 
     def next(self) -> Work | None:
-        """The request to run now; it is charged to its robot until `done` says what it took."""
+        """The next request. Its robot is charged the usual run time, until `done` reports the true one."""
         if not self._lines:
             return None
         robot = min(self._lines, key=lambda robot: (self._had_s[robot], self._lines[robot][0].arrived))
@@ -90,7 +91,7 @@ class Waiting:
         return work
 
     def done(self, work: Work, run_s: float) -> None:
-        """What `next` gave out has ended after `run_s` in a worker, 0 where it never began."""
+        """A request from `next` has ended after `run_s` in a worker, or never started (0)."""
         robot = work.robot
         self._held.drop(work)
         self._had_s[robot] += run_s - work.charged_s
@@ -120,6 +121,11 @@ class Waiting:
         self._count -= len(taken)
         return taken
 
+    @property
+    def robot_count(self) -> int:
+        """The number of robots whose worker time is remembered."""
+        return len(self._had_s)
+
     def __len__(self) -> int:
         return self._count
 
@@ -127,12 +133,12 @@ class Waiting:
         return (work for line in self._lines.values() for work in line)
 
 
-class _Held:
-    """Bytes that requests keep in memory: each body, and each pinned blob once."""
+class _HeldBytes:
+    """Memory that requests hold: each body, and each blob once."""
 
     def __init__(self) -> None:
         self.byte_count = 0
-        self._pins: Counter[int] = Counter()  # requests that pin the blob of this `id`
+        self._pins: Counter[int] = Counter()  # for the `id` of each blob, the requests that hold it
 
     def add(self, work: Work) -> None:
         self.byte_count += self.more(work)
@@ -146,27 +152,9 @@ class _Held:
         self.byte_count -= self.more(work)
 
     def more(self, work: Work) -> int:
-        """Bytes that are kept for this request alone."""
+        """Bytes that no other request holds."""
         own = byte_count(work.request.body)
         for blob in work.blobs.values():
             if id(blob) not in self._pins:
                 own += blob.data.nbytes
         return own
-
-
-class Crashes:
-    """How often a request's worker died of it; of the last CRASHED_KEPT requests with which one did."""
-
-    def __init__(self) -> None:
-        self._counts: OrderedDict[tuple[bytes, int], int] = OrderedDict()
-
-    def note(self, peer: bytes, id: int) -> None:
-        self._counts[peer, id] = self._counts.pop((peer, id), 0) + 1
-        if len(self._counts) > CRASHED_KEPT:
-            self._counts.popitem(last=False)
-
-    def too_many(self, peer: bytes, id: int) -> bool:
-        return self._counts.get((peer, id), 0) >= CRASHES_MAX
-
-    def __len__(self) -> int:
-        return len(self._counts)

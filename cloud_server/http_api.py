@@ -1,4 +1,7 @@
-"""HTTP beside the socket: health, readiness, metrics, settings and tasks, from a thread of its own."""
+"""The HTTP side of the server: health, readiness, metrics, settings and tasks, in a thread of its own.
+
+`server` gives the figures; `HttpGuard` decides who may read them.
+"""
 
 import asyncio
 import dataclasses
@@ -13,7 +16,7 @@ from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_l
 from offboard.cloud_server.metrics import Status
 from offboard.common import VERSION, tasks
 from offboard.common.errors import ConfigError, MissingExtra
-from offboard.common.security.guard import Guard
+from offboard.common.security.http_guard import HttpGuard
 from offboard.common.token_bucket import Bucket
 
 try:
@@ -25,10 +28,10 @@ try:
 except ImportError as error:
     raise MissingExtra("cloud-server", "cloud") from error
 
-CONNECTIONS_A_S, CONNECTIONS_AT_ONCE = 100, 512
-STALL_S = 2.0  # the loop turns at least every 0.5 s
+CONNECTIONS_A_S, CONNECTIONS_AT_ONCE = 100, 512  # new connections per second, and at once
+STALL_S = 2.0  # a turn of the server's loop takes at most 0.5 s
 STOP_S = 2.0
-TICKS, UVICORN_TICK_S = 5, 0.1  # of uvicorn's ten a second so many at once; with each tenth it sets the date
+TICKS, UVICORN_TICK_S = 5, 0.1  # five of uvicorn's ten ticks per second are done at once
 
 
 def create_app(
@@ -40,15 +43,15 @@ def create_app(
     loopback: bool = True,
     insecure: bool = False,
 ) -> FastAPI:
-    """The routes, all to be read only; `status` is called once a request, from the web thread.
+    """The routes, which change nothing. `status` is called once per request, in the HTTP thread.
 
-    With a `token` everything needs it but health, readiness and, on `loopback`, the metrics.
+    With a `token`, every request needs it, except for health, readiness and, on `loopback`, the metrics.
     """
     app = FastAPI(title="Offboard cloud server", version=VERSION, redoc_url=None)
     open_paths = ("/health", "/ready", *(["/metrics"] if loopback else []))
-    app.add_middleware(Guard, token=token, open_paths=open_paths, loopback=loopback)
+    app.add_middleware(HttpGuard, token=token, open_paths=open_paths, loopback=loopback)
 
-    @app.get("/health", summary="200 while the loop turns; version and details with the token")
+    @app.get("/health", summary="200 while the server works; version and details with the token")
     async def health(request: Request) -> JSONResponse:
         now = status()
         turning = now.last_turn_age_s < STALL_S
@@ -57,7 +60,7 @@ def create_app(
             content |= {"version": VERSION, **dataclasses.asdict(now)}
         return JSONResponse(content, 200 if turning else 503)
 
-    @app.get("/ready", summary="200 once every kind is warm in every worker")
+    @app.get("/ready", summary="200 once all workers are warm")
     async def ready() -> JSONResponse:
         now = status()
         taking = now.ready and not now.draining
@@ -67,11 +70,11 @@ def create_app(
     async def metrics() -> Response:
         return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)
 
-    @app.get("/config", summary="The resolved settings")
+    @app.get("/config", summary="The settings in use")
     async def config() -> dict[str, Any]:
         return settings
 
-    @app.get("/tasks", summary="What can be run here")
+    @app.get("/tasks", summary="The tasks that this server runs")
     async def known_tasks() -> list[dict[str, Any]]:
         return [
             {"name": k.name, "source_hash": k.source_hash, "duplicate": k.duplicate} for k in tasks.kinds()
@@ -81,7 +84,7 @@ def create_app(
 
 
 class PacedHttp(BoundedHttp):
-    """Takes only so many new connections a second: the web thread shall not take the robots' time."""
+    """Accepts a limited number of connections per second, so that HTTP does not take time from the robots."""
 
     _left = Bucket(CONNECTIONS_A_S, CONNECTIONS_AT_ONCE, CONNECTIONS_AT_ONCE)
     _at_s = 0.0
@@ -91,14 +94,14 @@ class PacedHttp(BoundedHttp):
         left.fill(now_s - PacedHttp._at_s)
         PacedHttp._at_s = now_s
         if left.level < 1:
-            time.sleep(1 / CONNECTIONS_A_S)  # others wait in the kernel's queue
+            time.sleep(1 / CONNECTIONS_A_S)  # further connections wait in the kernel
         else:
             left.take(1)
         super().connection_made(transport)
 
 
 class _Server(uvicorn.Server):
-    """Looks twice a second whether it is to stop: ten looks are a third of what a server at rest does."""
+    """Checks twice per second whether to stop. Ten checks would be a third of the work of an idle server."""
 
     async def main_loop(self) -> None:
         ticks = 0
@@ -107,7 +110,7 @@ class _Server(uvicorn.Server):
             ticks += TICKS
 
 
-class Web:
+class HttpServer:
     """Serves an app in a daemon thread, from `start` until `close`."""
 
     def __init__(self, app: FastAPI, address: tuple[str, int]) -> None:
@@ -117,7 +120,7 @@ class Web:
         config = uvicorn.Config(
             app,
             http=PacedHttp,
-            log_level="error",  # a line for every bad request would be the attacker's to write
+            log_level="error",  # otherwise an attacker could fill the log with bad requests
             log_config=None,
             access_log=False,
             server_header=False,
@@ -145,5 +148,5 @@ def _listen(address: tuple[str, int]) -> socket.socket:
         return socket.create_server(address, family=family, backlog=128)
     except OSError as error:
         host, port = address
-        reason = (error.strerror or str(error)).partition(" (")[0]  # Python adds the address again
+        reason = (error.strerror or str(error)).partition(" (")[0]  # without the address that Python adds
         raise ConfigError(f"--http: {host}:{port} cannot be bound: {reason}") from error

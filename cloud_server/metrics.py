@@ -1,4 +1,7 @@
-"""What the server counts, and the state it shows; how it is shown is `web`'s business."""
+"""The figures that the server counts, and its status.
+
+`http_api` shows them.
+"""
 
 from dataclasses import dataclass
 
@@ -9,7 +12,7 @@ SECONDS_BUCKETS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """The server at one moment; ages in seconds, None where nothing happened yet."""
+    """The state of the server at one moment. Ages are in seconds; None if nothing has happened yet."""
 
     ready: bool
     draining: bool
@@ -21,7 +24,7 @@ class Status:
 
 
 class Metrics:
-    """Counters of one server, in their own registry."""
+    """The Prometheus metrics of one server, in a registry of their own."""
 
     def __init__(self) -> None:
         r = self.registry = CollectorRegistry()
@@ -29,22 +32,26 @@ class Metrics:
         self.queue_depth = Gauge("offboard_queue_depth", "Requests waiting for a worker", registry=r)
         self.running = Gauge("offboard_running", "Tasks running", registry=r)
         self.queue_s = Histogram(
-            "offboard_queue_seconds", "Arrival to start", ["kind"], buckets=SECONDS_BUCKETS, registry=r
+            "offboard_queue_seconds",
+            "Time from arrival to start",
+            ["kind"],
+            buckets=SECONDS_BUCKETS,
+            registry=r,
         )
         self.run_s = Histogram(
             "offboard_run_seconds", "Time in the worker", ["kind"], buckets=SECONDS_BUCKETS, registry=r
         )
         self.bytes_in = Counter("offboard_bytes_in", "Bytes of messages received", registry=r)
         self.bytes_out = Counter("offboard_bytes_out", "Bytes of messages sent", registry=r)
-        self.blob_bytes = Gauge("offboard_blob_bytes", "Bytes of large arguments kept", registry=r)
+        self.blob_bytes = Gauge("offboard_blob_bytes", "Bytes of stored large arguments", registry=r)
         self.load = Gauge("offboard_load", "Share of the CPU that other programs take", registry=r)
-        self.capacity = Gauge("offboard_capacity", "So much of one CPU may a task use", registry=r)
+        self.capacity = Gauge("offboard_capacity", "Share of one CPU that a task may use", registry=r)
         self.dropped = Counter(
-            "offboard_dropped", "Messages not understood, and answers nobody took", ["reason"], registry=r
+            "offboard_dropped", "Messages and replies that were dropped", ["reason"], registry=r
         )
-        self.refused = Counter("offboard_refused", "Handshakes with a key that is not known", registry=r)
+        self.refused = Counter("offboard_refused", "Handshakes with an unknown key", registry=r)
         self.cut_off = Counter(
-            "offboard_cut_off", "Connections ended for sending more than may be, or could be read", registry=r
+            "offboard_cut_off", "Connections closed because they sent too much", registry=r
         )
         self.restarts = Counter(
             "offboard_executor_restarts", "Workers that died and were replaced", ["reason"], registry=r

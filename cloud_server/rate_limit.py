@@ -1,4 +1,7 @@
-"""How much each robot may send in a second, and what comes of sending more."""
+"""Limits how much each robot may send per second, and decides what happens to a robot that sends more.
+
+It reads no clock and no socket; `server` does what it decides.
+"""
 
 import math
 from collections import OrderedDict
@@ -7,15 +10,17 @@ from enum import Enum, auto
 
 from offboard.common.token_bucket import Bucket
 
-BURST_S = 1.0  # of what a robot may send that it may send at once
-MESSAGE_BYTES = 64 * 1024  # what a message counts for at least: reading it takes time too
-BUSY_A_S = 200.0  # refusals of one robot; what it sends beyond them is not read
-EXCESS_S = 2.0  # of what a robot may send, that it may send beyond it: who floods on and on is cut off
-CUT_OFF_S = 10.0  # for which that robot is not let in again
-ROBOTS_MAX = 4096  # of which this is known; beyond it those are forgotten that were silent for longest
+BURST_S = 1.0  # a robot may send the amount of this many seconds at once
+MESSAGE_BYTES = 64 * 1024  # a message counts as at least this many bytes: reading it takes time too
+BUSY_A_S = 200.0  # answers `busy` to one robot per second; messages beyond them are not read
+EXCESS_S = 2.0  # a robot that sends more than this many seconds' worth too much is cut off
+CUT_OFF_S = 10.0  # until a robot that was cut off may connect again
+ROBOTS_MAX = 4096  # robots remembered; the one that was silent for longest is forgotten first
 
 
 class Verdict(Enum):
+    """What to do with a message: read it, answer `busy`, ignore it, or cut off its robot."""
+
     TAKE = auto()
     REFUSE = auto()
     DROP = auto()
@@ -31,16 +36,16 @@ class _Robot:
     cut_until_s: float = -math.inf
 
 
-class Quota:
-    """A token bucket for each robot: `bytes_a_s`, at once not less than a message of `message_bytes_max`."""
+class RateLimit:
+    """Token buckets for each robot. Even at a low rate, one message of `message_bytes_max` may be sent."""
 
-    def __init__(self, bytes_a_s: float, message_bytes_max: int) -> None:
-        self._rate = bytes_a_s
-        self._most = max(BURST_S * bytes_a_s, message_bytes_max)
+    def __init__(self, bytes_per_s: float, message_bytes_max: int) -> None:
+        self._rate = bytes_per_s
+        self._most = max(BURST_S * bytes_per_s, message_bytes_max)
         self._robots: OrderedDict[bytes, _Robot] = OrderedDict()
 
     def judge(self, name: bytes, size: int, now_s: float) -> Verdict:
-        """What to do with a message of this size; only what is taken counts against the robot."""
+        """What to do with a message of this size. Only a message that is taken uses up the robot's bytes."""
         robot = self._robots.pop(name, None) or self._new(now_s)
         self._robots[name] = robot
         if len(self._robots) > ROBOTS_MAX:
@@ -63,6 +68,13 @@ class Quota:
             robot.refusals_left.take(1)
             return Verdict.REFUSE
         return Verdict.DROP
+
+    def __len__(self) -> int:
+        """The number of robots remembered."""
+        return len(self._robots)
+
+    def __contains__(self, name: bytes) -> bool:
+        return name in self._robots
 
     def _new(self, now_s: float) -> _Robot:
         left = Bucket(self._rate, self._most, self._most)

@@ -1,7 +1,7 @@
-"""The robots' connections as the kernel sees them: how to end one, and how much of one was not read yet.
+"""TCP connections as the kernel sees them: closing one, and limiting the bytes that were not read yet.
 
-libzmq bounds what it reads ahead by whole messages, so that one message without end, or many large ones
-faster than they are taken, would take all memory. What it has received is known to the kernel alone.
+libzmq limits what it receives in advance by the number of messages. One endless message, or many large ones,
+could therefore take all memory. Only the kernel knows how many bytes libzmq has received.
 """
 
 import contextlib
@@ -18,10 +18,10 @@ from typing import Any
 
 from offboard.cloud_server.metrics import Metrics
 
-LOOK_S, LOOK_AGAIN_S = 0.1, 0.01  # between two looks at the memory of this process; while it grows
-MESSAGES_UNREAD = 2  # of the largest, on one connection
-CURVE_BYTES = 33  # around a frame that is encrypted (RFC 26)
-SHORT_FRAME = 255  # bytes; a longer one has a longer length (RFC 23)
+LOOK_S, LOOK_AGAIN_S = 0.1, 0.01  # between two checks of this process's memory: usually, and while it grows
+MESSAGES_UNREAD = 2  # messages of the largest size that may be unread on one connection
+CURVE_BYTES = 33  # that encryption adds to a frame (RFC 26)
+SHORT_FRAME = 255  # bytes; the length of a longer frame takes more bytes (RFC 23)
 RECEIVED = struct.Struct("@128xQ")  # tcpi_bytes_received of struct tcp_info, Linux 4.1 on
 STATM, STATM_BYTES_MAX = Path("/proc/self/statm"), 256
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
@@ -31,18 +31,18 @@ log = logging.getLogger("offboard.cloud_server")
 
 @dataclass(slots=True)
 class _Seen:
-    """A connection when it was first looked at: its other end, bytes that had come, bytes that were read."""
+    """A connection at its first check: its other end, and the bytes received and read by then."""
 
     other_end: Any
     received: int
     read: int
 
 
-class Backlog:
-    """Ends the connections that have sent most beyond what was read of them, where that is too much.
+class UnreadLimit:
+    """Closes the connections with the most unread bytes, if there are too many unread bytes.
 
-    Too much is MESSAGES_UNREAD times `message_bytes_max` of one connection, or `bytes_max` of all. They are
-    looked at when the memory of this process has grown by half a message. Linux alone tells all this.
+    Too many are MESSAGES_UNREAD times `message_bytes_max` on one connection, or `bytes_max` on all of them.
+    Connections are checked when the memory of this process has grown by half a message. Works on Linux only.
     """
 
     def __init__(
@@ -58,12 +58,12 @@ class Backlog:
         if STATM.exists():
             self._statm = os.open(STATM, os.O_RDONLY)
             self._lowest = self._resident_bytes()
-            threading.Thread(target=self._run, name="backlog", daemon=True).start()
+            threading.Thread(target=self._run, name="unread-limit", daemon=True).start()
         else:
-            log.warning("%s is not there: what robots send ahead is not bounded by bytes", STATM)
+            log.warning("%s does not exist: the memory for unread messages is not limited", STATM)
 
     def took(self, file: int, sizes: Iterable[int]) -> None:
-        """A message of frames of these sizes was read; called by one thread."""
+        """A message with frames of these sizes was read. Called by one thread at a time."""
         self._read[file] = self._read.get(file, 0) + sum(self._on_the_wire(size) for size in sizes)
 
     def close(self) -> None:
@@ -76,7 +76,7 @@ class Backlog:
     def _run(self) -> None:
         pause_s = LOOK_S
         while not self._closed:
-            time.sleep(pause_s)  # ten times a second: an event that could be waited for costs more
+            time.sleep(pause_s)  # waiting for an event would cost more
             now = self._resident_bytes()
             grows = now - self._lowest >= self._message_bytes_max // 2
             self._lowest = now if grows else min(self._lowest, now)
@@ -89,7 +89,7 @@ class Backlog:
         return int(os.pread(self._statm, STATM_BYTES_MAX, 0).split()[1]) * PAGE_BYTES
 
     def look(self) -> None:
-        """Measure every connection, and end those that are too far ahead."""
+        """Check every connection, and close those with too many unread bytes."""
         unread: dict[int, int] = {}
         for file, whose, received in _connections(self._port):
             seen, read = self._seen.get(file), self._read.get(file, 0)
@@ -97,14 +97,16 @@ class Backlog:
                 self._seen[file] = _Seen(whose, received, read)
             else:
                 unread[file] = (received - seen.received) - (read - seen.read)
-        for file in self._too_far_ahead(unread):
+        for file in self._too_many(unread):
             self._metrics.cut_off.inc()
             log.warning(
-                "cut off %s: %d bytes of it could not be read", self._seen[file].other_end, unread[file]
+                "cut off %s: it sent %d bytes more than could be read",
+                self._seen[file].other_end,
+                unread[file],
             )
             end(file, self._seen.pop(file).other_end)
 
-    def _too_far_ahead(self, unread: dict[int, int]) -> Iterator[int]:
+    def _too_many(self, unread: dict[int, int]) -> Iterator[int]:
         total = sum(each for each in unread.values() if each > 0)
         for file in sorted(unread, key=unread.__getitem__, reverse=True):
             if unread[file] <= MESSAGES_UNREAD * self._message_bytes_max and total <= self._bytes_max:
@@ -114,7 +116,7 @@ class Backlog:
 
 
 def other_end(file: int) -> Any:
-    """The address that a connection comes from; None where this is no open connection."""
+    """The address at the other end of this connection; None if the file is no open connection."""
     try:
         with socket.socket(fileno=os.dup(file)) as held:
             return held.getpeername()
@@ -123,15 +125,15 @@ def other_end(file: int) -> Any:
 
 
 def end(file: int, expected: Any) -> None:
-    """Shut a connection down, if it is still the one from there: libzmq finds its other end gone."""
-    # The number may be another file's by now: hold it first, then look whose it is.
+    """Close this connection if `expected` is at its other end. libzmq sees that the robot is gone."""
+    # Another file may have this number by now: duplicate it first, then check whose it is.
     with contextlib.suppress(OSError), socket.socket(fileno=os.dup(file)) as held:
         if held.getpeername() == expected:
             held.shutdown(socket.SHUT_RDWR)
 
 
 def _connections(port: int) -> Iterator[tuple[int, Any, int]]:
-    """File, other end and bytes received of each connection to this port of ours."""
+    """For each connection to this port: file, other end, and bytes received."""
     for path in Path("/proc/self/fd").iterdir():
         with contextlib.suppress(OSError):
             if not str(path.readlink()).startswith("socket:"):

@@ -1,3 +1,3 @@
-"""What robot and cloud must agree on, and nothing else."""
+"""What robot and cloud must agree on."""
 
 VERSION = "0.2.0"

@@ -1,4 +1,4 @@
-"""Every error the project raises by name; who catches each one is said beside it."""
+"""All errors that Offboard raises, and what happens when each one is caught."""
 
 
 class OffloadError(Exception):
@@ -6,30 +6,30 @@ class OffloadError(Exception):
 
 
 def describe(error: BaseException) -> str:
-    """`Type: text` of any exception, also of one that cannot say its own text."""
+    """`Type: text` of any exception, even if its text cannot be read."""
     try:
         return f"{type(error).__name__}: {error}"
     except Exception:  # noqa: BLE001 - a user's __str__ may raise anything
-        return f"{type(error).__name__}: (its text cannot be had)"
+        return f"{type(error).__name__}: (it has no readable text)"
 
 
 class ConfigError(OffloadError):
-    """A setting, flag or input file is wrong; the process ends with exit code 2."""
+    """A setting, flag or input file is wrong. The process ends with exit code 2."""
 
 
 class MissingExtra(ConfigError):
-    """An optional library is absent; the message names the extra to install."""
+    """An optional library is missing. The message names the extra to install."""
 
     def __init__(self, what: str, extra: str) -> None:
         super().__init__(f"{what} needs the extra '{extra}': pip install 'offboard[{extra}]'")
 
 
 class DataError(OffloadError):
-    """A map, trace or scenario is wrong; names file and line; exit code 2."""
+    """A map, trace or scenario is wrong. The message names file and line; exit code 2."""
 
 
 class TaskError(OffloadError):
-    """The task's own fault: the same on every site, raised to the caller once, never retried."""
+    """The task is at fault, on every site. It is raised to the caller once and never retried."""
 
 
 class UnknownTask(TaskError):
@@ -37,27 +37,27 @@ class UnknownTask(TaskError):
 
 
 class TaskFailed(TaskError):
-    """The task's function raised; the message carries the type and text of what it raised."""
+    """The function of the task raised an exception. The message has its type and text."""
 
 
 class BadValue(TaskError):
-    """An argument or result cannot cross the wire."""
+    """An argument or result cannot be sent."""
 
 
 class CloudError(OffloadError):
-    """A site gave no answer; the task runs onboard and the lost time is learnt."""
+    """A site gave no answer. The task runs onboard, and the lost time is learnt."""
 
 
 class CloudTimeout(CloudError):
-    """No answer within the task's budget."""
+    """There was no answer within the budget of the task."""
 
 
 class CloudBusy(CloudError):
-    """The server's queue was full, or the budget was over before the task could start."""
+    """The queue of the server was full, or the budget ended before the task could start."""
 
 
 class Overtaken(CloudError):
-    """Another site answered first; how long this one would have taken is not known."""
+    """Another site answered first. The time that this site would have needed is unknown."""
 
 
 class CloudBroken(CloudError):
@@ -65,8 +65,8 @@ class CloudBroken(CloudError):
 
 
 class Unwanted(OffloadError):
-    """Raised within a task whose answer was given up meanwhile."""
+    """Raised inside a task, by `check_wanted`, if nobody waits for its answer any more."""
 
 
 class ProtocolError(OffloadError):
-    """Bytes that are not ours; logged, counted, dropped."""
+    """Received bytes that are no valid message. They are logged, counted and dropped."""

@@ -1,6 +1,6 @@
-"""What can be run: the `@task` decorator, the registry of kinds, loading task modules by name.
+"""The `@task` decorator, the registry of kinds, and loading the modules that register them.
 
-Where a task runs is decided in `robot_client`; how it crosses the wire is `wire.messages`.
+`robot_client` decides where a task runs; `common.wire` sends it.
 """
 
 import importlib
@@ -17,16 +17,16 @@ from offboard.common.errors import BadValue, ConfigError, UnknownTask, describe
 F = TypeVar("F", bound=Callable[..., Any])
 
 NAME_LENGTH_MAX = 64
-KINDS_MAX = 256  # `hello` names them all
+KINDS_MAX = 256  # a `hello` message names all of them
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
     """A registered function.
 
-    `size` maps the function's arguments to the input size d (finite, >= 0); `types` are the dataclasses
-    that its arguments and result may hold; `warm` is called once a process before the first task; a kind
-    with `duplicate=False` is never run on two sites; `work` tells from a result how much work it was, in any
+    `size` maps the arguments to the input size d (finite, >= 0). `types` are the dataclasses that arguments
+    and result may contain. `warm` is called once per process before the first task. A kind with
+    `duplicate=False` never runs on two sites. `work` maps a result to the amount of work that it took, in any
     unit.
     """
 
@@ -38,10 +38,10 @@ class Kind:
     warm: Callable[[], None] | None = None
     source_hash: str = ""
     work: Callable[[Any], float] | None = None
-    positional: int | None = None  # arguments of a call that needs no binding: all, by place
+    positional: int | None = None  # a call with this many positional arguments needs no binding
 
     def bind(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:
-        """The call as positional arguments, defaults filled in; TypeError as Python itself would say it."""
+        """The call as positional arguments with defaults filled in. TypeError as if it were called."""
         if not kwargs and self.positional is not None and len(args) == self.positional:
             return args
         bound = inspect.signature(self.function).bind(*args, **kwargs)
@@ -49,14 +49,14 @@ class Kind:
         return bound.args
 
     def size_of(self, args: tuple[Any, ...]) -> float:
-        """Input size d of a call; BadValue where the size function gives no finite number >= 0."""
+        """The input size d of a call. BadValue if the size function returns no finite number >= 0."""
         size = float(self.size(*args))
         if not (math.isfinite(size) and size >= 0):
             raise BadValue(f"task {self.name}: input size {size} is not a finite number >= 0")
         return size
 
     def work_of(self, result: Any) -> float | None:
-        """The work that a result says it was; None where that is not told, or is no number above 0."""
+        """The amount of work that a result took; None if it is unknown or not a number above 0."""
         if self.work is None:
             return None
         work = float(self.work(result))
@@ -65,7 +65,7 @@ class Kind:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One call of a kind: what to run, on what, and how big it is."""
+    """One call of a kind: its arguments and its input size."""
 
     kind: Kind
     args: tuple[Any, ...]
@@ -85,26 +85,31 @@ def task(
     warm: Callable[[], None] | None = None,
     work: Callable[[Any], float] | None = None,
 ) -> Callable[[F], F]:
-    """Register a function as a kind of task; it stays an ordinary function.
+    """Register a function as a kind of task. It can still be called as an ordinary function.
 
-    The same module is loaded on both sides; a kind whose source differs there stays onboard.
+    Robot and server load the same module. If the source of a kind differs between them, it runs onboard.
     """
     if not name or len(name) > NAME_LENGTH_MAX or not name.isidentifier():
         raise ConfigError(f"task name {name!r} is not an identifier of at most {NAME_LENGTH_MAX} characters")
     if len(_kinds) >= KINDS_MAX:
-        raise ConfigError(f"task {name}: {KINDS_MAX} tasks are registered already")
+        raise ConfigError(f"task {name}: {KINDS_MAX} tasks are registered already, the most allowed")
 
     def register(function: F) -> F:
         parameters = inspect.signature(function).parameters.values()
         for parameter in parameters:
             if parameter.kind in (parameter.KEYWORD_ONLY, parameter.VAR_KEYWORD):
-                raise ConfigError(f"task {name}: parameter {parameter.name!r} can only be given by keyword")
+                raise ConfigError(
+                    f"task {name}: parameter {parameter.name!r} is keyword-only; make it positional"
+                )
         fixed = all(parameter.kind != parameter.VAR_POSITIONAL for parameter in parameters)
         count = len(parameters) if fixed else None
-        kind = Kind(name, function, size, duplicate, types, warm, _source_hash(function), work, count)
+        kind = Kind(
+            name, function, size, duplicate,
+            types=types, warm=warm, source_hash=_source_hash(function), work=work, positional=count,
+        )  # fmt: skip
         known = _kinds.get(name)
         if known is not None and known.source_hash != kind.source_hash:
-            raise ConfigError(f"task {name} is registered twice, with different source")
+            raise ConfigError(f"task {name} is registered twice, with different source; rename one of them")
         _kinds[name] = kind
         return function
 
@@ -112,7 +117,7 @@ def task(
 
 
 def kind_of(function: Callable[..., Any]) -> Kind:
-    """The kind that `function` was registered as."""
+    """The kind of this function. UnknownTask if the function is not registered."""
     for kind in _kinds.values():
         if kind.function is function:
             return kind
@@ -136,7 +141,7 @@ def kinds() -> tuple[Kind, ...]:
 
 
 def load_modules(names: Iterable[str]) -> None:
-    """Import the modules that register tasks; ConfigError names one that cannot be imported."""
+    """Import the modules that register tasks. ConfigError names a module that cannot be imported."""
     for name in names:
         try:
             importlib.import_module(name)
@@ -145,11 +150,11 @@ def load_modules(names: Iterable[str]) -> None:
 
 
 def _source_hash(function: Callable[..., Any]) -> str:
-    """SHA-256 of the function's source; empty, which equals no other, where the source is not to be had."""
+    """SHA-256 of the source of a function. An empty text, which matches nothing, if there is no source."""
     try:
         source = textwrap.dedent(inspect.getsource(function))
     except (OSError, TypeError):
         return ""
-    import hashlib  # OpenSSL: not for who has no tasks, as --help
+    import hashlib  # it loads OpenSSL, which --help does not need
 
     return hashlib.sha256(source.encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""Threads that must have ended before the process does."""
+"""Waiting for threads that must end before the process does."""
 
 import threading
 import time
@@ -6,10 +6,10 @@ from collections.abc import Iterable
 
 
 def join_all(threads: Iterable[threading.Thread], timeout_s: float) -> None:
-    """Wait until they have ended, at most so long for all of them together; the caller's own is left out.
+    """Wait until these threads have ended, for at most `timeout_s` in total. The calling thread is skipped.
 
-    A thread that ends while the process does may take it down: OpenSSL (3.0) frees what it keeps for each
-    thread at the end of both, and glibc aborts at the second time.
+    A thread that ends at the same time as the process can crash it: OpenSSL 3.0 then frees the data of the
+    thread twice, and glibc aborts the process.
     """
     until_s = time.monotonic() + timeout_s
     for thread in threads:

@@ -1,8 +1,8 @@
-"""Token buckets: what may still be spent."""
+"""A token bucket, which limits an amount per unit of time or work."""
 
 
 class Bucket:
-    """Fills by `rate` a unit up to `most`; taking more than is there leaves a debt."""
+    """Fills by `rate` per unit, up to `most`. The level may become negative: then something is owed."""
 
     def __init__(self, rate: float, most: float, level: float = 0.0) -> None:
         self.rate, self.most, self.level = rate, most, level

@@ -1,4 +1,4 @@
-"""Whether somebody still waits for the task that runs in this thread: a long one may look, and stop."""
+"""Lets a long task check whether anybody still waits for its answer, and stop if nobody does."""
 
 import threading
 from collections.abc import Callable, Iterable
@@ -15,12 +15,12 @@ _here = _Here()
 
 
 def always() -> bool:
-    """Of a task that is wanted to its end."""
+    """For a task whose answer is always wanted."""
     return True
 
 
 def call_while(wanted: Callable[[], bool], function: Callable[..., Any], args: Iterable[Any]) -> Any:
-    """Call a task's function; `check_wanted` in it asks `wanted`."""
+    """Call the function of a task. `check_wanted` inside it calls `wanted`."""
     _here.wanted = wanted
     try:
         return function(*args)
@@ -29,9 +29,10 @@ def call_while(wanted: Callable[[], bool], function: Callable[..., Any], args: I
 
 
 def check_wanted() -> None:
-    """Unwanted, for the task to end with, where its answer was given up: late, or another site was first.
+    """Raise Unwanted if nobody waits for the answer of this task any more. Let it end the task.
 
-    It costs a fifth of a microsecond; where nobody can tell, the answer is wanted.
+    This happens if the answer is too late or if another site was first. A call takes about 0.2 microseconds.
+    Outside a task it does nothing.
     """
     if _here.wanted is not None and not _here.wanted():
         raise Unwanted("nobody waits for the answer any more")

@@ -1,4 +1,4 @@
-"""Tasks that harm the process that runs them; loaded on both sides as `tests.crashes`."""
+"""Tasks that harm the process in which they run. Robot and server load them as `tests.crashes`."""
 
 import ctypes
 import os
@@ -21,21 +21,21 @@ def segfault() -> None:
     ctypes.string_at(0)
 
 
-@task("leave", size=lambda code: 0.0)  # noqa: ARG005 - no size
+@task("leave", size=lambda code: 0.0)  # noqa: ARG005 - all calls have the same size
 def leave(code: int) -> None:
     os._exit(code)
 
 
 @task("leave_a_child", size=lambda seconds: seconds)
 def leave_a_child(seconds: float) -> None:
-    """Leaves a process behind that holds the files which this one had open."""
+    """Leave a child process behind that keeps the open files of this process."""
     if os.fork() == 0:
         time.sleep(seconds)
         os._exit(0)
     os._exit(4)
 
 
-@task("kill_itself", size=lambda number: 0.0)  # noqa: ARG005 - no size
+@task("kill_itself", size=lambda number: 0.0)  # noqa: ARG005 - all calls have the same size
 def kill_itself(number: int) -> None:
     os.kill(os.getpid(), number)
 
@@ -47,14 +47,14 @@ def grab(byte_count: int) -> int:
 
 @task("hoard", size=lambda byte_count: byte_count)
 def hoard(byte_count: int) -> int:
-    """Keeps what it took."""
+    """Allocate memory and keep it."""
     _hoard.append(np.ones(byte_count, np.uint8))
     return os.getpid()
 
 
 @task("fill", size=lambda: 0.0)
 def fill() -> None:
-    """Takes all memory, in pieces, and keeps it."""
+    """Allocate all memory in small pieces and keep it."""
     while True:
         _pieces.append("piece" * 100 + str(len(_pieces)))
 
@@ -64,9 +64,9 @@ def large(byte_count: int) -> NDArray[np.uint8]:
     return np.zeros(byte_count, np.uint8)
 
 
-@task("spin", size=lambda begun: 0.0, duplicate=False)  # noqa: ARG005 - no size
+@task("spin", size=lambda begun: 0.0, duplicate=False)  # noqa: ARG005 - all calls have the same size
 def spin(begun: str) -> None:
-    """Runs for ever, whatever it is asked."""
+    """Run for ever and ignore signals."""
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     Path(begun).touch()
@@ -74,9 +74,9 @@ def spin(begun: str) -> None:
         pass
 
 
-@task("look", size=lambda begun: 0.0, duplicate=False)  # noqa: ARG005 - no size
+@task("look", size=lambda begun: 0.0, duplicate=False)  # noqa: ARG005 - all calls have the same size
 def look(begun: str) -> None:
-    """Runs until its answer is not wanted."""
+    """Run until nobody waits for the answer."""
     Path(begun).touch()
     while True:
         check_wanted()

@@ -1,4 +1,4 @@
-"""A server with keys in a process of its own, and what to attack it with."""
+"""A server with keys in a process of its own, and clients to attack it."""
 
 import contextlib
 import os
@@ -22,7 +22,7 @@ OVER = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVE
 
 
 def until(condition: Callable[[], Any], within_s: float = WAIT_S) -> float:
-    """Wait for something that another process does; the seconds that it took."""
+    """Wait until another process has done something; returns the seconds that it took."""
     began = time.monotonic()
     while not condition():
         assert time.monotonic() - began < within_s, f"it did not happen within {within_s:g} s"
@@ -31,9 +31,9 @@ def until(condition: Callable[[], Any], within_s: float = WAIT_S) -> float:
 
 
 class Served:
-    """`python -m cloud_server` as a child process, ready when made; `lines` is its log.
+    """`python -m offboard.cloud_server` as a child process, ready once it is constructed.
 
-    `files`: its soft limit of open files at first.
+    `lines` is its log. `files` is its soft limit of open files at the start.
     """
 
     def __init__(self, *flags: str, files: int | None = None) -> None:
@@ -79,7 +79,7 @@ def clean_environ() -> dict[str, str]:
 
 
 class Dealer:
-    """A raw DEALER; `handshake` is the first event that ends one."""
+    """A raw DEALER socket. `handshake` is the event that ended its handshake."""
 
     def __init__(self, port: int, public: bytes = b"", secret: bytes = b"", server: bytes = b"") -> None:
         self._context = zmq.Context()
@@ -112,7 +112,7 @@ class Dealer:
 
 
 class Wire:
-    """A way to the server that keeps what robots say; one connection."""
+    """A relay for one connection to the server. `said` is everything that the robot has sent."""
 
     def __init__(self, port: int) -> None:
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -159,7 +159,7 @@ def recorded(port: int) -> Iterator[Wire]:
 
 
 def says_until_closed(port: int, said: bytes) -> bytes:
-    """Say this to the server over TCP; what it answers before it closes the connection."""
+    """Send bytes to the server over TCP; returns its answer until it closes the connection."""
     answered = b""
     with socket.create_connection(("127.0.0.1", port), WAIT_S) as client:
         client.sendall(said)

@@ -1,8 +1,8 @@
-"""Coverage-guided fuzzing of what a robot may send: `python -m tests.fuzz CORPUS [libFuzzer's flags]`.
+"""Coverage-guided fuzzing of the messages of robots: `python -m tests.fuzz CORPUS [libFuzzer's flags]`.
 
-An input is the frames of one message, each after its length. Whatever they are, reading them gives a
-message or a ProtocolError, and what a plan is asked with gives a plan or an ordinary exception.
-`-max_total_time=3600` is an hour.
+An input holds the frames of one message, each preceded by its length. Reading any frames must give a message
+or a ProtocolError; planning with any arguments must give a plan or an ordinary exception. Add
+`-max_total_time=3600` to stop after an hour.
 """
 
 import contextlib
@@ -13,7 +13,9 @@ from pathlib import Path
 
 import atheris
 
-importlib.import_module("offboard.common.planning.search")  # first: what is compiled cannot be instrumented
+importlib.import_module(
+    "offboard.common.planning.search"
+)  # before the others: compiled code cannot be instrumented
 with atheris.instrument_imports(
     include=[
         "msgpack",
@@ -33,7 +35,7 @@ from benchmarks.attack_messages import Frames, bombs, valid_messages  # noqa: E4
 from offboard.common.planning import planner  # noqa: E402
 
 FRAMES_MAX = 40
-SEED_BYTES_MAX = 4096  # a larger bomb teaches nothing
+SEED_BYTES_MAX = 4096  # larger bombs would only slow it down
 LENGTH = struct.Struct("<H")
 
 
@@ -51,7 +53,7 @@ def split(data: bytes) -> Frames:
 
 
 def check(data: bytes) -> None:
-    """One message, as the server and then its worker take it."""
+    """Read one message like the server, and its arguments like a worker."""
     frames = split(data)
     try:
         message = wire.unpack(frames)
@@ -71,10 +73,10 @@ def check(data: bytes) -> None:
         )
     except ProtocolError:
         return
-    with contextlib.suppress(BadValue):  # one frame too many, say
+    with contextlib.suppress(BadValue):  # for example one frame too many
         wire.encode(arguments, kind.types)
     if isinstance(message, wire.Request) and isinstance(arguments, list):
-        with contextlib.suppress(Exception):  # the task's own: answered `failed`
+        with contextlib.suppress(Exception):  # raised by the task: the server would answer `failed`
             assert isinstance(plan_path(*arguments), Plan)
 
 

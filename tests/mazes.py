@@ -1,7 +1,9 @@
-"""Small maps of every kind, and a planner in plain Python that tells what the shortest path costs there."""
+"""Small maps of every kind, and a planner in plain Python that finds the cost of the shortest path."""
 
 import heapq
+import lzma
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,10 +11,14 @@ import pytest
 from numpy.typing import NDArray
 
 from offboard.common.planning import planner, search
+from offboard.common.planning.map_files import read_map
+from offboard.common.planning.maps import GridMap
 from offboard.common.planning.planner_names import ASTAR, DIJKSTRA, JPS
 
 Cell = tuple[int, int]
-# Planners, and whether on costs.
+SAMPLES = Path(__file__).parent / "samples"
+BENCHMARKS = ("32room_000", "random512-10-0", "Berlin_1_1024")
+# Planners without and with costs.
 FORMS = ((DIJKSTRA, False), (DIJKSTRA, True), (ASTAR, False), (ASTAR, True), (JPS, False))
 FACTORS = [(50 + 0.8 * cost) / 50 for cost in range(253)]
 
@@ -25,10 +31,21 @@ def warm() -> None:
         search.Field(np.ones((3, 3), np.bool_)).route((0, 0), (2, 2), costs=costs, planner=name)
 
 
+def benchmark(name: str, folder: Path) -> tuple[GridMap, list[tuple[Cell, Cell, float]]]:
+    """A map of MovingAI, and problems on it: start, goal, and the published length of the shortest path."""
+    path = folder / f"{name}.map"
+    path.write_bytes(lzma.decompress((SAMPLES / f"{name}.map.xz").read_bytes()))
+    problems = []
+    for line in lzma.decompress((SAMPLES / f"{name}.scen.xz").read_bytes()).decode().splitlines()[1:]:
+        *_, x, y, goal_x, goal_y, optimum = line.split()
+        problems.append(((int(y), int(x)), (int(goal_y), int(goal_x)), float(optimum)))
+    return read_map(path), problems
+
+
 def oracle(
     free: NDArray[np.bool_], start: Cell, goal: Cell, costs: NDArray[np.uint8] | None = None
 ) -> float | None:
-    """Textbook Dijkstra with a heap, plain Python; None when there is no path."""
+    """Textbook Dijkstra with a heap, in plain Python; None if there is no path."""
     open_: Any = free.tolist()
     height, width = free.shape
     weights: Any = (np.zeros(free.shape, np.uint8) if costs is None else costs).tolist()
@@ -56,7 +73,7 @@ def oracle(
 def path_cost(
     free: NDArray[np.bool_], cells: NDArray[np.int32], costs: NDArray[np.uint8] | None = None
 ) -> float:
-    """Length of a path, every move of which must be allowed."""
+    """The cost of a path; fails if a move is not allowed."""
     total = 0.0
     for (row, col), (r, c) in zip(cells.tolist(), cells[1:].tolist(), strict=False):
         assert max(abs(r - row), abs(c - col)) == 1
@@ -81,7 +98,7 @@ def check(
 
 
 def random_maze(rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Small maps of every kind: noise of any density, corridors one cell wide, single rows and columns."""
+    """A small map: noise of any density, corridors one cell wide, or a single row or column."""
     height, width = rng.integers(1, 13, 2)
     free = rng.random((height, width)) > rng.choice([0.0, 0.2, 0.35, 0.5])
     if rng.random() < 0.3:
@@ -95,7 +112,7 @@ def random_cells(rng: np.random.Generator, free: NDArray[np.bool_]) -> tuple[Cel
 
 
 def serpentine(side: int) -> NDArray[np.bool_]:
-    """One corridor of about side * side / 2 cells, folded."""
+    """One folded corridor of about side * side / 2 cells."""
     free = np.zeros((side, side), np.bool_)
     free[::2] = True
     free[1::4, -1] = True

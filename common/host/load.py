@@ -1,39 +1,40 @@
-"""What the CPU can do now, and how much of it other programs take: features of the times of tasks.
+"""Measures the load and the capacity of the CPU: features from which the times of tasks are predicted.
 
-In a container, or wherever else a CPU quota holds, the CPU is the quota: what others of the group use is
-missing to this process, and so is the time that all of them are throttled for.
+If a CPU quota limits this process, as in a container, "the CPU" means the quota: other processes of the group
+use it up as well, and all of them wait while the group is throttled. `load_watch` decides when to measure.
 """
 
 import contextlib
 import os
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
-from offboard.common.host.cpu import QuotaGroup, parse_usage, quota_group, read_small
+from offboard.common.host.cgroup import QuotaGroup, parse_usage, quota_group, read_small
 
-LOADED = 0.3  # of the CPU, taken by others: from there on times tell of that
-EVERY_S = 0.5  # by a robot, and no more often: a reading costs more than a decision
-SERVER_EVERY_S = 0.1  # by a server, for all of its robots
-HURRIED_S = 0.05  # but so often where it may just have changed
-TELLING_S = 0.02  # CPU seconds there were to take; of fewer one sees the kernel's ticks alone
-READINGS_MAX = 8  # remembered, to look back as far
-LOOKED_UP_EVERY = 8  # readings: how often it is looked up whether there is a quota, and how clocks are held
-FREE_MIN = 0.1  # of the CPU: where this process leaves less to others, what they take says nothing
-PROCESSES_MAX = 64  # of a group whose CPU time is the sum of theirs
+LOADED = 0.3  # load from which a computer counts as loaded
+EVERY_S = 0.5  # between two readings on a robot: a reading costs more than a decision
+SERVER_EVERY_S = 0.1  # between two readings on a server, which serves many robots
+HURRIED_S = 0.05  # between two readings at a moment when the load may just have changed
+TELLING_S = 0.02  # CPU seconds between two readings: with fewer, the kernel's ticks hide the load
+READINGS_MAX = 8  # readings kept, to look back that far
+LOOKED_UP_EVERY = 8  # readings between two look-ups of the quota and of the clock frequency
+FREE_MIN = 0.1  # share of the CPU: if this process leaves less to others, their share means nothing
+PROCESSES_MAX = 64  # of a group whose CPU time is summed over its processes
 CLOCKS = Path("/sys/devices/system/cpu/cpufreq")
-CLOCKS_MAX = 16  # of them are looked at: CPUs of one kind share one
+CLOCKS_MAX = 16  # clocks that are looked at: CPUs of the same type share one
 TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 
 
 class Load:
-    """Reads the CPU time of all that shares the CPU with the process at `proc` (/proc/self).
+    """Measures the CPU time of everything that shares the CPU with one process.
 
-    `own_s`: CPU seconds of what is not others; None: of this process.
-    `capacity`: so much of one CPU at full clock may a thread use, above 0 to 1, by the quota and by how low
-    the clock is held, as where it gets hot (cpufreq's scaling_max_freq).
+    `capacity` says how much of one CPU at full clock one thread may use: above 0, at most 1. A quota lowers
+    it, and so does a clock limit (cpufreq's scaling_max_freq), for example because the CPU is hot.
+
+    Parameters: `proc` is the /proc folder of that process, `root` is /proc itself, `clocks` is the folder of
+    cpufreq. `own_s` returns the CPU seconds that do not count as load; by default those of this process.
     """
 
     def __init__(
@@ -52,16 +53,16 @@ class Load:
         self._group: QuotaGroup | None = None
         self._readings = 0
         self._read_at_s = -EVERY_S
-        # When, and CPU seconds of others and of our own until then.
+        # Time of a reading, and the CPU seconds of others and of our own until then.
         self._read_before: deque[tuple[float, float, float]] = deque(maxlen=READINGS_MAX)
         self._cpus = 0.0
         self._share = 0.0
 
     def share(self, every_s: float = EVERY_S) -> float:
-        """From 0 to 1: what others took of the CPU that this process left; 0 where that cannot be told.
+        """The load, 0 to 1: the share that others took of the CPU that this process left; 0 if unknown.
 
-        It is of the time since the last reading, which is at least `every_s` ago, or since one further back
-        where that was too little to tell.
+        It covers the time since the last reading, which is at least `every_s` ago. If that time is too short
+        to measure a load, it covers the time since an older reading.
         """
         now_s = time.monotonic()
         if now_s - self._read_at_s >= every_s:
@@ -93,7 +94,10 @@ class Load:
             self._share = min(1.0, max(0.0, took_s / left_s))
 
     def _look_up(self) -> bool:
-        """Whether the CPU is another group's than before: one whose quota holds is not looked for again."""
+        """Look up clock and quota. True if another group's quota holds now.
+
+        As long as the known group has a quota, no other group is searched for.
+        """
         self._clock = _clock(self._clocks)
         if self._quota():
             return False
@@ -104,7 +108,7 @@ class Load:
         return self._group.cpus() if self._group else None
 
     def _total_s(self) -> float:
-        """CPU seconds of all, this process among them."""
+        """CPU seconds of all processes, this one included."""
         if self._group is None:
             return self._machine_s()
         if self._group.usage is not None:
@@ -113,7 +117,7 @@ class Load:
         return sum(self._process_s(pid) for pid in pids[:PROCESSES_MAX])
 
     def _machine_s(self) -> float:
-        """From /proc/stat: all but idling, waiting for disks, and guests, who are users already."""
+        """From /proc/stat, without idle time, waits for disks, and guests: user time includes guests."""
         user, nice, system, _idle, _wait, *rest = map(
             int, read_small(f"{self._root}/stat").split(b"\n", 1)[0].split()[1:9]
         )
@@ -121,66 +125,16 @@ class Load:
 
     def _process_s(self, pid: str) -> float:
         if pid == str(os.getpid()):
-            return time.process_time()  # ticks are too coarse where it is taken away again
+            return time.process_time()  # this time is subtracted again: ticks are too coarse
         try:
             fields = read_small(f"{self._root}/{pid}/stat").rpartition(b")")[2].split()
-        except OSError:  # it has just ended
+        except OSError:  # the process has just ended
             return 0.0
         return TICK_S * (int(fields[11]) + int(fields[12]))
 
 
-class LoadWatch:
-    """Reads a load at the first look at it, and from then on every `every_s` in a thread of its own.
-
-    `pause_s` makes of that how long it waits for the next reading.
-
-    A process that asks for its CPU time is charged what it owes, and waits there for its quota: a thread that
-    decides must not be the one to ask.
-    """
-
-    def __init__(
-        self, load: Load, every_s: float = EVERY_S, pause_s: Callable[[float], float] = float
-    ) -> None:
-        self._load = load
-        self._every_s = every_s
-        self._pause_s = pause_s
-        self._latest = (0.0, 1.0)
-        self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="load", daemon=True)
-        self._starting = threading.Lock()
-        self._reading = threading.Lock()
-
-    def latest(self) -> tuple[float, float]:
-        """The share and the capacity that were read last."""
-        if self._thread.ident is None:
-            with self._starting:
-                if self._thread.ident is None and not self._closed.is_set():
-                    self._read()
-                    self._thread.start()
-        return self._latest
-
-    def hurry(self) -> None:
-        """Read it now, in the caller's thread, unless it is being read or has just been."""
-        if self._thread.ident is not None and self._reading.acquire(blocking=False):
-            try:
-                self._read()
-            finally:
-                self._reading.release()
-
-    def close(self) -> None:
-        self._closed.set()
-
-    def _run(self) -> None:
-        while not self._closed.wait(self._pause_s(self._every_s)):
-            with self._reading:
-                self._read()
-
-    def _read(self) -> None:
-        self._latest = (self._load.share(HURRIED_S), self._load.capacity)
-
-
 def _clock(folder: Path) -> float:
-    """The highest clock that is allowed over the highest there is; 1 where the kernel does not tell."""
+    """The highest clock allowed divided by the highest possible; 1 if the kernel does not report them."""
     allowed = full = 0
     with contextlib.suppress(OSError, ValueError):
         for policy in sorted(folder.glob("policy*"))[:CLOCKS_MAX]:

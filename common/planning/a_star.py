@@ -1,8 +1,8 @@
-"""The compiled kernel of A*: buckets as in `flood`, by the least that a path through a cell can cost.
+"""The compiled kernel of A*: buckets as in `dijkstra`, ordered by a lower bound of the path through a cell.
 
-That is the way to the cell and the octile distance from there, which together never fall along a move. A move
-straight towards the goal adds nothing to them, and so a cell may be lowered while its bucket is open: that is
-worked, newest first, until it is empty.
+This bound is the distance to the cell plus the octile distance from there to the goal. It never falls along a
+move. A move straight towards the goal adds nothing to it, so a cell may be lowered while its bucket is open.
+Therefore the kernel works through a bucket, newest cell first, until it is empty.
 """
 
 from typing import Any
@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.common.planning.compiled import kernel
-from offboard.common.planning.flood import EMPTY, FOUND, GROW, PAUSE, PAUSE_CELLS, TOO_FAR
+from offboard.common.planning.dijkstra import EMPTY, FOUND, GROW, PAUSE, PAUSE_CELLS, TOO_FAR
 
-FINE = 2  # buckets to a straight move: with 1 a fifth more is expanded, with 4 no less
-# Circular buckets: the dearest move, away from the goal, spans 6 of them (2 * 2 sqrt 2), on costs 18.
+FINE = 2  # buckets per straight move: with 1 a fifth more cells are expanded, with 4 no fewer
+# Circular buckets: the most expensive move, away from the goal, spans 6 (2 * 2 sqrt 2), with costs 18.
 AHEAD, AHEAD_WEIGHTED = 8, 32
-TURNS = 64  # cells expanded at least between two looks at how full the buckets are
+TURNS = 64  # cells expanded, at least, between two checks of how full the buckets are
 ROWS, COLS = (-1, 1, 0, 0, -1, -1, 1, 1), (0, 0, -1, 1, -1, 1, -1, 1)  # to the neighbours
 ONE = np.uint64(1)
 
@@ -34,15 +34,16 @@ def seek(
     goal: int,
     unreached: Any,
 ) -> int:
-    """Expand cells until through none that is left the goal could be nearer.
+    """Expand cells until no remaining cell can lead to a shorter path. One loop, for the speed of `dijkstra`.
 
-    `put_with` is the distance that a cell had when it was put into its bucket: it was lowered since where
-    that is another now; `unreached` is that of a free cell. `state` is the open bucket, expanded cells,
-    lowest and highest of them; a call goes on where the last one was, after GROW with larger buckets.
+    `put_with` is the distance that each cell had when it was put into its bucket; if its distance differs
+    now, it was lowered in the meantime. `unreached` is the distance of a free cell. `state` holds the open
+    bucket, the number of expanded cells, and the lowest and highest of them. After PAUSE, or after GROW with
+    larger buckets, the caller calls again and the search continues.
     """
     bucket, expanded = np.uint64(state[0]), np.uint64(state[1])
     lowest, highest = np.uint64(state[2]), np.uint64(state[3])
-    # A cell takes twice as long as in a flood.
+    # A cell takes twice as long as in Dijkstra's algorithm.
     pause, mask = expanded + np.uint64(PAUSE_CELLS // 2), np.uint64(counts.size - 1)
     goal_row, goal_col, end = goal // width, goal % width, np.uint64(goal)
     straight, diagonal = moves[0, 0], moves[1, 0]
@@ -56,7 +57,7 @@ def seek(
                 break
             bucket += ONE
             continue
-        if bucket > fine * (unreached - 4 * straight):  # beyond it a move could overflow
+        if bucket > fine * (unreached - 4 * straight):  # one more move could overflow
             outcome = TOO_FAR
             break
         if expanded >= pause:
@@ -94,7 +95,7 @@ def seek(
                 )
                 if least >= distance[end]:
                     continue
-                # A path of millions of cells is rounded: its bucket may be one that is over.
+                # In a path of millions of cells, rounding may point to a bucket that is closed already.
                 due = max(np.uint64(np.int64(fine * least)), bucket) & mask
                 buckets[due, counts[due]], put_with[due, counts[due]] = j, reached
                 counts[due] += ONE
@@ -104,6 +105,6 @@ def seek(
 
 @kernel
 def octile(rows: Any, cols: Any, straight: Any, diagonal: Any) -> Any:
-    """The way over so many rows and columns were all cells free."""
+    """The length of the shortest path across these rows and columns if all cells were free."""
     rows, cols = abs(rows), abs(cols)
     return diagonal * min(rows, cols) + straight * (max(rows, cols) - min(rows, cols))

@@ -1,7 +1,7 @@
-"""The `kernel` decorator: compiles a function with numba, without the interpreter lock, cached on disk.
+"""The `kernel` decorator: compiles a function with numba, releases the interpreter lock, caches on disk.
 
-Without numba every module still imports; calling a kernel then names the extra to install. There is no
-slow fallback, because it would falsify every measured time.
+Without numba every module can still be imported; calling a kernel raises an error that names the extra. There
+is no slow fallback, because it would falsify every measured time.
 """
 
 import functools
@@ -24,13 +24,13 @@ else:
 
 
 def kernel(function: F) -> F:
-    """Compile `function` on its first call; numba's cache honours NUMBA_CACHE_DIR."""
+    """Compile `function` at its first call. Set NUMBA_CACHE_DIR to choose the folder of numba's cache."""
     if numba is None:
         return cast(F, functools.wraps(function)(_missing))
     try:
         return cast(F, numba.njit(nogil=True, cache=True)(function))
     except RuntimeError as error:  # no folder to write the cache to, as in a read-only container
-        log.warning("%s is compiled anew in every process: %s", function.__name__, error)
+        log.warning("every process compiles %s anew: %s; set NUMBA_CACHE_DIR", function.__name__, error)
         return cast(F, numba.njit(nogil=True)(function))
 
 

@@ -1,8 +1,9 @@
-"""The compiled kernels of jump point search (Harabor and Grastien 2011, 2014), where corners are not cut.
+"""The compiled kernels of jump point search (Harabor and Grastien 2011, 2014), without cutting corners.
 
-Of equal paths the one with its diagonals first is looked for. It turns off a straight line only where a wall
-ends beside that, at a jump point. So lines are scanned for those, 64 cells at a time, on bits that are set
-where a cell is free, once by rows and once by columns; a diagonal scans both ways from each of its cells.
+Of all shortest paths it looks for the one that makes its diagonal moves first. Such a path leaves a straight
+line only at a jump point, where a wall beside the line ends. The kernel finds jump points by scanning lines,
+64 cells at a time: each bit of a word is set where a cell is free. There is one set of words for rows and one
+for columns. A diagonal is followed cell by cell, and from each cell both straight directions are scanned.
 """
 
 from typing import Any
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from offboard.common.planning.a_star import octile
 from offboard.common.planning.compiled import kernel
-from offboard.common.planning.flood import (
+from offboard.common.planning.dijkstra import (
     DIAGONAL,
     DISTANCE_MAX,
     EMPTY,
@@ -24,17 +25,17 @@ from offboard.common.planning.flood import (
     TOO_FAR,
 )
 
-STRIDE = 64  # cells of a diagonal that are gone along at a time: the rest of it waits for its turn
-NODES_MAX = 4 * (2 * STRIDE + 2) + 4  # that one expansion adds at most
+STRIDE = 64  # cells of a diagonal that are followed at a time; the rest goes onto the heap
+NODES_MAX = 4 * (2 * STRIDE + 2) + 4  # nodes that one expansion adds, at most
 
-CELL, SOURCE, WAY = 0, 1, 2  # rows of `nodes`; a way is 4 + 3 * row step + column step
-STANDING = 4  # the way of the start
+CELL, SOURCE, WAY = 0, 1, 2  # rows of `nodes`; a way is a direction: 4 + 3 * row step + column step
+STANDING = 4  # the way of the start: no direction
 STATES = 10
 OPEN, EXPANDED, MADE, LOOKS, TOO_LONG, LAST, GOAL, GOAL_ROW, GOAL_COL, WIDTH = range(STATES)
 
 ONE, HALF, TOP = np.uint64(1), np.uint64(32), np.uint64(63)
 LOW, ALL = np.uint64(2**32 - 1), np.uint64(2**64 - 1)
-# The place of a lone bit, by the top six bits of its product with a de Bruijn sequence (Leiserson 1998).
+# The position of a single bit: the top six bits of its product with a de Bruijn sequence (Leiserson 1998).
 SEQUENCE, LEFT_OVER = np.uint64(0x03F79D71B4CB0A89), np.uint64(58)
 PLACES = np.argsort([(int(SEQUENCE) << place) % 2**64 >> 58 for place in range(64)])
 
@@ -48,10 +49,11 @@ def search(
     heap: NDArray[np.uint64],
     state: NDArray[np.int64],
 ) -> int:
-    """Expand jump points in the order of what a path through them costs at least, newest first.
+    """Expand jump points in the order of the least cost of a path through them. One loop, for speed.
 
-    `distance` is that of jump points alone. A call goes on where the last one was, after GROW with larger
-    `nodes` and `heap`; a look is at up to 64 cells, and takes twice as long as a cell of a flood.
+    Of equal ones the newest comes first. `distance` is set for jump points only. After PAUSE, or after GROW
+    with larger `nodes` and `heap`, the caller calls again and the search continues. A look covers up to 64
+    cells and takes twice as long as one cell in Dijkstra's algorithm.
     """
     pause = state[LOOKS] + PAUSE_CELLS // 2
     goal, goal_row, goal_col, width = state[GOAL], state[GOAL_ROW], state[GOAL_COL], state[WIDTH]
@@ -95,8 +97,8 @@ def search(
                         break
                     if r == goal_row and c == goal_col:
                         distance[goal] = d
-                        break  # it is put on the heap as where a diagonal goes on
-                for part in range(2):  # along the column, along the row
+                        break  # it goes onto the heap, like the end of a stride
+                for part in range(2):  # first along the column, then along the row
                     step = over if part else down
                     if step == 0:
                         continue
@@ -122,7 +124,7 @@ def search(
 
 @kernel
 def _ways(rows: Any, row: Any, col: Any, way: Any) -> Any:
-    """The ways on from a jump point, as bits: also to the sides where a wall ends."""
+    """The directions to search from a jump point, as bits, including those around the end of a wall."""
     if way == STANDING:
         return 0b111101111
     down, over, ways = way // 3 - 1, way % 3 - 1, 1 << way
@@ -138,10 +140,10 @@ def _ways(rows: Any, row: Any, col: Any, way: Any) -> Any:
 
 @kernel
 def _stop(bits: Any, line: Any, at: Any, step: Any) -> Any:
-    """The first cell beyond `at` that is blocked, or beside which a wall ends."""
+    """The first cell after `at` that is blocked, or that has the end of a wall beside it."""
     i, word, place = np.uint64(line), np.uint64(at >> 6), np.uint64(at & 63)
     if step > 0:
-        left, right = np.uint64(0), np.uint64(0)  # the cells beside the last word, in their lowest bit
+        left, right = np.uint64(0), np.uint64(0)  # the last cell of the word before, on both sides
         mask = ALL << place << ONE
         while True:
             one_side, other = bits[i - ONE, word], bits[i + ONE, word]
@@ -204,7 +206,10 @@ def _pop(heap: Any, state: Any) -> Any:
 
 @kernel
 def trace(nodes: NDArray[np.uint32], path: NDArray[np.uint64], last: int, width: int) -> int:
-    """Write the path, goal first; returns its length. To a node leads a diagonal, then a straight line."""
+    """Write the cells of the path, goal first; returns their number.
+
+    The way from one node to the next is a diagonal followed by a straight line.
+    """
     length, node = 1, np.int64(last)
     cell = np.int64(nodes[CELL, node])
     path[0] = cell
@@ -222,7 +227,7 @@ def trace(nodes: NDArray[np.uint32], path: NDArray[np.uint64], last: int, width:
 
 
 def bits(free: NDArray[np.bool_]) -> NDArray[np.uint64]:
-    """Each line in words of 64 cells, the first in the lowest bit."""
+    """Each line as words of 64 cells; the first cell is the lowest bit."""
     packed = np.packbits(np.pad(free, ((0, 0), (0, -free.shape[1] % 64))), axis=1, bitorder="little")
     return np.ascontiguousarray(packed).view("<u8").astype(np.uint64)
 
@@ -238,7 +243,7 @@ def stamp(
     reach: NDArray[np.float64],
     blocked: bool,
 ) -> None:
-    """As `common.planning.flood.stamp`, on both forms of the bits."""
+    """Like `grid_kernels.stamp`, on the bits of rows and of columns."""
     height = template.size // width
     for k in range(hit_rows.size):
         row, col, radius = hit_rows[k] + 1, hit_cols[k] + 1, int(reach[k])

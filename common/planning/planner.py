@@ -1,6 +1,6 @@
-"""The task `plan_path`: the exact shortest path of a robot on its map, overlaid with what its scan sees.
+"""The task `plan_path`: the exact shortest path of a robot on its map, with the obstacles of its scan added.
 
-The search itself is `search`; this file says which cells are blocked and keeps maps prepared.
+This file decides which cells are blocked, and keeps prepared maps. The search itself is in `search`.
 """
 
 import math
@@ -19,16 +19,16 @@ from offboard.common.planning.planner_names import DIJKSTRA, check_planner
 from offboard.common.tasks import task
 
 RADIUS_M = 0.2
-PREPARED_MAX = 4  # maps kept ready; 9 bytes a cell each with one search at a time
-PREPARED_CELLS_MAX = CELLS_MAX  # of them together, but for the one in use
+PREPARED_MAX = 4  # prepared maps that are kept; each takes 9 bytes per cell with one search at a time
+PREPARED_CELLS_MAX = CELLS_MAX  # cells of all prepared maps together, except for the one in use
 BEAMS_MAX = 10_000
-RADIUS_CELLS_MAX = 200  # with the most beams the overlay stays a matter of seconds
-BEHIND_CELLS = 0.001  # a beam ends on a surface, between two cells: this far on is the occupied one
+RADIUS_CELLS_MAX = 200  # with BEAMS_MAX beams, adding the scan still takes only seconds
+BEHIND_CELLS = 0.001  # a beam ends on the surface between two cells; the occupied one is this much farther
 
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where the robot is in the map frame, in m and rad."""
+    """The pose of the robot in the map frame, in m and rad."""
 
     x: float
     y: float
@@ -45,7 +45,7 @@ class Point:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
-    """A LiDAR scan in the robot's frame; a range that is not below `range_max` (in m) saw nothing."""
+    """A LiDAR scan in the robot's frame. A beam hit something if its range is below `range_max` (in m)."""
 
     ranges: NDArray[np.float32]
     angle_min: float
@@ -55,11 +55,11 @@ class Scan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """A path, or why there is none: `status` is NONE or an error of nav2's ComputePathToPose.
+    """A path, or the reason why there is none: `status` is NONE or an error of nav2's ComputePathToPose.
 
-    `cells` are (row, col) from start to goal, `metres` their centres in the map frame, `cost` is in metres
-    (each times the cell's factor where costs are given), `expanded` the cells that the search settled, or its
-    jump points.
+    `cells` are (row, column) from start to goal, and `metres` their centres in the map frame. `cost` is the
+    length in metres; with costs, each metre is multiplied by the factor of its cell. `expanded` is the number
+    of cells that the search settled, or of its jump points.
     """
 
     status: str
@@ -72,23 +72,23 @@ class Plan:
 def size_of_plan(
     grid: GridMap, _scan: Scan | None, pose: Pose, goal: Point, *_options: Any, **_named: Any
 ) -> float:
-    """The paper's d for the straight line from pose to goal."""
+    """The paper's input size d for the straight line from pose to goal."""
     return path_size(math.hypot(goal.x - pose.x, goal.y - pose.y), grid.resolution, grid.cells.size)
 
 
 def warm() -> None:
-    """Compile, or load from the cache, all that a request runs.
+    """Compile all kernels that a request needs, or load them from the cache.
 
-    But A* and jump point search, which would take longer than all the rest, are left to their first request.
+    A* and jump point search are compiled at their first request: they would take longer than all the rest.
     """
     grid = GridMap(np.zeros((8, 8), np.int8), 1.0)
     scan = Scan(np.full(4, 2.5, np.float32), 0.0, math.pi / 2, 10.0)
     for costs in (None, np.zeros((8, 8), np.uint8)):
-        plan_path(grid, scan, Pose(4.5, 4.5), Point(0.5, 0.5), 1.0, costs)
+        plan_path(grid, scan, Pose(4.5, 4.5), Point(0.5, 0.5), radius_m=1.0, costs=costs)
 
 
 def work_of_plan(plan: Plan) -> float:
-    """The cells that the search settled, or its jump points."""
+    """The number of cells that the search settled, or of its jump points."""
     return plan.expanded
 
 
@@ -119,9 +119,9 @@ def plan_path(
 
 
 def scan_hits(grid: GridMap, scan: Scan, pose: Pose, radius_m: float) -> search.Hits:
-    """The cells that the scan saw occupied, each with the reach in cells that it blocks.
+    """The cells that the scan saw occupied, and how far around each (in cells) the robot cannot be.
 
-    The reach ends one cell before the robot, so that a robot is never walled in where it stands.
+    This reach ends one cell before the robot, so that the robot's own cell is never blocked.
     """
     ranges = np.asarray(scan.ranges, np.float64)
     beams = np.flatnonzero(np.isfinite(ranges) & (ranges >= 0) & (ranges < scan.range_max))
@@ -138,7 +138,8 @@ def scan_hits(grid: GridMap, scan: Scan, pose: Pose, radius_m: float) -> search.
 
 def _plan(grid: GridMap, route: search.Route) -> Plan:
     metres = grid.metres(route.cells).astype(np.float32)
-    return Plan(route.status, route.cells, metres, route.cost * grid.resolution, route.expanded)
+    cost = route.cost * grid.resolution
+    return Plan(route.status, route.cells, metres, cost=cost, expanded=route.expanded)
 
 
 _fields: "OrderedDict[tuple[int, float], tuple[weakref.ref[NDArray[np.int8]], search.Field]]" = OrderedDict()
@@ -146,14 +147,14 @@ _lock = threading.Lock()
 
 
 def _prepared(grid: GridMap, radius_m: float) -> search.Field:
-    """The map inflated by the radius, ready to search; kept by the identity of its cells.
+    """The map inflated by the radius, ready to search. It is kept by the identity of the map's cells.
 
-    The lock is held while a map is prepared, so that two requests do not prepare it twice.
+    The lock is held while a map is prepared, so that two requests do not prepare the same map.
     """
     key = (id(grid.cells), radius_m / grid.resolution)
     with _lock:
         for old in [name for name, (cells, _) in _fields.items() if cells() is None]:
-            del _fields[old]  # its id may be another array's by now
+            del _fields[old]  # another array may have the same id by now
         if key not in _fields:
             _fields[key] = (weakref.ref(grid.cells), search.Field(passable(grid, radius_m)))
         _fields.move_to_end(key)
@@ -174,25 +175,25 @@ def _check(
     radius_m: float,
     costs: NDArray[np.uint8] | None,
 ) -> None:
-    """ValueError names the argument that cannot be planned with."""
+    """ValueError names the wrong argument, its value, and what is allowed."""
     for name, value in (("pose.x", pose.x), ("pose.y", pose.y), ("pose.yaw", pose.yaw), ("goal.x", goal.x),
                         ("goal.y", goal.y), ("radius_m", radius_m)):  # fmt: skip
         if not math.isfinite(value):
-            raise ValueError(f"{name} is {value}, not a finite number")
+            raise ValueError(f"{name} is {value}; it must be a finite number")
     if not 0 <= radius_m <= RADIUS_CELLS_MAX * grid.resolution:
-        raise ValueError(f"radius_m is {radius_m}, allowed are 0 to {RADIUS_CELLS_MAX} cells")
+        raise ValueError(f"radius_m is {radius_m}; allowed are 0 to {RADIUS_CELLS_MAX} cells")
     if scan is not None:
         _check_scan(scan)
     if costs is not None and (costs.dtype != np.uint8 or costs.shape != grid.cells.shape):
-        raise ValueError(f"costs are {costs.dtype} {costs.shape}, not uint8 {grid.cells.shape} as the map")
+        raise ValueError(f"costs are {costs.dtype} {costs.shape}; they must be uint8 {grid.cells.shape}")
 
 
 def _check_scan(scan: Scan) -> None:
     ranges = scan.ranges
     if ranges.ndim != 1 or ranges.dtype.kind != "f" or ranges.size > BEAMS_MAX:
         raise ValueError(
-            f"scan.ranges is {ranges.dtype} {ranges.shape}, not one row of at most {BEAMS_MAX} floats"
+            f"scan.ranges is {ranges.dtype} {ranges.shape}; it must be one row of at most {BEAMS_MAX} floats"
         )
     for name in ("angle_min", "angle_increment", "range_max"):
         if not math.isfinite(getattr(scan, name)):
-            raise ValueError(f"scan.{name} is {getattr(scan, name)}, not a finite number")
+            raise ValueError(f"scan.{name} is {getattr(scan, name)}; it must be a finite number")

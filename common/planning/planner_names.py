@@ -1,10 +1,10 @@
-"""The names of the planners, without what it takes to run one."""
+"""The names of the planners. This module imports nothing, so that settings can use it."""
 
 DIJKSTRA, ASTAR, JPS = PLANNERS = ("dijkstra", "astar", "jps")
 
 
-def check_planner(name: str, weighted: bool) -> None:
-    """ValueError where there is no such planner, or none on weighted cells."""
+def check_planner(name: str, *, weighted: bool) -> None:
+    """ValueError if there is no such planner, or if it cannot plan on weighted cells."""
     if name not in PLANNERS:
         raise ValueError(f"planner is {name!r}, allowed are {', '.join(PLANNERS)}")
     if weighted and name == JPS:

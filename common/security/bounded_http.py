@@ -1,18 +1,22 @@
-"""HTTP connections that nobody can hold for nothing: bounded in time and in number."""
+"""HTTP connections with limits: how long one may take, and how many are open.
+
+`http_guard` decides which requests are answered.
+"""
 
 import asyncio
 from typing import Any
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-REQUEST_S = 10.0  # for a request to come in whole, and for its answer to be taken
-CONNECTIONS_MAX = 256  # at once; another one takes the place of the one that says nothing for longest
+REQUEST_S = 10.0  # to send a request and to receive its answer
+CONNECTIONS_MAX = 256  # open at the same time
 
 
 class BoundedHttp(H11Protocol):
-    """uvicorn's, against whoever opens connections and says little on them (Slowloris).
+    """uvicorn's HTTP protocol, hardened against clients that send and read very slowly (Slowloris).
 
-    A connection ends that has no request answered for REQUEST_S, however slowly it speaks or reads.
+    It closes a connection on which no request was answered for REQUEST_S. Beyond CONNECTIONS_MAX it closes
+    the connection that has been silent for the longest time.
     """
 
     def __init__(self, *args: Any, **options: Any) -> None:
@@ -24,7 +28,7 @@ class BoundedHttp(H11Protocol):
         super().connection_made(transport)
         self._await_request()
         if len(self.connections) > CONNECTIONS_MAX:
-            self._longest().end()
+            self._most_silent().end()
 
     def connection_lost(self, exc: Exception | None) -> None:
         if self._limit is not None:
@@ -36,7 +40,7 @@ class BoundedHttp(H11Protocol):
         super().on_response_complete()
 
     def end(self) -> None:
-        """At once, without a word."""
+        """Close the connection at once, without an answer."""
         self.connections.discard(self)
         self.transport.abort()
 
@@ -46,7 +50,7 @@ class BoundedHttp(H11Protocol):
             self._limit.cancel()
         self._limit = self.loop.call_later(REQUEST_S, self.end)
 
-    def _longest(self) -> "BoundedHttp":
-        """The connection whose last request is longest ago."""
+    def _most_silent(self) -> "BoundedHttp":
+        """The connection with the oldest last request."""
         ours = (one for one in self.connections if isinstance(one, BoundedHttp))
         return min(ours, key=lambda one: one._since)

@@ -1,6 +1,7 @@
-"""CurveZMQ keys: the files of robots and servers, made, read and checked.
+"""Makes, reads and checks the key files of robots and servers (CurveZMQ).
 
-The files are those of `zmq.auth.certs`, so other tools read them too; what is open to whom is `guard.py`.
+The files have the format of `zmq.auth.certs`, so other tools can read them. Which robots a server accepts is
+decided in the server.
 """
 
 import argparse
@@ -19,22 +20,22 @@ from zmq.utils import z85
 from offboard.common.command_line import CommandParser, add_flags
 from offboard.common.config import resolve, setting
 from offboard.common.errors import ConfigError
-from offboard.common.security.guard import PRIVATE_BYTES_MAX, read_private
+from offboard.common.security.private_files import PRIVATE_BYTES_MAX, read_private
 
 PUBLIC, PRIVATE = ".key", ".key_secret"
-SERVER, ROBOT = "server", "robot"  # names of their key files
+SERVER, ROBOT = "server", "robot"  # names of the key files
 ITEMS = ("public-key", "secret-key")
 
 _KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 _BANNERS = {
-    PUBLIC: "#   ZeroMQ CURVE public certificate: may be copied, but not changed on its way.",
-    PRIVATE: "#   ZeroMQ CURVE **secret** certificate: give it to nobody, and leave its mode at 0600.",
+    PUBLIC: "#   ZeroMQ CURVE public certificate: may be copied, but must not be changed.",
+    PRIVATE: "#   ZeroMQ CURVE **secret** certificate: do not share it, and keep its mode at 0600.",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class KeyPair:
-    """A certificate with its private part, each key in the 40 characters that libzmq takes."""
+    """A public and a secret key, each in the 40 characters that libzmq takes."""
 
     public: bytes
     secret: bytes = field(repr=False)
@@ -42,7 +43,7 @@ class KeyPair:
 
 @dataclass(frozen=True, slots=True)
 class RobotKeys:
-    """Who a robot is, and the one server that it believes."""
+    """The robot's own keys, and the public key of the one server that it trusts."""
 
     own: KeyPair
     server: bytes
@@ -52,26 +53,27 @@ class RobotKeys:
 class KeysConfig:
     """Settings of `cloud-server keys` and `robot-client keys`."""
 
-    out: Path = setting(Path("keys"), "folder for the files; made where it is not there", metavar="DIR")
+    out: Path = setting(Path("keys"), "folder for the key files; created if it is missing", metavar="DIR")
 
 
 def run_keys(name: str, argv: Sequence[str], *, prog: str, prefix: str, environ: Mapping[str, str]) -> Path:
-    """The command `keys`: make the files of `name`, say what they are for; their folder."""
+    """The command `keys`: make the key files of `name` and print what they are for; returns their folder."""
     parser = CommandParser(
         prog=prog,
-        description=f"Make a CurveZMQ key pair: DIR/{name}{PUBLIC} to be copied to whom it talks to, and "
-        f"DIR/{name}{PRIVATE}, which nobody else may read. A private key is never overwritten.",
+        description=f"Make a CurveZMQ key pair. Copy DIR/{name}{PUBLIC} to the other side; keep "
+        f"DIR/{name}{PRIVATE} secret. Existing keys are never overwritten.",
     )
     add_flags(parser, KeysConfig, prefix)
     flags: argparse.Namespace = parser.parse_args(argv)
     out = resolve(KeysConfig, flags, environ=environ, prefix=prefix).out
     public, private = make_keys(out, name)
-    print(f"{private}: private, stays here\n{public}: public, for the keys of whom it talks to")
+    other = ROBOT if name == SERVER else SERVER
+    print(f"{private}: secret, keep it here\n{public}: public, copy it to each {other}")
     return out
 
 
 def make_keys(folder: Path, name: str) -> tuple[Path, Path]:
-    """Write a new key pair; its public and its private file."""
+    """Write a new key pair; returns the public and the private file."""
     check_curve()
     public, private = folder / f"{name}{PUBLIC}", folder / f"{name}{PRIVATE}"
     public_key, secret_key = zmq.curve_keypair()
@@ -84,50 +86,55 @@ def make_keys(folder: Path, name: str) -> tuple[Path, Path]:
             private.unlink()
             raise
     except FileExistsError as error:
-        raise ConfigError(f"--out: {error.filename} exists already, and is not overwritten") from error
+        raise ConfigError(
+            f"--out: {error.filename} already exists and is not overwritten; choose another folder"
+        ) from error
     except OSError as error:
         raise ConfigError(f"--out: {error.filename or folder}: {error.strerror}") from error
     return public, private
 
 
 def server_keys(folder: Path) -> KeyPair:
-    """Of a server's --keys."""
+    """The keys in the folder of a server's --keys."""
     return _read_pair("--keys", folder / f"{SERVER}{PRIVATE}")
 
 
 def robot_keys(folder: Path, site: str) -> RobotKeys:
-    """Of a robot's --keys, for one site: the server's key is SITE.key there, or else server.key."""
+    """The keys in the folder of a robot's --keys, for one site.
+
+    The key of the site's server is in SITE.key, or else in server.key.
+    """
     own = _read_pair("--keys", folder / f"{ROBOT}{PRIVATE}")
     path = folder / f"{site}{PUBLIC}"
     if site == ROBOT or not path.exists():
         path = folder / f"{SERVER}{PUBLIC}"
     server = read_public(path)
     if server == own.public:
-        raise ConfigError(f"{path}: this is the robot's own key, not that of its server")
+        raise ConfigError(f"{path}: this is the robot's own key; copy the server's {SERVER}{PUBLIC} here")
     return RobotKeys(own, server)
 
 
 def read_public(path: Path) -> bytes:
-    """The key in a public certificate; ConfigError names file and line."""
+    """The key in a public key file; ConfigError names file and line."""
     check_curve()
     try:
         with path.open("rb") as file:
             text = file.read(PRIVATE_BYTES_MAX).decode()
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; a public key is wanted there") from error
+        raise ConfigError(f"{path}: {error.strerror}; it must be a public key file (*{PUBLIC})") from error
     except UnicodeDecodeError:
-        raise ConfigError(f"{path}: not text; a public key is wanted there") from None
+        raise ConfigError(f"{path}: not a text file; it must be a public key file (*{PUBLIC})") from None
     found = _parse(path, text)
     if "secret-key" in found:
-        raise ConfigError(f"{path}: holds a secret-key; only the public key ({PUBLIC}) belongs here")
+        raise ConfigError(f"{path}: holds a secret-key; copy only the public key file (*{PUBLIC}) here")
     return found["public-key"]
 
 
 def check_curve() -> None:
-    """ConfigError where libzmq was built without it."""
+    """ConfigError if libzmq was built without CURVE."""
     if not zmq.has("curve"):
         raise ConfigError(
-            f"keys: libzmq {zmq.zmq_version()} was built without CURVE; the wheel on PyPI has it: "
+            f"keys: libzmq {zmq.zmq_version()} was built without CURVE; the wheel from PyPI has it: "
             "pip install --force-reinstall --only-binary pyzmq pyzmq"
         )
 
@@ -136,15 +143,15 @@ def _read_pair(where: str, path: Path) -> KeyPair:
     check_curve()
     found = _parse(path, read_private(where, path))
     if "secret-key" not in found:
-        raise ConfigError(f"{path}: no secret-key in it")
+        raise ConfigError(f"{path}: secret-key is missing; make new keys with the command `keys`")
     pair = KeyPair(found["public-key"], found["secret-key"])
     if zmq.curve_public(pair.secret) != pair.public:
-        raise ConfigError(f"{path}: the public-key does not belong to the secret-key")
+        raise ConfigError(f"{path}: the public-key does not belong to the secret-key; make new keys")
     return pair
 
 
 def _parse(path: Path, text: str) -> dict[str, bytes]:
-    """What stands under `curve`: public-key, and secret-key where it is there."""
+    """The entries under `curve`: public-key and, in a private file, secret-key."""
     found: dict[str, bytes] = {}
     section = ""
     for number, line in enumerate(text.splitlines(), 1):
@@ -155,23 +162,23 @@ def _parse(path: Path, text: str) -> dict[str, bytes]:
         elif section == "curve":
             name, _, value = (part.strip() for part in line.partition("="))
             if name not in ITEMS or name in found:
-                raise ConfigError(f"{path}:{number}: {name!r} is not one of {', '.join(ITEMS)}, each once")
+                raise ConfigError(f"{path}:{number}: {name!r}: allowed are {', '.join(ITEMS)}, each once")
             found[name] = _key(f"{path}:{number}: {name}", value.strip("\"'"))
     if "public-key" not in found:
-        raise ConfigError(f"{path}: no public-key under `curve`: not a file of `... keys`")
+        raise ConfigError(f"{path}: no public-key under `curve`; the command `keys` makes such files")
     return found
 
 
 def _key(where: str, text: str) -> bytes:
-    """Never says the value: it may be a private one."""
+    """The checked key. The error does not show the value: it may be secret."""
     with contextlib.suppress(ValueError, struct.error):
         if _KEY.fullmatch(text) and len(z85.decode(text.encode())) == 32:
             return text.encode()
-    raise ConfigError(f"{where}: not a key: 40 characters of Z85 in quotes are wanted")
+    raise ConfigError(f"{where}: not a key; it must be 40 characters of Z85 in quotes")
 
 
 def _write(path: Path, mode: int, public_key: bytes, secret_key: bytes | None = None) -> None:
-    """A new file, with its mode from its first moment."""
+    """Write a new file that has its mode from the start."""
     lines = [_BANNERS[path.suffix], f"#   Made {datetime.now(UTC):%Y-%m-%d %H:%M} UTC by Offboard", ""]
     lines += ["metadata", "curve", f'    public-key = "{public_key.decode()}"']
     if secret_key is not None:

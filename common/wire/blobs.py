@@ -1,6 +1,6 @@
-"""Large arguments named by their SHA-256: digests, a byte-bounded store, and array views on raw bytes.
+"""Blobs, which are large arguments named by their SHA-256: digests, a bounded store, and array views.
 
-Which values become blobs is decided in `common.wire.values`.
+`values` decides which arguments become blobs.
 """
 
 import hashlib
@@ -17,14 +17,14 @@ from offboard.common.errors import ProtocolError
 Buffer = bytes | memoryview
 Array = NDArray[Any]
 
-VIEWS_MAX = 8  # differently shaped arrays kept of one blob
+VIEWS_MAX = 8  # arrays of different shapes or types that are kept for one blob
 
 _CODES = ("b1", "i1", "u1", "i2", "u2", "f2", "i4", "u4", "f4", "i8", "u8", "f8", "c8", "c16")
 DTYPES = {np.dtype(order + code).str: np.dtype(order + code) for code in _CODES for order in "<>"}
 
 
 class StoredBlob:
-    """The bytes of one blob; the same (dtype, shape) gives the same array object while the blob lives."""
+    """The bytes of one blob. Asked for the same dtype and shape, it returns the same array object."""
 
     def __init__(self, data: Buffer) -> None:
         self.data = memoryview(data).toreadonly()
@@ -40,10 +40,10 @@ class StoredBlob:
 
 
 class BlobStore:
-    """Blobs by SHA-256, for one thread at a time.
+    """At most `bytes_max` of blobs, by their SHA-256. For one thread at a time.
 
-    Beyond `bytes_max` the owner of most bytes loses what was least recently used: who sends many blobs does
-    not push out those of others.
+    If there is no room, the owner with the most bytes loses its least recently used blob. A robot that sends
+    many blobs therefore does not push out the blobs of others.
     """
 
     def __init__(self, bytes_max: int) -> None:
@@ -54,7 +54,7 @@ class BlobStore:
         self._owned: Counter[bytes] = Counter()
 
     def add(self, data: Buffer, owner: bytes = b"") -> bytes:
-        """Keep `data` and return its digest; data larger than the whole store is not kept."""
+        """Keep `data` and return its digest. Data larger than the whole store is not kept."""
         digest = hashlib.sha256(data).digest()
         if digest in self._blobs:
             self._blobs.move_to_end(digest)
@@ -68,7 +68,7 @@ class BlobStore:
         return digest
 
     def _dispensable(self, kept: bytes) -> bytes:
-        """Of the owner of most, `kept` left out."""
+        """The oldest blob of the owner with the most bytes; `kept` does not count."""
         owned = self._owned - Counter({self._owners[kept]: self._blobs[kept].data.nbytes})
         heaviest = max(owned, key=owned.__getitem__)
         return next(one for one in self._blobs if self._owners[one] == heaviest and one != kept)
@@ -89,12 +89,16 @@ class BlobStore:
     def __len__(self) -> int:
         return len(self._blobs)
 
+    def bytes_of(self, owner: bytes) -> int:
+        """The bytes of the blobs of one owner."""
+        return self._owned[owner]
+
 
 _digests: dict[int, tuple[weakref.ref[Array], bytes]] = {}
 
 
 def array_digest(array: Array, raw: memoryview) -> bytes:
-    """SHA-256 of the array's data; remembered by identity where nobody can write to it."""
+    """SHA-256 of the data of an array. If nothing can change the array, it is computed once."""
     if not _constant(array):
         return hashlib.sha256(raw).digest()
     key = id(array)
@@ -107,7 +111,7 @@ def array_digest(array: Array, raw: memoryview) -> bytes:
 
 
 def _constant(array: Array) -> bool:
-    """Neither the array nor what it is a view of can be written to."""
+    """True if neither the array nor the array that it is a view of is writeable."""
     base: Any = array
     while isinstance(base, np.ndarray):
         if base.flags.writeable:
@@ -117,15 +121,15 @@ def _constant(array: Array) -> bool:
 
 
 def array_view(data: memoryview, dtype: Any, shape: tuple[int, ...]) -> Array:
-    """A read-only array on `data`, not copied unless it lies askew."""
+    """A read-only array on `data`. It is copied only if the data is not aligned."""
     kind = checked_dtype(dtype)
     if math.prod(shape) * kind.itemsize != data.nbytes:
-        raise ProtocolError(f"array of shape {shape} and dtype {kind} does not fill {data.nbytes} bytes")
+        raise ProtocolError(f"an array of shape {shape} and dtype {kind} does not have {data.nbytes} bytes")
     try:
         array: Array = np.ndarray(shape, kind, buffer=data.toreadonly())
     except (ValueError, TypeError, OverflowError) as error:
-        raise ProtocolError(f"array of shape {shape}: {error}") from error
-    if not array.flags.aligned:  # compiled code would be compiled again for it
+        raise ProtocolError(f"an array of shape {shape}: {error}") from error
+    if not array.flags.aligned:  # numba would compile kernels again for such an array
         array = array.copy()
         array.flags.writeable = False
     return array
@@ -133,7 +137,7 @@ def array_view(data: memoryview, dtype: Any, shape: tuple[int, ...]) -> Array:
 
 def checked_dtype(name: Any) -> np.dtype[Any]:
     if not isinstance(name, str) or name not in DTYPES:
-        raise ProtocolError(f"array of dtype {name!r:.80} is not allowed")
+        raise ProtocolError(f"an array of dtype {name!r:.80} is not allowed")
     return DTYPES[name]
 
 

@@ -1,7 +1,8 @@
 """A ZMQ socket that one thread reads and any thread sends on.
 
-A socket may be used by several threads, one after the other, where a lock is between them. The reader must
-then not wait inside the socket: it waits for the descriptor by which libzmq signals.
+Several threads may use a ZMQ socket if a lock lets only one of them in at a time. The reader must then not
+wait inside the socket; it waits for the file descriptor on which libzmq signals. `messages` says what the
+frames mean.
 """
 
 import contextlib
@@ -13,24 +14,24 @@ from typing import Any
 
 import zmq
 
-COPIED_BYTES_MAX = 4096  # of a frame that is copied into the message
-WAKE_BYTES = 4096  # taken at once of the pair by which the reader is woken
-# As whole numbers: pyzmq's flags make a new object at each `|` and `&`, which takes longer than the call.
+COPIED_BYTES_MAX = 4096  # a larger frame is not copied into the message
+WAKE_BYTES = 4096  # wake-ups read at once
+# As integers: with pyzmq's flags, each `|` and `&` makes a new object, which takes longer than the call.
 _NOW, _MORE = int(zmq.DONTWAIT), int(zmq.DONTWAIT | zmq.SNDMORE)
 _POLLIN = int(zmq.POLLIN)
 
 
 class Channel:
-    """`lock` is held while the socket is used; whoever needs more to be of one piece may hold it longer.
+    """A socket with a lock. Hold `lock` around several calls that must not be interrupted by other threads.
 
-    `watched`: further descriptors for which `wait` returns. The owner closes the socket.
+    `wait` also returns for the file descriptors `watched`. The owner closes the socket.
     """
 
     def __init__(self, of: "zmq.Socket[bytes]", *watched: int) -> None:
         self.lock = threading.RLock()
         self._socket = of
-        self._frames: list[zmq.Frame] = []  # of a message whose reading was interrupted, as by Ctrl-C
-        self._read_out = False  # nothing was left to read; for what comes after that there is a signal
+        self._frames: list[zmq.Frame] = []  # frames of a message whose reading was interrupted by Ctrl-C
+        self._read_out = False  # all was read; libzmq signals the next message
         self._waker, self._woken = socket.socketpair()
         self._waker.setblocking(False)
         self._woken.setblocking(False)
@@ -39,18 +40,18 @@ class Channel:
             self._poll.register(readable, select.POLLIN)
 
     def send(self, frames: Sequence[Any]) -> None:
-        """Never waits: zmq.Again where the queue is full."""
+        """Send without waiting; zmq.Again if the queue is full."""
         with self.lock:
             *first, last = frames
             for frame in first:
                 self._send(frame, _MORE)
             self._send(last, _NOW)
-            # The signal is given once, for all that happened before: sending may have taken it.
+            # libzmq signals only once for everything that happened, and sending may have used up the signal.
             if readable(self._socket):
                 self.wake()
 
     def receive(self) -> "list[zmq.Frame] | None":
-        """The next message; None where there is none. For the reader."""
+        """The next message; None if there is none. For the reader."""
         with self.lock:
             if not readable(self._socket):
                 self._read_out = True
@@ -64,7 +65,7 @@ class Channel:
             return frames or None
 
     def wait(self, timeout_s: float) -> None:
-        """Until there is something to read, or `wake` was called. For the reader."""
+        """Wait until there is a message or `wake` is called. For the reader."""
         if not self._read_out:
             with self.lock:
                 if readable(self._socket):
@@ -75,21 +76,23 @@ class Channel:
             self._woken.recv(WAKE_BYTES)
 
     def wake(self) -> None:
-        """Make `wait` return, the next one if none is under way. Any thread, any time."""
-        with contextlib.suppress(OSError):  # full: it is awake already; closed: there is nobody to wake
+        """End the current `wait`, or else the next one. Any thread may call this at any time."""
+        with contextlib.suppress(
+            OSError
+        ):  # if full, the reader is awake already; if closed, there is no reader
             self._waker.send(b"\0")
 
     def close(self) -> None:
-        """What `wake` needs; not the socket."""
+        """Close the pair of sockets behind `wake`, but not the socket itself."""
         self._waker.close()
         self._woken.close()
 
     def _send(self, frame: Any, flags: int) -> None:
-        # Copying a small frame costs less than what lets the sender go on owning it.
+        # Copying a small frame costs less than tracking when libzmq no longer needs it.
         copied = isinstance(frame, bytes) and len(frame) <= COPIED_BYTES_MAX
         self._socket.send(frame, flags, copy=copied)
 
 
 def readable(of: "zmq.Socket[bytes]") -> bool:
-    """Whether there is a message."""
+    """True if there is a message."""
     return bool(int(of.getsockopt(zmq.EVENTS)) & _POLLIN)

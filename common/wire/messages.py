@@ -1,24 +1,23 @@
 """The messages between robot and server, version 1: a small msgpack header, then raw frames.
 
-Frame 0 is `[VERSION, type, fields]`; a reader ignores fields it does not know, so version 1 can grow.
-Arguments and results are `common.wire.values`, whose names can be had from here too.
+Frame 0 is `[VERSION, type, fields]`. A reader ignores unknown fields, so version 1 can get more of them.
+Arguments and results are encoded in `values`; this module offers its main names too.
 """
 
 import dataclasses
-import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, get_args
+from typing import get_args
 
 import msgpack
 
 from offboard.common.errors import BadValue, ProtocolError
-from offboard.common.tasks import KINDS_MAX, NAME_LENGTH_MAX
+from offboard.common.tasks import NAME_LENGTH_MAX
 from offboard.common.wire.blobs import BlobStore, Buffer, StoredBlob
+from offboard.common.wire.fields import IDLE, TEXT_LENGTH_MAX, Fields
 from offboard.common.wire.values import (
     ARRAYS_MAX,
     BLOB_BYTES_MIN,
-    BLOBS_MAX,
     Body,
     decode,
     encode,
@@ -50,14 +49,10 @@ __all__ = [
 
 VERSION = 1
 HEADER_BYTES_MAX = 64 * 1024
-FRAMES_MAX = 2 + ARRAYS_MAX  # header, value, its arrays
-TEXT_LENGTH_MAX = 128  # software version, source hash
+FRAMES_MAX = 2 + ARRAYS_MAX  # header, value, arrays
 ERROR_LENGTH_MAX = 2000
 ID_MAX = 2**63 - 1
 COUNT_MAX = 2**31 - 1
-SECONDS_MAX = 1e6
-DIGEST_BYTES = 32
-IDLE = {"load": 0.0, "capacity": 1.0}  # what a server has that does not say
 STATUSES = ("ok", "failed", "unknown_task", "busy", "expired", "need_blob")
 
 
@@ -67,9 +62,10 @@ class VersionMismatch(ProtocolError):
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """First message each way: the task names known, with the hash of each one's source.
+    """The first message in each direction.
 
-    `message_bytes_max` is the largest message that the sender takes.
+    `tasks` maps each known task to the hash of its source. The sender accepts messages of up to
+    `message_bytes_max`.
     """
 
     tasks: dict[str, str]
@@ -79,10 +75,10 @@ class Hello:
 
 @dataclass(slots=True)
 class Request:
-    """Run a task: `body` is the encoded list of its arguments, `blobs` the digests that it refers to.
+    """Run a task. `body` is the encoded list of arguments, `blobs` are the digests that it refers to.
 
-    `budget_s` is the time left when it was sent; `attempt` counts from 1 and grows when the same id is
-    sent again after `need_blob`.
+    `budget_s` is the time that was left when the request was sent. `attempt` starts at 1 and grows when the
+    same id is sent again after `need_blob`.
     """
 
     id: int
@@ -95,11 +91,11 @@ class Request:
 
 @dataclass(slots=True)
 class Reply:
-    """How a request went; `body` is the encoded result, empty unless `status` is ok.
+    """The answer to a request. `body` is the encoded result; it is empty unless `status` is ok.
 
-    `server_fault`: it failed, but not by the task's own doing, so another site may well answer. `cpu_s` is
-    the CPU time that the server used while the task ran; None, and not sent, where it did not run, or where
-    the server is older than the field. `load` and `capacity` are as in a pong.
+    `server_fault`: the task failed, but the task is not the cause, so another site may answer it. `cpu_s` is
+    the CPU time that the server used while the task ran. It is None, and not sent, if the task did not run or
+    if the server is too old to send it. `load` and `capacity` are as in a pong.
     """
 
     id: int
@@ -123,9 +119,10 @@ class Ping:
 
 @dataclass(frozen=True, slots=True)
 class Pong:
-    """How the server is: tasks in its queue; `load`: the share of its CPU that other programs take, 0 to 1;
-    `capacity`: so much of one CPU may a task use, above 0 to 1. The last two are sent where they differ from
-    an idle machine's.
+    """The state of the server: the number of waiting tasks, its load, and its capacity.
+
+    `load` is the share of the CPU that other programs take, 0 to 1. `capacity` is the share of one CPU that a
+    task may use, above 0 and at most 1. Both are sent only if they differ from those of an idle machine.
     """
 
     id: int
@@ -136,14 +133,14 @@ class Pong:
 
 @dataclass(frozen=True, slots=True)
 class Cancel:
-    """The answer to this request is no longer wanted."""
+    """The sender does not want the answer to this request any more."""
 
     id: int
 
 
 @dataclass(frozen=True, slots=True)
 class Blob:
-    """The bytes of one blob; the receiver computes the digest itself."""
+    """The bytes of one blob. The receiver computes the digest itself."""
 
     data: Buffer
 
@@ -152,7 +149,7 @@ Message = Hello | Request | Reply | Ping | Pong | Cancel | Blob
 
 
 def pack(message: Message) -> list[Buffer]:
-    """The frames of a message; buffers in it are not copied. BadValue where it breaks a bound."""
+    """The frames of a message; its buffers are not copied. BadValue if the message is too large."""
     kind, names = _FIELDS[type(message)]
     fields = {field: getattr(message, field) for field in names}
     if isinstance(message, Reply):
@@ -171,93 +168,36 @@ def pack(message: Message) -> list[Buffer]:
     elif isinstance(message, Blob):
         frames.append(message.data)
     if len(header) > HEADER_BYTES_MAX or len(frames) > FRAMES_MAX:
-        raise BadValue(f"a {kind} with a header of {len(header)} bytes and {len(frames)} frames is too big")
+        raise BadValue(
+            f"a {kind} has a header of {len(header)} bytes and {len(frames)} frames; "
+            f"at most {HEADER_BYTES_MAX} bytes and {FRAMES_MAX} frames are allowed"
+        )
     return frames
 
 
 def unpack(frames: Sequence[Buffer]) -> Message:
-    """The message in `frames`; VersionMismatch for another version, ProtocolError for all else."""
+    """The message in `frames`. VersionMismatch for another version, ProtocolError for any other fault."""
     if not 1 <= len(frames) <= FRAMES_MAX:
-        raise ProtocolError(f"message of {len(frames)} frames, 1 to {FRAMES_MAX} are allowed")
+        raise ProtocolError(f"message of {len(frames)} frames; allowed are 1 to {FRAMES_MAX}")
     header = unpack_bounded(frames[0], HEADER_BYTES_MAX)
     if not isinstance(header, list) or not header or type(header[0]) is not int:
         raise ProtocolError("header is not [version, type, fields]")
     if header[0] != VERSION:
-        raise VersionMismatch(f"peer speaks wire version {header[0]}, this is version {VERSION}")
+        raise VersionMismatch(f"the other side speaks wire version {header[0]}, this side {VERSION}")
     if len(header) != 3 or not isinstance(header[1], str) or not isinstance(header[2], dict):
         raise ProtocolError("header is not [version, type, fields]")
     read = _READERS.get(header[1])
     if read is None:
         raise ProtocolError(f"unknown message type {header[1]!r:.80}")
-    return read(_Fields(header[1], header[2]), list(frames[1:]))
+    return read(Fields(header[1], header[2]), list(frames[1:]))
 
 
 def byte_count(frames: Iterable[Buffer]) -> int:
-    """Bytes in all frames, without transport headers."""
+    """The bytes in all frames, without the headers of the transport."""
     return sum(f.nbytes if isinstance(f, memoryview) else len(f) for f in frames)
 
 
-class _Fields:
-    """Takes checked values out of a header's map."""
-
-    def __init__(self, message: str, values: dict[Any, Any]) -> None:
-        self.message = message
-        self.values = values
-
-    def whole(self, name: str, low: int, high: int) -> int:
-        value = self.values.get(name)
-        if type(value) is not int or not low <= value <= high:
-            raise self.wrong(name, f"a whole number {low} to {high}")
-        return value
-
-    def seconds(self, name: str) -> float:
-        value: Any = self.values.get(name)
-        if type(value) not in (int, float) or not (math.isfinite(value) and 0 <= value <= SECONDS_MAX):
-            raise self.wrong(name, f"a number 0 to {SECONDS_MAX:g}")
-        return float(value)
-
-    def share(self, name: str) -> float:
-        value: Any = self.values.get(name, IDLE[name])
-        if type(value) not in (int, float) or not 0 <= value <= 1 or (name == "capacity" and not value):
-            raise self.wrong(name, f"a share {'above ' if name == 'capacity' else ''}0 to 1")
-        return float(value)
-
-    def text(self, name: str, length_max: int) -> str:
-        value = self.values.get(name)
-        if not isinstance(value, str) or len(value) > length_max:
-            raise self.wrong(name, f"a text of at most {length_max} characters")
-        return value
-
-    def flag(self, name: str) -> bool:
-        value = self.values.get(name)
-        if type(value) is not bool:
-            raise self.wrong(name, "true or false")
-        return value
-
-    def digests(self, name: str) -> tuple[bytes, ...]:
-        value = self.values.get(name)
-        if not isinstance(value, list) or len(value) > BLOBS_MAX:
-            raise self.wrong(name, f"a list of at most {BLOBS_MAX} digests")
-        if not all(isinstance(item, bytes) and len(item) == DIGEST_BYTES for item in value):
-            raise self.wrong(name, f"a list of digests of {DIGEST_BYTES} bytes")
-        return tuple(value)
-
-    def tasks(self, name: str) -> dict[str, str]:
-        value = self.values.get(name)
-        if not isinstance(value, dict) or len(value) > KINDS_MAX:
-            raise self.wrong(name, f"a map of at most {KINDS_MAX} tasks")
-        for key, text in value.items():
-            if not (isinstance(key, str) and 0 < len(key) <= NAME_LENGTH_MAX):
-                raise self.wrong(name, f"a map of names of 1 to {NAME_LENGTH_MAX} characters")
-            if not (isinstance(text, str) and len(text) <= TEXT_LENGTH_MAX):
-                raise self.wrong(name, f"a map to texts of at most {TEXT_LENGTH_MAX} characters")
-        return value
-
-    def wrong(self, name: str, allowed: str) -> ProtocolError:
-        return ProtocolError(f"{self.message}.{name} is {self.values.get(name)!r:.80}, not {allowed}")
-
-
-def _hello(fields: _Fields, rest: list[Buffer]) -> Hello:
+def _hello(fields: Fields, rest: list[Buffer]) -> Hello:
     _frame_count("hello", rest, 0)
     return Hello(
         fields.tasks("tasks"),
@@ -266,22 +206,23 @@ def _hello(fields: _Fields, rest: list[Buffer]) -> Hello:
     )
 
 
-def _request(fields: _Fields, rest: list[Buffer]) -> Request:
+def _request(fields: Fields, rest: list[Buffer]) -> Request:
     kind, budget_s = fields.text("kind", NAME_LENGTH_MAX), fields.seconds("budget_s")
     if not kind or not budget_s > 0:
         raise ProtocolError("request without a kind or a budget")
     if not rest:
         raise ProtocolError("request without a body")
     attempt = fields.whole("attempt", 1, COUNT_MAX)
-    return Request(fields.whole("id", 0, ID_MAX), kind, budget_s, attempt, fields.digests("blobs"), rest)
+    id, blobs = fields.whole("id", 0, ID_MAX), fields.digests("blobs")
+    return Request(id, kind, budget_s, attempt, blobs=blobs, body=rest)
 
 
-def _reply(fields: _Fields, rest: list[Buffer]) -> Reply:
+def _reply(fields: Fields, rest: list[Buffer]) -> Reply:
     status = fields.text("status", TEXT_LENGTH_MAX)
     if status not in STATUSES:
         raise fields.wrong("status", f"one of {', '.join(STATUSES)}")
     if (status == "ok") != bool(rest):
-        raise ProtocolError(f"reply with status {status} and {len(rest)} body frames")
+        raise ProtocolError(f"reply with status {status} and {len(rest)} frames of body")
     return Reply(
         id=fields.whole("id", 0, ID_MAX),
         status=status,
@@ -298,38 +239,38 @@ def _reply(fields: _Fields, rest: list[Buffer]) -> Reply:
     )
 
 
-def _ping(fields: _Fields, rest: list[Buffer]) -> Ping:
+def _ping(fields: Fields, rest: list[Buffer]) -> Ping:
     _frame_count("ping", rest, 0)
     return Ping(fields.whole("id", 0, ID_MAX))
 
 
-def _pong(fields: _Fields, rest: list[Buffer]) -> Pong:
+def _pong(fields: Fields, rest: list[Buffer]) -> Pong:
     _frame_count("pong", rest, 0)
     queue = fields.whole("queue_depth", 0, COUNT_MAX)
     return Pong(fields.whole("id", 0, ID_MAX), queue, fields.share("load"), fields.share("capacity"))
 
 
-def _cancel(fields: _Fields, rest: list[Buffer]) -> Cancel:
+def _cancel(fields: Fields, rest: list[Buffer]) -> Cancel:
     _frame_count("cancel", rest, 0)
     return Cancel(fields.whole("id", 0, ID_MAX))
 
 
-def _blob(_: _Fields, rest: list[Buffer]) -> Blob:
+def _blob(_: Fields, rest: list[Buffer]) -> Blob:
     _frame_count("blob", rest, 1)
     return Blob(rest[0])
 
 
 def _frame_count(name: str, rest: list[Buffer], wanted: int) -> None:
     if len(rest) != wanted:
-        raise ProtocolError(f"{name} with {len(rest)} frames after the header, not {wanted}")
+        raise ProtocolError(f"{name} with {len(rest)} frames after the header; it must have {wanted}")
 
 
-_RAW = ("body", "data")  # what follows the header in frames of its own
+_RAW = ("body", "data")  # fields that follow the header as frames
 _FIELDS: dict[type, tuple[str, list[str]]] = {
     kind: (kind.__name__.lower(), [one.name for one in dataclasses.fields(kind) if one.name not in _RAW])
     for kind in get_args(Message)
 }
-_READERS: dict[str, Callable[[_Fields, list[Buffer]], Message]] = {
+_READERS: dict[str, Callable[[Fields, list[Buffer]], Message]] = {
     "hello": _hello,
     "request": _request,
     "reply": _reply,

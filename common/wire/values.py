@@ -1,6 +1,6 @@
-"""How arguments and results become bytes: msgpack, raw array buffers, and blobs named by their SHA-256.
+"""Encodes arguments and results: msgpack, raw buffers of arrays, and blobs named by their SHA-256.
 
-What the frames travel in is `wire.messages`.
+`messages` puts the encoded frames into requests and replies.
 """
 
 import dataclasses
@@ -26,13 +26,13 @@ from offboard.common.wire.blobs import (
 )
 
 BLOB_BYTES_MIN = 64 * 1024  # a larger argument is a blob
-VALUE_BYTES_MAX = 16 * 1024 * 1024  # msgpack part of a value; arrays do not count
-ARRAYS_MAX = 1000  # arrays sent beside one value
-BLOBS_MAX = 64  # blobs one value may refer to
-UNSCANNED_BYTES_MAX = 512  # of msgpack that cannot announce more than is harmless
+VALUE_BYTES_MAX = 16 * 1024 * 1024  # of the msgpack part of a value, without its arrays
+ARRAYS_MAX = 1000  # arrays of one value that are sent in frames
+BLOBS_MAX = 64  # blobs that one value may refer to
+UNSCANNED_BYTES_MAX = 512  # of msgpack that is too short to announce a harmful number of items
 NESTING_MAX = 32
 DIMENSIONS_MAX = 8
-TYPES_MAX = 256  # dataclasses whose fields are remembered
+TYPES_MAX = 256  # dataclasses whose field names are cached
 
 _IN_FRAME, _IN_BLOB, _DATACLASS = 1, 2, 3
 _SCALARS = {type(None), bool, int, float, str}
@@ -41,7 +41,7 @@ _UNPACK_ERRORS = (ValueError, TypeError, OverflowError, RecursionError, msgpack.
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """An encoded value: frame 0 is msgpack, the rest raw arrays; `blobs` is what it names by digest."""
+    """An encoded value: frame 0 is msgpack, the others are raw arrays. `blobs` holds its blobs by digest."""
 
     frames: list[Buffer]
     blobs: dict[bytes, memoryview] = field(default_factory=dict)
@@ -56,33 +56,34 @@ def encode(
 ) -> Body:
     """Encode None, bool, int, float, str, bytes, list, tuple, dict, arrays and dataclasses of `types`.
 
-    With `blobs`, every array or bytes over BLOB_BYTES_MIN is named by digest instead of sent along, unless
-    `along` says so of the array's bytes.
-    Arrays are not copied: leave them alone until the frames are sent. BadValue names what cannot cross.
+    With `blobs`, each array or bytes larger than BLOB_BYTES_MIN becomes a blob: the value holds only its
+    digest. If `along` returns True for the bytes of an array, the array is sent in a frame instead.
+    Arrays are not copied, so do not change them before the frames are sent. BadValue names what cannot be
+    sent.
     """
-    encoder = _Encoder(types, blobs, along)
+    encoder = _Encoder(types, use_blobs=blobs, along=along)
     main = encoder.pack(value, 0)
     if len(main) > VALUE_BYTES_MAX:
         raise BadValue(
-            f"value takes {len(main)} bytes beside its arrays, at most {VALUE_BYTES_MAX} are allowed"
+            f"the value takes {len(main)} bytes without its arrays; at most {VALUE_BYTES_MAX} are allowed"
         )
     return Body([main, *encoder.frames], encoder.blobs)
 
 
 def decode(frames: Sequence[Buffer], types: Sequence[type], blobs: Mapping[bytes, StoredBlob]) -> Any:
-    """The value in `frames`, arrays as read-only views on them; anything unsound is ProtocolError."""
+    """The value in `frames`. Arrays are read-only views on them. ProtocolError for anything malformed."""
     if not 1 <= len(frames) <= 1 + ARRAYS_MAX:
-        raise ProtocolError(f"value of {len(frames)} frames, 1 to {1 + ARRAYS_MAX} are allowed")
+        raise ProtocolError(f"value of {len(frames)} frames; allowed are 1 to {1 + ARRAYS_MAX}")
     return _Decoder(frames, types, blobs).unpack(frames[0], 0)
 
 
 def unpack_bounded(data: Buffer, bytes_max: int) -> Any:
-    """msgpack to a plain tree, extension values left as ExtType."""
+    """Unpack msgpack to a tree of plain values. Extension values stay ExtType."""
     if byte_length(data) > bytes_max:
-        raise ProtocolError(f"msgpack of {byte_length(data)} bytes, at most {bytes_max} are allowed")
+        raise ProtocolError(f"msgpack of {byte_length(data)} bytes; at most {bytes_max} are allowed")
     try:
-        # Skipping proves that every announced item is there; unpacking alone allocates on announcement, for
-        # each byte of the data at most as many items as it has bytes.
+        # Unpacking allocates memory as soon as a number of items is announced: for each byte, up to as many
+        # items as the data has bytes. Skipping first proves that all announced items exist.
         if byte_length(data) > UNSCANNED_BYTES_MAX:
             scan = msgpack.Unpacker(max_buffer_size=bytes_max, strict_map_key=False)
             scan.feed(data)
@@ -93,9 +94,11 @@ def unpack_bounded(data: Buffer, bytes_max: int) -> Any:
 
 
 class _Encoder:
-    """Turns a value into what msgpack packs, collecting array frames and blobs on the way."""
+    """Turns a value into a tree for msgpack, and collects the frames of arrays and the blobs."""
 
-    def __init__(self, types: Sequence[type], use_blobs: bool, along: Callable[[memoryview], bool]) -> None:
+    def __init__(
+        self, types: Sequence[type], *, use_blobs: bool, along: Callable[[memoryview], bool]
+    ) -> None:
         self.types = types
         self.use_blobs = use_blobs
         self.along = along
@@ -107,7 +110,7 @@ class _Encoder:
         try:
             packed: bytes = msgpack.packb(tree)
         except (ValueError, OverflowError) as error:
-            raise BadValue(f"value cannot cross the wire: {error}") from error
+            raise BadValue(f"the value cannot be sent: {error}") from error
         return packed
 
     def _tree(self, value: Any, depth: int) -> Any:
@@ -117,7 +120,7 @@ class _Encoder:
         if kind is bytes:
             return self._bytes(value)
         if depth > NESTING_MAX:
-            raise BadValue(f"value nests deeper than {NESTING_MAX} levels")
+            raise BadValue(f"the value nests deeper than {NESTING_MAX} levels")
         if kind is list or kind is tuple:
             if set(map(type, value)) <= _SCALARS:
                 return value
@@ -127,18 +130,23 @@ class _Encoder:
                 self._key(key): one if type(one) in _SCALARS else self._tree(one, depth + 1)
                 for key, one in value.items()
             }
-        if kind is np.ndarray:
-            return self._array(value)
+        return self._array(value) if kind is np.ndarray else self._object(value, depth)
+
+    def _object(self, value: Any, depth: int) -> Any:
+        kind = type(value)
         if isinstance(value, np.generic) and value.dtype.str in DTYPES and value.dtype.kind in "biuf":
             return value.item()
         if kind in self.types and dataclasses.is_dataclass(value):
             return self._dataclass(value, depth)
-        raise BadValue(f"a value of type {kind.__module__}.{kind.__qualname__} cannot cross the wire")
+        raise BadValue(
+            f"a value of type {kind.__module__}.{kind.__qualname__} cannot be sent; "
+            "allowed are plain values, arrays, and dataclasses listed in @task(types=...)"
+        )
 
     def _key(self, key: Any) -> str | int:
         if type(key) is str or type(key) is int:
             return key
-        raise BadValue(f"a dict key of type {type(key).__qualname__} cannot cross the wire, str or int can")
+        raise BadValue(f"a dict key of type {type(key).__qualname__} cannot be sent; use str or int")
 
     def _bytes(self, value: bytes) -> Any:
         if not self.use_blobs or len(value) <= BLOB_BYTES_MIN:
@@ -149,13 +157,14 @@ class _Encoder:
     def _array(self, array: Array) -> Any:
         if array.dtype.str not in DTYPES or array.ndim > DIMENSIONS_MAX:
             raise BadValue(
-                f"an array of {array.ndim} dimensions and dtype {array.dtype} cannot cross the wire"
+                f"an array of {array.ndim} dimensions and dtype {array.dtype} cannot be sent; "
+                f"allowed are {DIMENSIONS_MAX} dimensions of numbers"
             )
         raw = np.asarray(array, order="C").reshape(-1).view(np.uint8).data
         if self.use_blobs and raw.nbytes > BLOB_BYTES_MIN and not self.along(raw):
             return self._blob(array_digest(array, raw), raw, array.dtype.str, array.shape)
         if len(self.frames) == ARRAYS_MAX:
-            raise BadValue(f"value holds more than {ARRAYS_MAX} arrays")
+            raise BadValue(f"the value holds more than {ARRAYS_MAX} arrays")
         self.frames.append(raw)
         place = (len(self.frames), array.dtype.str, array.shape)
         return msgpack.ExtType(_IN_FRAME, msgpack.packb(place))
@@ -163,7 +172,7 @@ class _Encoder:
     def _blob(self, digest: bytes, raw: memoryview, dtype: str | None, shape: tuple[int, ...]) -> Any:
         self.blobs[digest] = raw
         if len(self.blobs) > BLOBS_MAX:
-            raise BadValue(f"value holds more than {BLOBS_MAX} arrays over {BLOB_BYTES_MIN} bytes")
+            raise BadValue(f"the value holds more than {BLOBS_MAX} arrays over {BLOB_BYTES_MIN} bytes")
         return msgpack.ExtType(_IN_BLOB, msgpack.packb((digest, dtype, shape)))
 
     def _dataclass(self, value: Any, depth: int) -> Any:
@@ -178,7 +187,7 @@ def _field_names(kind: Any) -> tuple[str, ...]:
 
 
 class _Decoder:
-    """Turns what msgpack unpacked back into a value, trusting nothing."""
+    """Turns a tree from msgpack back into a value. The tree may come from anyone, so all of it is checked."""
 
     def __init__(
         self, frames: Sequence[Buffer], types: Sequence[type], blobs: Mapping[bytes, StoredBlob]
@@ -221,18 +230,18 @@ class _Decoder:
             return array_view(memoryview(self.frames[where]).toreadonly(), dtype, shape)
         blob = self.blobs.get(where) if isinstance(where, bytes) else None
         if blob is None:
-            raise ProtocolError("value refers to a blob that was not announced")
+            raise ProtocolError("the value refers to a blob that the request does not list")
         return bytes(blob.data) if dtype is None else blob.array(checked_dtype(dtype).str, shape)
 
     def _dataclass(self, tree: Any) -> Any:
         if not (isinstance(tree, list) and len(tree) == 2 and isinstance(tree[1], dict)):
-            raise ProtocolError("malformed dataclass")
+            raise ProtocolError("a dataclass is not [name, fields]")
         name, fields = tree
         cls = self.types.get(name) if isinstance(name, str) else None
         if cls is None or not dataclasses.is_dataclass(cls):
             raise ProtocolError(f"no dataclass {name!r:.80} is registered with this task")
         if fields.keys() != {f.name for f in dataclasses.fields(cls) if f.init}:
-            raise ProtocolError(f"the fields of dataclass {name} differ")
+            raise ProtocolError(f"the fields of dataclass {name} differ from those on this side")
         try:
             return cls(**fields)
         except Exception as error:
@@ -241,7 +250,7 @@ class _Decoder:
 
 def _shape(shape: Any) -> tuple[int, ...]:
     if not isinstance(shape, list) or len(shape) > DIMENSIONS_MAX:
-        raise ProtocolError(f"array shape is not a list of at most {DIMENSIONS_MAX} numbers")
+        raise ProtocolError(f"an array shape is not a list of at most {DIMENSIONS_MAX} numbers")
     if not all(type(n) is int and 0 <= n < 2**63 for n in shape):
-        raise ProtocolError(f"array shape {shape!r:.80} has a bad dimension")
+        raise ProtocolError(f"array shape {shape!r:.80} has a dimension that is not 0 to 2**63 - 1")
     return tuple(shape)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.common.planning.flood import covered
+from offboard.common.planning.grid_kernels import covered
 from offboard.common.planning.maps import GridMap, passable
 from offboard.common.planning.planner import Plan, scan_hits
 from offboard.loadgen.scenario.outcome import Answered

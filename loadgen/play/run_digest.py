@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from offboard.common.planning.maps import read_map
+from offboard.common.planning.map_files import read_map
 from offboard.loadgen.scenario.scenario import Scenario
 
 # The packages that the parts of a testbed load.

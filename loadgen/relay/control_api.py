@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Any, Protocol
 
 from offboard.common.errors import ConfigError, MissingExtra
-from offboard.common.security.guard import Guard
+from offboard.common.security.http_guard import HttpGuard
 from offboard.loadgen.relay.link.link import NAMES
 from offboard.loadgen.relay.link_schedule import Linked, Schedule, parse_schedule
 
@@ -126,7 +126,7 @@ def control_app(
         redoc_url=None,
     )
     app.add_middleware(BoundedBody)
-    app.add_middleware(Guard, token=token, open_paths=("/health",), loopback=loopback)
+    app.add_middleware(HttpGuard, token=token, open_paths=("/health",), loopback=loopback)
     _add_link(app, relay, insecure=insecure)
     _add_schedule(app, relay, schedule)
     app.add_exception_handler(ConfigError, _bad_value)

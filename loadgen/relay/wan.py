@@ -11,7 +11,8 @@ from pathlib import Path
 
 from offboard.common.config import setting
 from offboard.common.errors import ConfigError
-from offboard.common.security.guard import LOOPBACK, OPEN_REMEDY, on_loopback, read_token, warn_each_minute
+from offboard.common.security.exposure import LOOPBACK, OPEN_REMEDY, on_loopback, warn_each_minute
+from offboard.common.security.private_files import read_token
 from offboard.loadgen.relay.control_api import ControlServer, control_app
 from offboard.loadgen.relay.link.bandwidth import CHUNK_BYTES
 from offboard.loadgen.relay.link.link_settings import LinkFlags

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.common.errors import ConfigError
-from offboard.common.planning.flood import covered
+from offboard.common.planning.grid_kernels import covered
 from offboard.common.planning.maps import OCCUPIED, GridMap, largest_component, passable, path_size
 from offboard.common.planning.planner import RADIUS_CELLS_MAX, RADIUS_M, Plan, Point, Pose, Scan, scan_hits
 from offboard.common.planning.planner_names import DIJKSTRA

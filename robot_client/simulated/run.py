@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from offboard.common import errors
 from offboard.common.errors import ConfigError, TaskError
-from offboard.common.host import cpu
+from offboard.common.host import cpu_time
 from offboard.common.tasks import kind_of
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import BOTH
@@ -88,7 +88,7 @@ class Run:
         kind = kind_of(self._work.function)
         if kind.warm is not None:
             kind.warm()
-        cpu.used_s()  # the first call takes longer: it looks for the files to read
+        cpu_time.used_s()  # the first call takes longer: it looks for the files to read
         if kind.duplicate:
             with contextlib.suppress(TaskError):  # the run meets and reports the same failure
                 offload(self._work.function, *self._work.request(), where=BOTH)

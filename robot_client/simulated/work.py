@@ -135,7 +135,8 @@ def read_prior(path: Path, resolution: float | None) -> "GridMap":
 
     A MovingAI map keeps its cells.
     """
-    from offboard.common.planning.maps import read_map, resampled
+    from offboard.common.planning.map_files import read_map
+    from offboard.common.planning.maps import resampled
 
     grid = read_map(path)
     return grid if resolution is None or path.suffix == ".map" else resampled(grid, resolution)

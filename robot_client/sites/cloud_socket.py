@@ -14,7 +14,7 @@ import zmq
 import zmq.utils.monitor
 
 from offboard.common.errors import ConfigError
-from offboard.common.security.guard import on_loopback
+from offboard.common.security.exposure import on_loopback
 from offboard.common.security.keys import RobotKeys
 from offboard.common.wire.channel import Channel, readable
 from offboard.robot_client.sites.connection import NO_HANDSHAKE, UNKNOWN_ROBOT, HandshakeFailure

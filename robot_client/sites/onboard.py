@@ -9,9 +9,10 @@ from dataclasses import dataclass, field
 from queue import SimpleQueue
 
 from offboard.common.errors import OffloadError, Overtaken, TaskFailed, describe
-from offboard.common.host import cpu
-from offboard.common.host.cpu import SELF
-from offboard.common.host.load import LOADED, Load, LoadWatch
+from offboard.common.host import cpu_time
+from offboard.common.host.cgroup import SELF
+from offboard.common.host.load import LOADED, Load
+from offboard.common.host.load_watch import LoadWatch
 from offboard.common.tasks import Kind, Task
 from offboard.common.threads import join_all
 from offboard.common.wanted import call_while
@@ -145,7 +146,7 @@ class OnboardRunner:
 
 
 def _run(run: _Run) -> Execution:
-    cpu_before_s, started_s = cpu.used_s(), time.perf_counter()
+    cpu_before_s, started_s = cpu_time.used_s(), time.perf_counter()
     value, failure = None, None
     OWN_CPU.begin()
     try:
@@ -153,7 +154,7 @@ def _run(run: _Run) -> Execution:
     except BaseException as error:  # noqa: BLE001 - anything that the function raises is the task's failure
         failure = TaskFailed(describe(error))
         failure.__cause__ = error
-    cpu_s = cpu.used_s() - cpu_before_s
+    cpu_s = cpu_time.used_s() - cpu_before_s
     # Reading the CPU time makes the kernel charge this thread. A thread that has used more than its quota is
     # then stopped for a while, and the caller waits for that too.
     ended_s = time.perf_counter()

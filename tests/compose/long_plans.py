@@ -5,7 +5,8 @@ import sys
 import time
 from pathlib import Path
 
-from offboard.common.planning.maps import read_map, resampled
+from offboard.common.planning.map_files import read_map
+from offboard.common.planning.maps import resampled
 from offboard.common.planning.planner import Point, Pose, plan_path
 
 SETTLE_S = 0.3  # until the program that changed the quota needs no more CPU

@@ -1,4 +1,4 @@
-"""What a wicked robot, or a stranger, sends to a server: rows of docs/security.md."""
+"""Attacks on a server by a bad robot or a stranger; docs/security.md has a row for each."""
 
 import contextlib
 import random
@@ -22,7 +22,7 @@ from benchmarks.attack_target import Target, dealer
 from benchmarks.attackers import ATTACKS
 from benchmarks.keyring import Keys
 from offboard.cloud_server.rate_limit import CUT_OFF_S
-from offboard.cloud_server.server import HANDSHAKE_S
+from offboard.cloud_server.robot_socket import HANDSHAKE_S
 from offboard.common.planning.maps import GridMap
 from offboard.common.planning.planner import Point, Pose, plan_path
 from offboard.common.security.bounded_http import CONNECTIONS_MAX, REQUEST_S
@@ -41,7 +41,7 @@ GARBAGE = 100_000  # messages
 MUTATED = 20_000
 CLAIMED = 2**32  # bytes
 PING = 777_777
-UNREAD_MIB = 400  # two messages, and what loopback brings in a tenth of a second
+UNREAD_MIB = 400  # two messages, and what loopback transfers in a tenth of a second
 
 
 @pytest.fixture(scope="module")
@@ -50,8 +50,8 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Keys:
 
 
 @pytest.fixture(scope="module")
-def wicked(keys: Keys) -> Path:
-    return keys.add("wicked")
+def attacker(keys: Keys) -> Path:
+    return keys.add("attacker")
 
 
 @pytest.fixture(scope="module")
@@ -60,9 +60,9 @@ def good(keys: Keys) -> Path:
 
 
 @pytest.fixture(scope="module")
-def served(keys: Keys, wicked: Path, good: Path) -> Iterator[Served]:  # noqa: ARG001 - their keys come first
-    """A server for all attacks: what one of them broke, the next would find."""
-    unbounded = ("--robot-mib-s", "65536")  # nothing is cut off for its number
+def served(keys: Keys, attacker: Path, good: Path) -> Iterator[Served]:  # noqa: ARG001 - the keys must exist before
+    """One server for all attacks: what one attack breaks, the next one finds."""
+    unbounded = ("--robot-mib-s", "65536")  # so that no attack is cut off for its rate
     served = Served(
         "--keys",
         str(keys.server),
@@ -78,8 +78,8 @@ def served(keys: Keys, wicked: Path, good: Path) -> Iterator[Served]:  # noqa: A
 
 
 @pytest.fixture
-def target(served: Served, wicked: Path) -> Target:
-    return Target(served.endpoint, int(served.http.rpartition(":")[2]), wicked)
+def target(served: Served, attacker: Path) -> Target:
+    return Target(served.endpoint, int(served.http.rpartition(":")[2]), attacker)
 
 
 def memory(served: Served) -> int:
@@ -94,7 +94,7 @@ def dropped(served: Served) -> float:
 
 
 def is_served(served: Served, keys: Path | None) -> None:
-    """A good robot has a task answered in the cloud."""
+    """The cloud answers a task of a good robot."""
     with Offloader.connect(served.endpoint, policy="cloud", keys=keys) as offload:
         assert offload.wait_for_sites(echo, WAIT_S) == {}
         assert offload(echo, "still there") == "still there"
@@ -103,7 +103,7 @@ def is_served(served: Served, keys: Path | None) -> None:
 
 
 def until_pong(client: "zmq.Socket[bytes]") -> list[wire.Message]:
-    """What the server answers until it answers a ping; pings beyond the quota are not read."""
+    """All answers of the server until it answers a ping. It may ignore pings above the rate limit."""
     answers: list[wire.Message] = []
     until_s = time.monotonic() + WAIT_S
     while not any(isinstance(one, wire.Pong) and one.id == PING for one in answers):
@@ -115,19 +115,19 @@ def until_pong(client: "zmq.Socket[bytes]") -> list[wire.Message]:
 
 
 def test_garbage_is_dropped_and_counted(served: Served, target: Target, good: Path) -> None:
-    """100,000 messages of random bytes: none is taken, none costs memory, and the next robot is served."""
+    """100,000 messages of random bytes cost no memory, and the next robot is served."""
     before, at_first = dropped(served), memory(served)
     attack = ATTACKS["garbage"](target)
     with contextlib.closing(attack):
         for _ in range(GARBAGE):
             next(attack)
-        until(lambda: dropped(served) - before > GARBAGE / 2)  # what finds a full queue is not sent
+        until(lambda: dropped(served) - before > GARBAGE / 2)  # messages beyond a full socket are not sent
     is_served(served, good)
     assert memory(served) - at_first < 2 * MESSAGE_MIB * MIB
 
 
 def test_changed_messages_do_no_harm(served: Served, target: Target, good: Path) -> None:
-    """Good messages with changed bits, bytes, lengths or frames: the server answers, or drops them."""
+    """The server answers or drops good messages with changed bits, bytes, lengths or frames."""
     rng, messages = random.Random(5), valid_messages()
     with dealer(target) as client:
         client.sndtimeo = int(WAIT_S * 1000)
@@ -144,8 +144,8 @@ def test_changed_messages_do_no_harm(served: Served, target: Target, good: Path)
 
 
 @pytest.mark.parametrize("name", bombs())
-def test_bombs_cost_nothing(served: Served, target: Target, good: Path, name: str) -> None:
-    """What is small and says that it is large, or is code: refused or dropped, and no memory is taken."""
+def test_bombs_cost_no_memory(served: Served, target: Target, good: Path, name: str) -> None:
+    """Small messages that claim to be large, or that contain code, are refused or dropped."""
     at_first = memory(served)
     with dealer(target) as client:
         client.send_multipart(bombs()[name])
@@ -159,7 +159,7 @@ def test_bombs_cost_nothing(served: Served, target: Target, good: Path, name: st
 
 @pytest.mark.parametrize("encrypted", [False, True], ids=["plain", "curve"])
 def test_a_claim_of_4_gb_is_not_believed(served: Served, good: Path, encrypted: bool) -> None:
-    """A frame that says it has 4 GB: the connection is closed, and no memory taken for it."""
+    """A frame that claims 4 GB costs no memory, and its connection is closed."""
     at_first = memory(served)
     greeting = curve_greeting() if encrypted else PLAIN_GREETING + READY
     with socket.create_connection(("127.0.0.1", served.port), WAIT_S) as client:
@@ -172,7 +172,7 @@ def test_a_claim_of_4_gb_is_not_believed(served: Served, good: Path, encrypted: 
 
 
 def test_a_claim_of_4_gb_is_not_believed_without_keys() -> None:
-    """After a handshake that any may make: a connection is closed that says a frame has 4 GB."""
+    """Without keys anyone can finish the handshake; a frame that claims 4 GB still costs no memory."""
     served = Served(*SIZES)
     try:
         at_first = memory(served)
@@ -191,26 +191,26 @@ def test_a_claim_of_4_gb_is_not_believed_without_keys() -> None:
 
 
 def test_a_message_without_end_is_cut_off() -> None:
-    """Small frames of one message that never ends: the connection goes before the memory does."""
+    """The connection of an endless message is closed before it takes all memory."""
     served = Served(*SIZES)
     try:
         at_first, most = memory(served), 0
         attack = ATTACKS["endless"](Target(served.endpoint, 0, None))
         with contextlib.closing(attack):
             until_s = time.monotonic() + WAIT_S
-            while served.logged("could not be read") < 3 and time.monotonic() < until_s:
+            while served.logged("more than could be read") < 3 and time.monotonic() < until_s:
                 next(attack)
                 most = max(most, memory(served) - at_first)
         print(f"{most / MIB:.0f} MiB")
-        assert served.logged("could not be read") == 3
+        assert served.logged("more than could be read") == 3
         assert most < UNREAD_MIB * MIB
         is_served(served, None)
     finally:
         served.close()
 
 
-def test_who_does_not_read_is_not_answered_for_ever(served: Served, target: Target, good: Path) -> None:
-    """A robot asks for large results and reads none: what waits for it is bounded by bytes."""
+def test_unread_replies_are_limited(served: Served, target: Target, good: Path) -> None:
+    """If a robot asks for large results and reads none, the bytes that wait for it are limited."""
     at_first = memory(served)
     body = wire.encode([MESSAGE_MIB * MIB // 2]).frames
     with dealer(target) as client:
@@ -223,14 +223,14 @@ def test_who_does_not_read_is_not_answered_for_ever(served: Served, target: Targ
     is_served(served, good)
 
 
-def test_bytes_a_second_are_bounded(keys: Keys, wicked: Path, good: Path) -> None:
-    """More than --robot-mib-s: requests are `busy`; another robot is served."""
+def test_bytes_per_second_are_limited(keys: Keys, attacker: Path, good: Path) -> None:
+    """Above --robot-mib-s requests are answered `busy`; another robot is served."""
     served = Served("--keys", str(keys.server), *SIZES, "--robot-mib-s", "1")
     try:
-        with dealer(Target(served.endpoint, 0, wicked)) as client:
+        with dealer(Target(served.endpoint, 0, attacker)) as client:
             body = wire.encode([bytes(60_000)]).frames
             statuses = []
-            for _ in range(350):  # 64 KiB each, of which there are 16 MiB at first
+            for _ in range(350):  # 64 KiB each; the first 16 MiB are free
                 client.send_multipart(request(body, "echo"))
                 assert client.poll(int(WAIT_S * 1000))
                 reply = wire.unpack(client.recv_multipart())
@@ -243,18 +243,18 @@ def test_bytes_a_second_are_bounded(keys: Keys, wicked: Path, good: Path) -> Non
         served.close()
 
 
-def test_a_flood_is_cut_off(keys: Keys, wicked: Path, good: Path) -> None:
-    """Who sends on and on is disconnected, and not let in for a while; other robots are."""
+def test_a_flood_is_cut_off(keys: Keys, attacker: Path, good: Path) -> None:
+    """A robot that keeps flooding is disconnected and shut out for a while; other robots are served."""
     served = Served("--keys", str(keys.server), *SIZES)
     try:
-        with contextlib.closing(ATTACKS["flood"](Target(served.endpoint, 0, wicked))) as attack:
+        with contextlib.closing(ATTACKS["flood"](Target(served.endpoint, 0, attacker))) as attack:
             until_s = time.monotonic() + WAIT_S
-            while not served.logged("cut off wicked") and time.monotonic() < until_s:
+            while not served.logged("cut off robot attacker") and time.monotonic() < until_s:
                 next(attack)
-        assert served.logged("cut off wicked") == 1
-        assert not is_let_in(served, wicked)
+        assert served.logged("cut off robot attacker") == 1
+        assert not is_let_in(served, attacker)
         is_served(served, good)
-        until(lambda: is_let_in(served, wicked), CUT_OFF_S + WAIT_S)
+        until(lambda: is_let_in(served, attacker), CUT_OFF_S + WAIT_S)
     finally:
         served.close()
 
@@ -266,7 +266,7 @@ def is_let_in(served: Served, keys: Path) -> bool:
 
 
 def test_slow_handshakes_end(served: Served, good: Path) -> None:
-    """200 connections that say a byte now and then are closed after HANDSHAKE_S; robots are served."""
+    """200 connections that send a byte now and then are closed after HANDSHAKE_S; robots are served."""
     clients = [socket.create_connection(("127.0.0.1", served.port), WAIT_S) for _ in range(200)]
     began = time.monotonic()
     text = iter(curve_greeting())
@@ -292,8 +292,8 @@ def test_slow_handshakes_end(served: Served, good: Path) -> None:
     assert not clients
 
 
-def test_slow_http_ends_and_lets_others_in(served: Served) -> None:
-    """More connections than the server holds, each with half a request: health is answered, and they end."""
+def test_slow_http_connections_are_closed(served: Served) -> None:
+    """/health is answered during more half-finished requests than the server keeps; those are closed."""
     address = ("127.0.0.1", int(served.http.rpartition(":")[2]))
     clients = [socket.create_connection(address, WAIT_S) for _ in range(CONNECTIONS_MAX + 50)]
     began = time.monotonic()
@@ -316,12 +316,12 @@ def test_slow_http_ends_and_lets_others_in(served: Served) -> None:
             client.close()
 
 
-def test_five_thousand_robots_may_be_idle(keys: Keys, wicked: Path, good: Path) -> None:
-    """The server raises its soft limit of open files; another robot is served, memory is as the docs say."""
+def test_five_thousand_robots_can_be_idle(keys: Keys, attacker: Path, good: Path) -> None:
+    """The server raises its limit of open files, serves another robot, and takes the documented memory."""
     served = Served("--keys", str(keys.server), *SIZES, files=1024)
     try:
         at_first = memory(served)
-        attack = ATTACKS["idle"](Target(served.endpoint, 0, wicked))
+        attack = ATTACKS["idle"](Target(served.endpoint, 0, attacker))
         with contextlib.closing(attack):
             for _ in range(IDLE):
                 next(attack)
@@ -334,8 +334,8 @@ def test_five_thousand_robots_may_be_idle(keys: Keys, wicked: Path, good: Path) 
         served.close()
 
 
-def test_a_good_robot_is_served_beside_all_attacks(served: Served, target: Target, good: Path) -> None:
-    """Every attack but the idle one at once, each by half a core: no plan of a good robot is lost."""
+def test_a_good_robot_is_served_during_all_attacks(served: Served, target: Target, good: Path) -> None:
+    """During all attacks but the idle one, each with half a core, no plan of a good robot is lost."""
     command = [sys.executable, "-m", "benchmarks.attackers"]
     place = [target.endpoint, str(target.http_port), str(target.keys)]
     attackers = [

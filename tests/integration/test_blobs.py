@@ -1,4 +1,4 @@
-"""When the client sends a large argument along, and when it asks first whether the server has it."""
+"""When a robot sends a large argument with its request, and when it first asks whether the server has it."""
 
 import time
 from collections.abc import Iterator
@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from offboard.cloud_server.executors import Threads
+from offboard.cloud_server.executors import ThreadExecutor
 from offboard.cloud_server.metrics import Metrics
-from offboard.cloud_server.server import Server
+from offboard.cloud_server.server import Limits, Server
 from offboard.common.tasks import Task, kind_of, task
 from offboard.robot_client.sites.blob_uploads import INLINE_BYTES_MAX, INLINE_SHARE, NEW_AFTER
 from offboard.robot_client.sites.cloud import CloudRunner
@@ -30,13 +30,18 @@ def both_sums(*arrays: Any) -> list[float]:
 
 
 class Served:
-    """A server in a thread of this process, and how often it asked for a blob."""
+    """A server in this process, and how often it asked for a blob."""
 
     def __init__(self) -> None:
         self.metrics = Metrics()
-        bounds = {"queue_max": 8, "blob_bytes_max": 2**24, "message_bytes_max": MESSAGE_BYTES_MAX}
-        bounds |= {"robot_bytes_a_s": 2**30, "drain_s": 1}
-        self.server = Server("tcp://127.0.0.1:0", Threads(1), self.metrics, **bounds)  # type: ignore[arg-type]
+        limits = Limits(
+            queue_max=8,
+            blob_bytes_max=2**24,
+            message_bytes_max=MESSAGE_BYTES_MAX,
+            robot_bytes_per_s=2**30,
+            drain_s=1.0,
+        )
+        self.server = Server("tcp://127.0.0.1:0", ThreadExecutor(1), self.metrics, limits)
 
     @property
     def asked(self) -> int:
@@ -77,8 +82,8 @@ def new(n: int) -> np.ndarray[Any, Any]:
     return np.full(NUMBERS, float(n))
 
 
-def test_arguments_that_are_always_new_go_along(served: Served) -> None:
-    """After NEW_AFTER tasks whose blob the server did not have, none is named, asked for or kept."""
+def test_arguments_that_always_change_are_sent_at_once(served: Served) -> None:
+    """After NEW_AFTER tasks with unknown blobs, the robot sends arguments at once; they are not stored."""
     with joined(served) as runner:
         for n in range(NEW_AFTER + 3):
             run(runner, new(n))
@@ -86,8 +91,8 @@ def test_arguments_that_are_always_new_go_along(served: Served) -> None:
     assert served.kept_bytes == NEW_AFTER * new(0).nbytes
 
 
-def test_what_went_along_is_kept_once_it_comes_again(served: Served) -> None:
-    """The second time it is uploaded, unasked; from the third on it is only named."""
+def test_an_argument_that_comes_again_is_stored(served: Served) -> None:
+    """The second time it is uploaded unasked; from the third time on only its name is sent."""
     with joined(served) as runner:
         sent = [run(runner, new(n)).bytes_out for n in (*range(NEW_AFTER + 1), NEW_AFTER, NEW_AFTER)]
     assert served.asked == NEW_AFTER
@@ -95,8 +100,8 @@ def test_what_went_along_is_kept_once_it_comes_again(served: Served) -> None:
     assert sent[-1] < 1000
 
 
-def test_no_more_goes_along_than_fits(served: Served) -> None:
-    """Of one task; the rest are blobs, in messages of their own."""
+def test_a_request_carries_no_more_than_fits(served: Served) -> None:
+    """The other arguments of the task are blobs in messages of their own."""
     most = int(INLINE_SHARE * MESSAGE_BYTES_MAX)
     assert most <= INLINE_BYTES_MAX
     with joined(served) as runner:
@@ -107,15 +112,15 @@ def test_no_more_goes_along_than_fits(served: Served) -> None:
 
 
 def test_a_blob_that_is_used_again_is_asked_for_first(served: Served) -> None:
-    """A known blob in between shows that the kind's blobs come again: the next new one is named only."""
+    """A known blob shows that blobs of this kind come again, so the next unknown one is only named."""
     with joined(served) as runner:
         for n in (0, 1, 1, 2, 2, 3, 3):
             run(runner, new(n))
     assert served.asked == 4
 
 
-def test_what_another_robot_has_sent_is_not_sent_again(served: Served) -> None:
-    """A robot that is new asks first, and that the server had it lets it ask again."""
+def test_a_blob_from_another_robot_is_not_sent_again(served: Served) -> None:
+    """A new robot asks first; as long as the server has the blobs, it goes on asking."""
     with joined(served) as runner:
         for n in range(NEW_AFTER):
             run(runner, new(n))
@@ -126,7 +131,7 @@ def test_what_another_robot_has_sent_is_not_sent_again(served: Served) -> None:
 
 
 def test_of_two_blobs_the_known_one_is_not_sent_again(served: Served) -> None:
-    """A map that stays and an image that changes: only the image goes along."""
+    """With a constant map and a changing image, only the image is sent."""
     grid = new(-1)
     with joined(served) as runner:
         sent = [run(runner, grid, new(n)).bytes_out for n in range(NEW_AFTER + 3)]

@@ -5,9 +5,9 @@ from threading import Thread
 
 import pytest
 
-from offboard.cloud_server.executors import Threads
+from offboard.cloud_server.executors import ThreadExecutor
 from offboard.cloud_server.metrics import Metrics
-from offboard.cloud_server.server import Server
+from offboard.cloud_server.server import Limits, Server
 from offboard.common.tasks import task
 from offboard.common.wire.channel import Channel
 from offboard.robot_client.offloader import Offloader
@@ -41,9 +41,11 @@ def test_an_empty_task_is_two_messages_and_wakes_no_other_thread(monkeypatch: py
     monkeypatch.setattr(Channel, "send", counted_send)
     monkeypatch.setattr(Channel, "wake", counted_wake)
     server = Server(
-        "tcp://127.0.0.1:0", Threads(1), Metrics(),
-        queue_max=8, blob_bytes_max=2**20, message_bytes_max=2**20, robot_bytes_a_s=2**30, drain_s=1.0,
-    )  # fmt: skip
+        "tcp://127.0.0.1:0",
+        ThreadExecutor(1),
+        Metrics(),
+        Limits(8, blob_bytes_max=2**20, message_bytes_max=2**20, robot_bytes_per_s=2**30, drain_s=1.0),
+    )
     thread = Thread(target=server.run)
     thread.start()
     with Offloader.connect(server.endpoint, policy="cloud") as offload:

@@ -1,4 +1,4 @@
-"""A task that harms its worker process loses its own answer, and nothing else."""
+"""A task that harms its worker process loses only its own answer."""
 
 import contextlib
 import importlib
@@ -15,8 +15,9 @@ import httpx
 import numpy as np
 import pytest
 
-from offboard.cloud_server import worker_pool as worker_processes
-from offboard.cloud_server.executors import Outcome, Processes
+from offboard.cloud_server import worker
+from offboard.cloud_server.task_run import Call, Outcome
+from offboard.cloud_server.worker_pool import WorkerPool
 from offboard.common.errors import CloudTimeout, TaskFailed
 from offboard.common.wire.messages import decode, encode
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
@@ -28,9 +29,9 @@ from tests.probes import echo, nap, process_id
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
 
 MODULES = ("tests.probes", "tests.crashes")
-START_S = 90.0  # the planner is compiled, where it was not before
+START_S = 90.0  # may include compiling the planner
 WAIT_S = 20.0
-REPLACED_S = 2.0  # from a crash until the next worker takes tasks
+REPLACED_S = 2.0  # from a crash until another worker takes tasks
 BUDGET_S = 0.3
 MIB = 1 << 20
 GIB = 1 << 30
@@ -43,11 +44,11 @@ def kinds() -> None:
 
 
 @pytest.fixture
-def make() -> Iterator[Callable[..., Processes]]:
-    made: list[Processes] = []
+def make() -> Iterator[Callable[..., WorkerPool]]:
+    made: list[WorkerPool] = []
 
-    def start(count: int = 2, *more: str, memory: int = GIB, changes: list[str] | None = None) -> Processes:
-        executor = Processes(count, [*MODULES, *more], MIB, memory)
+    def start(count: int = 2, *more: str, memory: int = GIB, changes: list[str] | None = None) -> WorkerPool:
+        executor = WorkerPool(count, [*MODULES, *more], MIB, memory)
         made.append(executor)
         executor.warm((changes if changes is not None else []).append).result(START_S)
         return executor
@@ -57,11 +58,11 @@ def make() -> Iterator[Callable[..., Processes]]:
         executor.close()
 
 
-def submit(executor: Processes, kind: str, *args: Any, **limits: Any) -> Any:
-    return executor.submit(kind, encode(args).frames, {}, **limits)
+def submit(executor: WorkerPool, kind: str, *args: Any, **limits: Any) -> Any:
+    return executor.submit(Call(kind, encode(args).frames, **limits), lambda _: None)
 
 
-def run(executor: Processes, kind: str, *args: Any, **limits: Any) -> Outcome:
+def run(executor: WorkerPool, kind: str, *args: Any, **limits: Any) -> Outcome:
     outcome = submit(executor, kind, *args, **limits).result(WAIT_S)
     assert isinstance(outcome, Outcome)
     return outcome
@@ -73,7 +74,7 @@ def value(outcome: Outcome) -> Any:
 
 
 def until(done: Callable[[], bool], what: str) -> float:
-    """Seconds until `done`."""
+    """Wait until `done`; returns the seconds that it took."""
     began = time.monotonic()
     while not done():
         assert time.monotonic() - began < WAIT_S, f"{what}: not within {WAIT_S:g} s"
@@ -102,28 +103,30 @@ def gone(pid: int) -> bool:
     ],
 )
 def test_a_crash_fails_its_own_task_alone(
-    make: Callable[..., Processes], kind: str, args: tuple[Any, ...], how: str, server_fault: bool
+    make: Callable[..., WorkerPool], kind: str, args: tuple[Any, ...], how: str, server_fault: bool
 ) -> None:
-    """It fails with the reason, the task beside it is answered, and soon there are two workers again,
-    with the planner loaded, whose code is in the cache of the compiler."""
+    """The task fails with the reason, the other running task is answered, and a new worker starts soon.
+
+    The workers load the planner, whose compiled code is in the cache.
+    """
     changes: list[str] = []
     executor = make(2, "offboard.common.planning.planner", changes=changes)
-    beside = submit(executor, "nap", 0.5)
+    at_the_same_time = submit(executor, "nap", 0.5)
     outcome = run(executor, kind, *args)
     assert (outcome.status, outcome.error) == ("failed", f"the worker {how} while this task ran")
     assert (outcome.crashed, outcome.server_fault, outcome.cpu_s) == (True, server_fault, None)
     replaced_s = outcome.run_s + until(lambda: executor.up == 2, "another worker")
     assert value(run(executor, "echo", 1)) == 1
     assert replaced_s <= REPLACED_S, f"{replaced_s:.2f} s"
-    assert value(beside.result(WAIT_S)) == 0.5
+    assert value(at_the_same_time.result(WAIT_S)) == 0.5
     both = [submit(executor, "nap", 0.2) for _ in range(2)]
     assert [value(one.result(WAIT_S)) for one in both] == [0.2, 0.2]
     until(lambda: len(changes) == 5, "another spare one")
     assert changes == ["", "", "", "signal" if "signal" in how else "exit", ""]
 
 
-def test_too_much_memory_is_an_ordinary_failure(make: Callable[..., Processes]) -> None:
-    """10 GB are refused, and the worker lives on; so it is where none is left for the result."""
+def test_too_much_memory_is_an_ordinary_failure(make: Callable[..., WorkerPool]) -> None:
+    """A task that asks for 10 GB fails and its worker goes on; so does one whose result needs too much."""
     executor = make(1)
     pid = value(run(executor, "process_id"))
     outcome = run(executor, "grab", 10 * GIB)
@@ -138,8 +141,8 @@ def test_too_much_memory_is_an_ordinary_failure(make: Callable[..., Processes]) 
     assert value(run(executor, "large", 200 * MIB)).nbytes == 200 * MIB
 
 
-def test_memory_that_is_gone_in_small_pieces_is_a_failure_too(make: Callable[..., Processes]) -> None:
-    """Where nothing at all is left the answer still comes, and the worker is replaced if it must."""
+def test_a_task_that_fills_all_memory_is_answered(make: Callable[..., WorkerPool]) -> None:
+    """The answer comes even if no memory is left; the worker is replaced if necessary."""
     executor = make(1, memory=256 * MIB)
     for _ in range(3):
         outcome = run(executor, "fill")
@@ -149,8 +152,8 @@ def test_memory_that_is_gone_in_small_pieces_is_a_failure_too(make: Callable[...
     assert value(run(executor, "echo", 1)) == 1
 
 
-def test_a_worker_whose_memory_is_lost_is_replaced(make: Callable[..., Processes]) -> None:
-    """Where a task kept more than half of the memory and the next finds too little, that one fails alone."""
+def test_a_worker_that_keeps_too_much_memory_is_replaced(make: Callable[..., WorkerPool]) -> None:
+    """If a task keeps more than half of the memory, the next task may fail; then the worker is replaced."""
     changes: list[str] = []
     executor = make(1, changes=changes)
     pid = value(run(executor, "hoard", 700 * MIB))
@@ -163,15 +166,15 @@ def test_a_worker_whose_memory_is_lost_is_replaced(make: Callable[..., Processes
     assert changes == ["", "", "memory", ""]
 
 
-def test_an_endless_task_is_killed_after_its_budget(make: Callable[..., Processes], tmp_path: Path) -> None:
-    """Whatever signals it ignores; the answer says so, and the worker is free for others again."""
+def test_an_endless_task_is_killed_after_its_budget(make: Callable[..., WorkerPool], tmp_path: Path) -> None:
+    """It is killed even if it ignores signals; the answer gives the reason, and another worker starts."""
     changes: list[str] = []
     executor = make(1, changes=changes)
     outcome = run(executor, "spin", str(tmp_path / "begun"), budget_s=BUDGET_S)
     assert outcome.status == "failed"
     assert outcome.error == "the worker was killed 1 s after the budget was over while this task ran"
     assert (outcome.crashed, outcome.server_fault) == (True, True)
-    assert outcome.run_s >= BUDGET_S + worker_processes.OVERTIME_S
+    assert outcome.run_s >= BUDGET_S + worker.OVERTIME_S
     until(lambda: executor.up == 1, "another worker")
     assert value(run(executor, "echo", 5)) == 5
     until(lambda: len(changes) == 4, "another spare one")
@@ -179,8 +182,10 @@ def test_an_endless_task_is_killed_after_its_budget(make: Callable[..., Processe
 
 
 @pytest.mark.parametrize("why", ["cancelled", "budget over"])
-def test_a_task_that_looks_keeps_its_worker(make: Callable[..., Processes], tmp_path: Path, why: str) -> None:
-    """Cancelled, or beyond its budget, it is told, and stops; the next task is not told anything."""
+def test_a_task_that_checks_keeps_its_worker(
+    make: Callable[..., WorkerPool], tmp_path: Path, why: str
+) -> None:
+    """A task that calls `check_wanted` stops if cancelled or too late; the next task is not affected."""
     executor, begun = make(1), tmp_path / "begun"
     pid, wanted = value(run(executor, "process_id")), [True]
     budget_s = BUDGET_S if why == "budget over" else WAIT_S
@@ -194,13 +199,13 @@ def test_a_task_that_looks_keeps_its_worker(make: Callable[..., Processes], tmp_
     wanted[0] = True
     future = submit(executor, "look", str(begun), wanted=lambda: wanted[0])
     with pytest.raises(TimeoutError):
-        future.result(5 * worker_processes.LOOK_S)
+        future.result(5 * worker.LOOK_S)
     wanted[0] = False
     assert future.result(WAIT_S).error.startswith("Unwanted")
 
 
-def test_an_idle_worker_that_is_killed_is_replaced(make: Callable[..., Processes]) -> None:
-    """kill -9 from outside between two tasks costs no task."""
+def test_an_idle_worker_that_is_killed_is_replaced(make: Callable[..., WorkerPool]) -> None:
+    """`kill -9` between two tasks costs no task."""
     changes: list[str] = []
     executor = make(changes=changes)
     pid = value(run(executor, "process_id"))
@@ -210,15 +215,15 @@ def test_an_idle_worker_that_is_killed_is_replaced(make: Callable[..., Processes
     until(lambda: changes[3:] == ["signal", ""], "another worker")
 
 
-def test_tasks_given_while_workers_die_are_all_answered(make: Callable[..., Processes]) -> None:
-    """Every future ends, with an answer or with why not, while workers are killed at any moment."""
+def test_all_tasks_are_answered_while_workers_die(make: Callable[..., WorkerPool]) -> None:
+    """Workers are killed at any moment; still every future gets an answer or the reason for having none."""
     executor = make(2)
     outcomes: list[Outcome] = []
     ending = time.monotonic() + 3.0
     while time.monotonic() < ending:
         if len(outcomes) % 50 == 49:
             with contextlib.suppress(ProcessLookupError):
-                os.kill(executor._workers[len(outcomes) // 50 % 2].pid, signal.SIGKILL)
+                os.kill(executor.pids[len(outcomes) // 50 % 2], signal.SIGKILL)
         outcomes.append(run(executor, "echo", len(outcomes)))
         if executor.up == 0:
             until(lambda: executor.up > 0, "another worker")
@@ -243,22 +248,22 @@ def test_tasks_given_while_workers_die_are_all_answered(make: Callable[..., Proc
         ),
     ],
 )
-def test_a_crash_in_warm_up_is_told(
+def test_a_crash_during_warm_up_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, body: str, error: str
 ) -> None:
-    """Workers that cannot start are an error with the reason, not one attempt after the other."""
+    """If workers cannot start, `warm` fails with the reason instead of trying again."""
     (tmp_path / "breaks_at_start.py").write_text(body)
     monkeypatch.syspath_prepend(tmp_path)
-    executor = Processes(2, ["breaks_at_start"], MIB)
+    executor = WorkerPool(2, ["breaks_at_start"], MIB)
     with contextlib.closing(executor), pytest.raises(Exception, match=re.escape(error)):
         executor.warm().result(WAIT_S)
 
 
-def test_a_worker_that_does_not_start_again_is_tried_again(
-    make: Callable[..., Processes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_failed_restart_is_repeated(
+    make: Callable[..., WorkerPool], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Meanwhile the others work; tries have a pause between them."""
-    monkeypatch.setattr(worker_processes, "FAILED_PAUSE_S", 0.1)
+    """There is a pause between two attempts, and the other workers go on."""
+    monkeypatch.setattr(worker, "FAILED_PAUSE_S", 0.1)
     (tmp_path / "starts_sometimes.py").write_text(
         "import pathlib\n"
         f"if pathlib.Path({str(tmp_path / 'bad')!r}).exists():\n"
@@ -277,11 +282,11 @@ def test_a_worker_that_does_not_start_again_is_tried_again(
     until(lambda: executor.up == 2, "another worker")
 
 
-def test_nothing_is_left_after_close(make: Callable[..., Processes], tmp_path: Path) -> None:
-    """Neither process nor thread nor open file, though one task never ends and one worker has just died."""
+def test_nothing_is_left_after_close(make: Callable[..., WorkerPool], tmp_path: Path) -> None:
+    """No process, thread or open file is left, even if one task never ends and one worker has just died."""
     before = len(list(Path("/proc/self/fd").iterdir())), threading.active_count()
     executor = make(3)
-    pids = [worker.pid for worker in executor._workers]
+    pids = executor.pids
     endless = submit(executor, "spin", str(tmp_path / "begun"))
     until((tmp_path / "begun").exists, "the task")
     run(executor, "segfault")
@@ -290,13 +295,13 @@ def test_nothing_is_left_after_close(make: Callable[..., Processes], tmp_path: P
     assert endless.result(0).error == "the worker was ended with the server while this task ran"
     assert [gone(pid) for pid in pids] == [True] * 4
     assert (len(list(Path("/proc/self/fd").iterdir())), threading.active_count()) == before
-    assert not executor._spool.folder.exists()
+    assert not executor.blob_folder.exists()
 
 
 def test_an_idle_worker_ends_by_itself(
-    make: Callable[..., Processes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make: Callable[..., WorkerPool], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """`close` gives a module the time to tidy up."""
+    """`close` lets a module run its exit handlers."""
     (tmp_path / "tidies_up.py").write_text(
         f"import atexit, pathlib\natexit.register(pathlib.Path({str(tmp_path / 'tidy')!r}).touch)\n"
     )
@@ -305,18 +310,20 @@ def test_an_idle_worker_ends_by_itself(
     assert (tmp_path / "tidy").exists()
 
 
-def test_large_arguments_and_results_cross_the_pipe(make: Callable[..., Processes]) -> None:
-    """40 MB each way, and the small answers after them."""
+def test_large_arguments_and_results_cross_the_pipe(make: Callable[..., WorkerPool]) -> None:
+    """40 MB cross in each direction, and small values after them."""
     executor, numbers = make(1), np.arange(5_000_000)
     np.testing.assert_array_equal(value(run(executor, "echo", numbers)), numbers)
     assert value(run(executor, "echo", [1, b"2", None])) == [1, b"2", None]
 
 
-def test_a_robot_hears_why_and_the_others_are_served(
+def test_a_robot_gets_the_reason_and_others_are_served(
     testbed: Callable[..., LocalTestbed], connect: Callable[..., Offloader], tmp_path: Path
 ) -> None:
-    """Through server and client: crash, exit, 10 GB and an endless loop are TaskFailed or late, none of them
-    is run onboard, and tasks of another robot meanwhile are answered by the cloud."""
+    """Crashes and 10 GB raise TaskFailed at the robot, and an endless loop is too late; none runs onboard.
+
+    At the same time the cloud answers the tasks of another robot.
+    """
     bed = testbed({"executor": "processes", "workers": 2, "tasks": ",".join(MODULES)})
     offload, other = (connect(bed, policy=CLOUD, timeout_s=WAIT_S) for _ in range(2))
     workers = {other(process_id)}
@@ -326,12 +333,12 @@ def test_a_robot_hears_why_and_the_others_are_served(
         (crashes.grab, (10 * GIB,), "MemoryError: Unable to allocate 10.0 GiB"),
     ):
         answers: list[float] = []
-        beside = threading.Thread(target=lambda: answers.append(other(nap, 0.5)))  # noqa: B023
-        beside.start()
+        at_the_same_time = threading.Thread(target=lambda: answers.append(other(nap, 0.5)))  # noqa: B023
+        at_the_same_time.start()
         time.sleep(0.1)
         with pytest.raises(TaskFailed, match=re.escape(reason)):
             offload(fatal, *args)
-        beside.join()
+        at_the_same_time.join()
         assert answers == [0.5]
         assert other.last is not None
         assert (other.last.used, len(other.last.executions)) == (CLOUD, 1)

@@ -1,4 +1,4 @@
-"""A robot that floods the server does not take it from the others."""
+"""A robot that floods the server does not keep it from serving the others."""
 
 import select
 import subprocess
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.integration
 ROBOTS = 6
 NAP_S = 0.01
 SECONDS = 3.0
-TIMES = 50  # its share is what the flood asks for
+TIMES = 50  # the flood asks for this many times its share
 FLOOD_IN_FLIGHT = 200
 
 
@@ -28,7 +28,7 @@ def ask(socket: "zmq.Socket[bytes]", id: int) -> None:
 
 
 def answers(endpoint: str) -> Counter[int]:
-    """How many each of ROBOTS gets in SECONDS, that ask for one at a time."""
+    """For each of ROBOTS, the answers that it gets in SECONDS if it asks for one at a time."""
     with zmq.Context() as context:
         sockets = [context.socket(zmq.DEALER) for _ in range(ROBOTS)]
         poller, found = zmq.Poller(), Counter[int]()
@@ -51,8 +51,8 @@ def answers(endpoint: str) -> Counter[int]:
 
 
 def flood(endpoint: str, rate: float) -> None:
-    """Until the input ends; says how many answers were of which status."""
-    told, sent, began = Counter[str](), 0, time.monotonic()
+    """Send requests until stdin ends; then print how many were answered `ok` and `busy`."""
+    statuses, sent, began = Counter[str](), 0, time.monotonic()
     with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
         socket.linger = 0
         socket.connect(endpoint)
@@ -60,17 +60,17 @@ def flood(endpoint: str, rate: float) -> None:
             while socket.poll(0):
                 reply = wire.unpack(socket.recv_multipart())
                 assert isinstance(reply, wire.Reply)
-                told[reply.status] += 1
+                statuses[reply.status] += 1
             due = int((time.monotonic() - began) * rate)
-            while sent < due and sent - told.total() < FLOOD_IN_FLIGHT:
+            while sent < due and sent - statuses.total() < FLOOD_IN_FLIGHT:
                 ask(socket, sent)
                 sent += 1
-    print(told["ok"], told["busy"])
+    print(statuses["ok"], statuses["busy"])
 
 
-@pytest.mark.timeout(60)  # measures twice, for SECONDS
+@pytest.mark.timeout(60)  # it measures twice for SECONDS
 def test_a_flood_takes_its_share_and_no_more() -> None:
-    """At 50 times its share it gets `busy`; the others keep 75 % of what they had, 10 % apart at most."""
+    """At 50 times its share it gets `busy`; the others keep 75 % of their answers, and differ by 10 %."""
     with cloud_server("tests.probes", CLOUD_WORKERS="1") as server:
         alone = answers(server.endpoint)
         rate = TIMES * alone.total() / SECONDS / (ROBOTS + 1)
@@ -78,9 +78,9 @@ def test_a_flood_takes_its_share_and_no_more() -> None:
         flooding = subprocess.Popen(
             [sys.executable, "-c", command], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
-        beside = answers(server.endpoint)
+        during = answers(server.endpoint)
         ok, busy = map(int, flooding.communicate("")[0].split())
-    print(alone, beside, ok, busy)
+    print(alone, during, ok, busy)
     assert busy > ok > 0
-    assert beside.total() >= 0.75 * alone.total()
-    assert min(beside.values()) >= 0.9 * max(beside.values()) - 1
+    assert during.total() >= 0.75 * alone.total()
+    assert min(during.values()) >= 0.9 * max(during.values()) - 1

@@ -1,4 +1,4 @@
-"""A* and jump point search: the cost of Dijkstra to the bit, for less work."""
+"""A* and jump point search find exactly the costs of Dijkstra with less work."""
 
 import itertools
 import math
@@ -12,19 +12,30 @@ import pytest
 from numpy.typing import NDArray
 
 from offboard.common.errors import Unwanted
-from offboard.common.planning import maps, search
-from offboard.common.planning.flood import PAUSE_CELLS
+from offboard.common.planning import informed_workspaces, jump_points, maps, workspaces
+from offboard.common.planning.dijkstra import PAUSE_CELLS
+from offboard.common.planning.map_files import read_map
 from offboard.common.planning.planner import Point, Pose, Scan, plan_path
 from offboard.common.planning.planner_names import ASTAR, DIJKSTRA, JPS, PLANNERS
 from offboard.common.planning.search import NO_HITS, Cell, Field, Hits, Route
 from offboard.common.wanted import call_while
-from tests.mazes import FORMS, check, oracle, path_cost, random_cells, random_maze, serpentine, warm
+from tests.mazes import (
+    BENCHMARKS,
+    FORMS,
+    benchmark,
+    check,
+    oracle,
+    path_cost,
+    random_cells,
+    random_maze,
+    serpentine,
+    warm,
+)
 
 ROOT = Path(__file__).parents[2]
 WILLOW = ROOT / "maps/willow-full-0.05.yaml"
-MOVINGAI = ROOT.parent / "shared/maps/movingai"
 QUICK = (ASTAR, JPS)
-warm()  # compiles before the clock of any test runs
+warm()  # compile now, so that the timeout of no test includes it
 
 
 def noise(height: int, width: int, blocked: float) -> NDArray[np.bool_]:
@@ -37,10 +48,10 @@ def same(one: Route, other: Route) -> bool:
     return (one.status, one.cost, len(one.cells)) == (other.status, other.cost, len(other.cells))
 
 
-def test_two_thousand_small_mazes_equal_the_heap() -> None:
-    """Each planner has the cost of Dijkstra to the bit, and that and the path are textbook Dijkstra's.
+def test_two_thousand_small_mazes_match_a_plain_planner() -> None:
+    """Every planner finds exactly the cost of Dijkstra, and cost and path are those of a plain planner.
 
-    Among them are problems without a path, of one cell, at the border and in corridors one cell wide.
+    The mazes include problems without a path, with start = goal, at the border, and in narrow corridors.
     """
     rng = np.random.default_rng(12)
     unreachable = standing = border = thin = 0
@@ -62,8 +73,8 @@ def test_two_thousand_small_mazes_equal_the_heap() -> None:
     assert min(unreachable, standing, border, thin) > 50, (unreachable, standing, border, thin)
 
 
-def test_two_thousand_weighted_mazes_equal_the_heap() -> None:
-    """A* on costs has the cost of Dijkstra to the bit, and that and the path are textbook Dijkstra's."""
+def test_two_thousand_weighted_mazes_match_a_plain_planner() -> None:
+    """With costs, A* finds exactly the cost of Dijkstra, and cost and path are those of a plain planner."""
     rng = np.random.default_rng(13)
     for _ in range(2_000):
         free = random_maze(rng)
@@ -78,8 +89,8 @@ def test_two_thousand_weighted_mazes_equal_the_heap() -> None:
         assert (route.status, route.cost) == (level.status, level.cost)
 
 
-def test_large_rooms_equal_dijkstra() -> None:
-    """Over lines longer than a word of bits, and diagonals longer than one stride of them."""
+def test_large_rooms_match_dijkstra() -> None:
+    """Costs are equal, also on lines longer than a word of 64 bits and diagonals longer than a stride."""
     rng = np.random.default_rng(14)
     for blocked in (0.0, 0.0005, 0.003, 0.02, 0.1, 0.3):
         free = np.asarray(rng.random((180, 330)) > blocked)
@@ -94,23 +105,21 @@ def test_large_rooms_equal_dijkstra() -> None:
                 assert path_cost(free, route.cells) == pytest.approx(level.cost, rel=1e-9)
 
 
-@pytest.mark.skipif(not MOVINGAI.is_dir(), reason="the MovingAI files of ../shared/maps are not here")
-@pytest.mark.parametrize("name", ["arena", "32room_000", "random512-10-0", "Berlin_1_1024"])
-def test_published_optima(name: str) -> None:
-    """100 problems spread over each file have the published length within 1e-3."""
-    field = Field(maps.passable(maps.read_map(MOVINGAI / f"{name}.map")))
-    problems = (MOVINGAI / f"{name}.map.scen").read_text().splitlines()[1:]
-    for line in [problems[k] for k in np.linspace(0, len(problems) - 1, 100).astype(int)]:
-        *_, x, y, goal_x, goal_y, optimum = line.split()
+@pytest.mark.parametrize("name", BENCHMARKS)
+def test_published_optima(tmp_path: Path, name: str) -> None:
+    """100 problems of each benchmark map have the published length within 1e-3."""
+    grid, problems = benchmark(name, tmp_path)
+    field = Field(maps.passable(grid))
+    for start, goal, optimum in problems[::3]:
         for planner in QUICK:
-            route = field.route((int(y), int(x)), (int(goal_y), int(goal_x)), planner=planner)
-            assert route.cost == pytest.approx(float(optimum), abs=1e-3), (planner, line)
+            route = field.route(start, goal, planner=planner)
+            assert route.cost == pytest.approx(optimum, abs=1e-3), (planner, start, goal)
 
 
 @pytest.mark.parametrize("name", ["willow-full-0.05", "depot"])
 def test_on_real_maps_a_star_expands_no_more_than_dijkstra(name: str) -> None:
-    """Of 60 problems in none, and less than half of its cells in total; the costs are the same to the bit."""
-    grid = maps.read_map(ROOT / f"maps/{name}.yaml")
+    """In 60 problems A* never expands more cells, and less than half in total; the costs are equal."""
+    grid = read_map(ROOT / f"maps/{name}.yaml")
     field = Field(maps.passable(grid))
     total = dict.fromkeys(PLANNERS, 0)
     for start, goal in maps.free_pairs(grid, 60, seed=4).tolist():
@@ -126,11 +135,11 @@ def test_on_real_maps_a_star_expands_no_more_than_dijkstra(name: str) -> None:
 FREE: dict[str, Callable[[], NDArray[np.bool_]]] = {
     "room": lambda: np.ones((300, 400), np.bool_),
     "noise": lambda: noise(300, 400, 0.1),
-    "willow": lambda: maps.largest_component(maps.passable(maps.read_map(WILLOW))),
+    "willow": lambda: maps.largest_component(maps.passable(read_map(WILLOW))),
 }
 
 
-# Cells, or jump points, that were expanded when this was written, and a tenth more for a change of order.
+# Expanded cells or jump points when this was written, plus a tenth for a different order.
 @pytest.mark.parametrize(
     ("place", "planner", "expanded_max"),
     [
@@ -146,7 +155,7 @@ FREE: dict[str, Callable[[], NDArray[np.bool_]]] = {
     ],
 )
 def test_fixed_problems_do_not_take_more_work(place: str, planner: str, expanded_max: int) -> None:
-    """From corner to corner no more is expanded than it was, whatever the machine."""
+    """A search from corner to corner expands no more cells than it did before."""
     free = FREE[place]()
     cells = np.argwhere(free)
     start, goal = (tuple(cells[n].tolist()) for n in (cells.sum(1).argmin(), cells.sum(1).argmax()))
@@ -154,8 +163,8 @@ def test_fixed_problems_do_not_take_more_work(place: str, planner: str, expanded
 
 
 @pytest.mark.parametrize(("planner", "weighted"), FORMS)
-def test_a_second_search_allocates_nothing_of_the_maps_size(planner: str, weighted: bool) -> None:
-    """Its peak is that of the path and what tells it, far below one byte a cell."""
+def test_a_second_search_allocates_little_memory(planner: str, weighted: bool) -> None:
+    """It allocates memory for the path only, far below one byte per cell of the map."""
     field, costs = Field(noise(1000, 1000, 0.02)), np.zeros((1000, 1000), np.uint8) if weighted else None
     field.route((0, 0), (999, 999), costs=costs, planner=planner)
     tracemalloc.start()
@@ -167,7 +176,7 @@ def test_a_second_search_allocates_nothing_of_the_maps_size(planner: str, weight
 
 @pytest.mark.parametrize("planner", QUICK)
 def test_hits_block_their_discs_for_one_request_only(planner: str) -> None:
-    """A route goes round the disc of a hit, over the border too, and the next request does not know of it."""
+    """A route avoids the disc of a hit, also across the border, and the next request is not affected."""
     free = noise(41, 70, 0.05)
     free[20, 0] = free[20, 69] = True
     field = Field(free)
@@ -193,7 +202,7 @@ def test_hits_block_their_discs_for_one_request_only(planner: str) -> None:
 
 @pytest.mark.parametrize("planner", QUICK)
 def test_a_path_too_long_for_uint32_is_exact(planner: str) -> None:
-    """Beyond 53,166 cells the float64 search takes over, be they of a corridor or of the map's side."""
+    """For more than 53,166 cells the float64 search is used, in a long corridor and on a long map."""
     free = serpentine(331)
     moves = int(free.sum()) - 1
     assert moves > 53_166
@@ -201,7 +210,7 @@ def test_a_path_too_long_for_uint32_is_exact(planner: str) -> None:
         route = Field(free).route((first, 0), (330, 0), planner=planner)
         assert (route.status, route.cost, len(route.cells)) == ("NONE", length, length + 1)
     field, at_12 = Field(free), int(free[12:].sum()) - 1
-    for moves in range(53_160, 53_170):  # about the bound; row 10 is gone along backwards
+    for moves in range(53_160, 53_170):  # around the limit; row 10 is crossed backwards
         start = (12, at_12 - moves) if moves <= at_12 else (10, moves - at_12 - 2)
         route = field.route(start, (330, 0), planner=planner)
         assert (route.status, route.cost) == ("NONE", moves), start
@@ -210,20 +219,21 @@ def test_a_path_too_long_for_uint32_is_exact(planner: str) -> None:
 
 
 @pytest.mark.parametrize("planner", QUICK)
-def test_room_grows_when_much_is_found(monkeypatch: pytest.MonkeyPatch, planner: str) -> None:
-    """A search that starts with little room grows and ends at the same answer."""
+def test_arrays_grow_when_they_are_full(monkeypatch: pytest.MonkeyPatch, planner: str) -> None:
+    """A search that starts with tiny arrays finds the same route with the same work."""
     free = noise(200, 200, 0.1)
     first = Field(free).route((0, 0), (199, 199), planner=planner)
-    monkeypatch.setattr(search, "_first_capacity", lambda *_: 8)
-    monkeypatch.setattr(search.jump, "NODES_MAX", 4)
+    for module in (workspaces, informed_workspaces):
+        monkeypatch.setattr(module, "first_capacity", lambda *_: 8)
+    monkeypatch.setattr(jump_points, "NODES_MAX", 4)
     again = Field(free).route((0, 0), (199, 199), planner=planner)
     assert again.expanded == first.expanded
     assert again.cells.tolist() == first.cells.tolist()
 
 
-def test_threads_on_one_map_do_not_meet() -> None:
-    """Four threads at once with all planners, on costs and with hits, answer as each does alone."""
-    grid = maps.read_map(ROOT / "tests/samples/random512-10-0-crop.map")
+def test_threads_on_one_map_do_not_disturb_each_other() -> None:
+    """Four threads with all planners, costs and hits get the routes that one thread gets alone."""
+    grid = read_map(ROOT / "tests/samples/random512-10-0-crop.map")
     field = Field(maps.passable(grid))
     costs = np.random.default_rng(0).integers(0, 253, grid.cells.shape).astype(np.uint8)
     hits = Hits(np.arange(10, 120, 7), np.full(16, 64), np.full(16, 2.0))
@@ -248,8 +258,8 @@ def test_threads_on_one_map_do_not_meet() -> None:
 
 
 @pytest.mark.parametrize(("planner", "weighted"), FORMS[2:])
-def test_a_search_stops_where_nobody_waits_for_it(planner: str, weighted: bool) -> None:
-    """It asks at least every PAUSE_CELLS cells, or looks, and the next search finds what it should."""
+def test_a_search_stops_if_nobody_waits_for_it(planner: str, weighted: bool) -> None:
+    """It checks at least every PAUSE_CELLS cells or looks, and the next search is correct."""
     free = noise(1000, 1000, 0.3)
     free[989], free[990:] = False, True
     field, costs = Field(free), np.zeros(free.shape, np.uint8) if weighted else None
@@ -267,8 +277,8 @@ def test_a_search_stops_where_nobody_waits_for_it(planner: str, weighted: bool) 
     assert route(near).cost == pytest.approx(field.route((0, 0), near).cost, rel=1e-9)
 
 
-def test_what_no_planner_can_is_refused() -> None:
-    """Another name, and costs for jump point search: one line names the argument and what is allowed."""
+def test_unknown_planners_and_costs_with_jps_are_refused() -> None:
+    """The error is one line with the argument and what is allowed."""
     grid, costs = maps.GridMap(np.zeros((9, 9), np.int8), 1.0), np.zeros((9, 9), np.uint8)
     pose, goal = Pose(0.5, 0.5), Point(8.5, 8.5)
     with pytest.raises(ValueError, match=r"^planner is 'theta', allowed are dijkstra, astar, jps$"):
@@ -281,9 +291,9 @@ def test_what_no_planner_can_is_refused() -> None:
 
 
 @pytest.mark.parametrize("planner", QUICK)
-def test_a_plan_has_the_cost_of_dijkstras_with_a_scan_too(planner: str) -> None:
-    """The task takes the planner's name, and lays the scan over the map whatever it is."""
-    willow = maps.read_map(WILLOW)
+def test_all_planners_find_the_same_plan_with_a_scan(planner: str) -> None:
+    """The task adds the scan to the map whichever planner it uses."""
+    willow = read_map(WILLOW)
     pairs = willow.metres(maps.free_pairs(willow, 12, seed=3, radius_m=0.2).reshape(-1, 2)).reshape(-1, 2, 2)
     for n, ((x, y), (goal_x, goal_y)) in enumerate(pairs.tolist()):
         scan = Scan(np.full(90, 0.5 + 0.2 * n, np.float32), 0.0, math.pi / 45, 10.0)

@@ -1,4 +1,4 @@
-"""Key files: what is written, and what a wrong one says."""
+"""Key files: making and reading them, and the errors about wrong ones."""
 
 import stat
 from pathlib import Path
@@ -11,7 +11,7 @@ from offboard.common.errors import ConfigError
 from offboard.common.security import keys
 from offboard.common.security.keys import make_keys, read_public, robot_keys, server_keys
 
-GOOD = "Yne@$w-vo<fVvi]a<NY6T1ed:M$fCG*[IaLV{hID"  # of RFC 26, with the next line
+GOOD = "Yne@$w-vo<fVvi]a<NY6T1ed:M$fCG*[IaLV{hID"  # this and the next one are from RFC 26
 SECRET = "D:)Q[IlAW!ahhC2ac:9*A}h:p?([4%wOTJ%JR%cs"
 
 
@@ -22,8 +22,8 @@ def secret_file(folder: Path, name: str, public: str = GOOD, secret: str = SECRE
     return path
 
 
-def test_the_private_file_is_its_owners_alone(tmp_path: Path) -> None:
-    """0600 from its first moment, whatever the umask; the public one may be read."""
+def test_only_the_owner_may_read_the_private_file(tmp_path: Path) -> None:
+    """Its mode is 0600 whatever the umask is; everyone may read the public file."""
     public, private = make_keys(tmp_path / "deep" / "keys", "robot")
     assert stat.S_IMODE(private.stat().st_mode) == 0o600
     assert stat.S_IMODE(public.stat().st_mode) & 0o444
@@ -31,15 +31,15 @@ def test_the_private_file_is_its_owners_alone(tmp_path: Path) -> None:
 
 
 def test_pyzmq_reads_our_files(tmp_path: Path) -> None:
-    """zmq.auth finds both keys in ours, and the public one alone in the public file."""
+    """zmq.auth finds both keys in our private file, and only the public key in our public file."""
     public, private = make_keys(tmp_path, "server")
     both = zmq.auth.load_certificate(private)
     assert both == (server_keys(tmp_path).public, server_keys(tmp_path).secret)
     assert zmq.auth.load_certificate(public) == (both[0], None)
 
 
-def test_we_read_pyzmqs_files(tmp_path: Path) -> None:
-    """What zmq.auth made, metadata included; its private file must be given its mode first."""
+def test_we_read_the_files_of_pyzmq(tmp_path: Path) -> None:
+    """Files made by zmq.auth work, metadata included, once the private file has mode 0600."""
     zmq.auth.create_certificates(tmp_path, "server", metadata={"public-key": "of whom"})
     private = tmp_path / "server.key_secret"
     private.chmod(0o600)
@@ -48,28 +48,28 @@ def test_we_read_pyzmqs_files(tmp_path: Path) -> None:
     assert read_public(tmp_path / "server.key") == pair.public
 
 
-def test_no_key_is_ever_overwritten(tmp_path: Path) -> None:
-    """Neither a private nor a public one; and nothing is left of the attempt."""
+def test_existing_keys_are_never_overwritten(tmp_path: Path) -> None:
+    """If the private or the public file exists, no file is written."""
     _, private = make_keys(tmp_path, "robot")
     before = private.read_text()
-    with pytest.raises(ConfigError, match=r"^--out: .*robot\.key_secret exists already"):
+    with pytest.raises(ConfigError, match=r"^--out: .*robot\.key_secret already exists"):
         make_keys(tmp_path, "robot")
     assert private.read_text() == before
     private.unlink()
-    with pytest.raises(ConfigError, match=r"^--out: .*robot\.key exists already"):
+    with pytest.raises(ConfigError, match=r"^--out: .*robot\.key already exists"):
         make_keys(tmp_path, "robot")
     assert not private.exists()
 
 
 def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
-    """One line with its path."""
+    """The error is one line with the path of the folder."""
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"^--out: .*file/keys: Not a directory$"):
         make_keys(tmp_path / "file" / "keys", "robot")
 
 
 def test_a_secret_is_not_shown(tmp_path: Path) -> None:
-    """Neither the representation of a key pair nor an error about its file holds it."""
+    """Neither the repr of a key pair nor an error about its file contains the secret key."""
     path = secret_file(tmp_path, "server")
     assert SECRET not in repr(server_keys(tmp_path))
     secret_file(tmp_path, "server", secret=SECRET[:-1])
@@ -84,17 +84,17 @@ def test_a_secret_is_not_shown(tmp_path: Path) -> None:
     [
         ("", ": no public-key under `curve`"),
         (f'metadata\n    public-key = "{GOOD}"\n', ": no public-key under `curve`"),
-        ("curve\n    public-key = \n", ":2: public-key: not a key: 40 characters of Z85 in quotes"),
+        ("curve\n    public-key = \n", ":2: public-key: not a key; it must be 40 characters of Z85"),
         (f'curve\n    public-key = "{GOOD[1:]}"\n', ":2: public-key: not a key"),
         (f'curve\n    public-key = "{GOOD[1:]}~"\n', ":2: public-key: not a key"),
         (f'curve\n    public-key = "{"#" * 40}"\n', ":2: public-key: not a key"),
-        (f'# ours\n\ncurve\n    publc-key = "{GOOD}"\n', ":4: 'publc-key' is not one of public-key, "),
-        (f'curve\n    public-key = "{GOOD}"\n    public-key = "{GOOD}"\n', ":3: 'public-key' is not one of"),
-        (f'curve\n  public-key = "{GOOD}"\n  secret-key = "{SECRET}"\n', ": holds a secret-key; only the "),
+        (f'# ours\n\ncurve\n    publc-key = "{GOOD}"\n', ":4: 'publc-key': allowed are public-key, "),
+        (f'curve\n    public-key = "{GOOD}"\n    public-key = "{GOOD}"\n', ":3: 'public-key': allowed are"),
+        (f'curve\n  public-key = "{GOOD}"\n  secret-key = "{SECRET}"\n', ": holds a secret-key; copy "),
     ],
 )  # fmt: skip
 def test_a_wrong_public_file_is_named(tmp_path: Path, text: str, error: str) -> None:
-    """File, line, and what is wanted there."""
+    """The error names file and line, and says what must be there."""
     path = tmp_path / "arm.key"
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
@@ -102,27 +102,29 @@ def test_a_wrong_public_file_is_named(tmp_path: Path, text: str, error: str) -> 
     assert str(caught.value).startswith(f"{path}{error}")
 
 
-def test_a_public_file_that_is_none(tmp_path: Path) -> None:
-    """Missing, a folder, and bytes that are no text."""
+def test_an_unreadable_public_file_is_named(tmp_path: Path) -> None:
+    """A missing file, a folder and bytes that are not text are each a ConfigError."""
     (tmp_path / "bytes.key").write_bytes(b"\xff\xfe")
-    for name, error in (("none", "No such file"), (".", "Is a directory"), ("bytes.key", "not text")):
+    for name, error in (("none", "No such file"), (".", "Is a directory"), ("bytes.key", "not a text file")):
         with pytest.raises(ConfigError, match=error):
             read_public(tmp_path / name)
 
 
 def test_keys_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
-    """A public key beside another's secret one, and a private file without a secret."""
+    """So is a private file without a secret key."""
     other, _ = zmq.curve_keypair()
     secret_file(tmp_path, "server", public=other.decode())
-    with pytest.raises(ConfigError, match=r"the public-key does not belong to the secret-key$"):
+    with pytest.raises(
+        ConfigError, match=r"the public-key does not belong to the secret-key; make new keys$"
+    ):
         server_keys(tmp_path)
     (tmp_path / "server.key_secret").write_text(f'curve\n    public-key = "{GOOD}"\n')
-    with pytest.raises(ConfigError, match=r"no secret-key in it$"):
+    with pytest.raises(ConfigError, match=r"secret-key is missing; make new keys"):
         server_keys(tmp_path)
 
 
 def test_a_site_has_its_own_server_key_or_the_common_one(tmp_path: Path) -> None:
-    """NAME.key, else server.key; a site called robot has server.key, not the robot's own."""
+    """The key is in SITE.key or else in server.key; a site named `robot` does not get the robot's own key."""
     make_keys(tmp_path, "robot")
     for name in ("server", "edge"):
         make_keys(tmp_path / "made", name)
@@ -132,8 +134,8 @@ def test_a_site_has_its_own_server_key_or_the_common_one(tmp_path: Path) -> None
     assert pinned == [common, edge, common]
 
 
-def test_a_robot_that_pins_itself_is_told(tmp_path: Path) -> None:
-    """The robot's own public key in the place of the server's is a copy of the wrong file."""
+def test_the_robots_own_key_as_server_key_is_refused(tmp_path: Path) -> None:
+    """Then someone has copied the wrong file."""
     make_keys(tmp_path, "robot")
     (tmp_path / "server.key").write_bytes((tmp_path / "robot.key").read_bytes())
     with pytest.raises(ConfigError, match=r"server\.key: this is the robot's own key"):
@@ -141,14 +143,16 @@ def test_a_robot_that_pins_itself_is_told(tmp_path: Path) -> None:
 
 
 def test_a_missing_server_key_is_named(tmp_path: Path) -> None:
-    """A robot has to know its server."""
+    """A robot needs the public key of its server."""
     make_keys(tmp_path, "robot")
-    with pytest.raises(ConfigError, match=r"server\.key: No such file or directory; a public key is wanted"):
+    with pytest.raises(
+        ConfigError, match=r"server\.key: No such file or directory; it must be a public key file"
+    ):
         robot_keys(tmp_path, "cloud")
 
 
 def test_a_libzmq_without_curve_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where keys are made and where they are read."""
+    """The error is the same when keys are made and when they are read."""
     make_keys(tmp_path, "server")
     monkeypatch.setattr(keys.zmq, "has", lambda _: False)
     for call in (lambda: make_keys(tmp_path, "x"), lambda: server_keys(tmp_path)):

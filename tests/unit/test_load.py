@@ -1,8 +1,6 @@
-"""What others take of the CPU, from files laid out as a kernel shows them."""
+"""The load of other programs and the capacity of the CPU, from files as a kernel shows them."""
 
 import os
-import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -15,15 +13,14 @@ from offboard.common.host.load import (
     READINGS_MAX,
     TICK_S,
     Load,
-    LoadWatch,
 )
-from tests.unit.test_cpu import Machine
+from tests.cgroups import Machine
 
 CPUS = os.cpu_count() or 1
 
 
 class Times:
-    """What the process reads of clocks, as the test says."""
+    """The clocks that the process reads; the test sets them."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now_s, self.own_s = 100.0, 5.0
@@ -45,7 +42,7 @@ class Host:
         self.busy_s(0.0)
 
     def busy_s(self, seconds: float) -> None:
-        """All of it that was not idle, half of it the system's; guests are users already."""
+        """CPU seconds of all processes, half in the kernel. The time of guests is part of the user time."""
         half = round(seconds / 2 / TICK_S)
         (self.root / "stat").write_text(f"cpu  {half} 0 {half} 99999 500 0 0 0 777 0\ncpu0 1 2 3\n")
 
@@ -53,25 +50,13 @@ class Host:
         return Load(self.root / "self", self.root)
 
 
-class Counted(Load):
-    """Notes who reads it, and says how often that was."""
-
-    def __init__(self, proc: Path) -> None:
-        super().__init__(proc)
-        self.read_by: list[threading.Thread] = []
-
-    def share(self, every_s: float = EVERY_S) -> float:  # noqa: ARG002
-        self.read_by.append(threading.current_thread())
-        return float(len(self.read_by))
-
-
 def later(times: Times, seconds: float, own_s: float = 0.0) -> None:
     times.now_s += seconds
     times.own_s += own_s
 
 
-def test_the_share_of_others_is_that_of_what_is_left(tmp_path: Path, times: Times) -> None:
-    """Others who take half of what this process leaves are a load of a half, once that lasted."""
+def test_the_load_is_the_share_of_what_this_process_leaves(tmp_path: Path, times: Times) -> None:
+    """If others take half of the CPU that this process leaves, the load is 0.5."""
     host = Host(tmp_path)
     host.busy_s(50.0)
     one = host.load()
@@ -85,8 +70,8 @@ def test_the_share_of_others_is_that_of_what_is_left(tmp_path: Path, times: Time
     assert share == pytest.approx(0.5, abs=0.01 + TICK_S)
 
 
-def test_what_this_process_takes_is_no_load(tmp_path: Path, times: Times) -> None:
-    """However busy the robot itself is, the load is that of others."""
+def test_the_work_of_this_process_is_no_load(tmp_path: Path, times: Times) -> None:
+    """If this process alone is busy, the load is 0."""
     host = Host(tmp_path)
     host.busy_s(50.0)
     one = host.load()
@@ -99,8 +84,8 @@ def test_what_this_process_takes_is_no_load(tmp_path: Path, times: Times) -> Non
     assert one.share() == pytest.approx(0.0, abs=2 * TICK_S)
 
 
-def test_it_is_read_no_more_often_than_it_says(tmp_path: Path, times: Times) -> None:
-    """Between two readings the last share is the answer, at no cost."""
+def test_the_load_is_read_once_per_interval(tmp_path: Path, times: Times) -> None:
+    """Before the interval is over, `share` returns the last reading."""
     host = Host(tmp_path)
     one = host.load()
     one.share()
@@ -111,8 +96,8 @@ def test_it_is_read_no_more_often_than_it_says(tmp_path: Path, times: Times) -> 
     assert one.share() > 0.0
 
 
-def test_the_share_is_that_since_the_reading_before(tmp_path: Path, times: Times) -> None:
-    """What was long ago counts for nothing; it never leaves 0 to 1."""
+def test_the_load_covers_the_time_since_the_last_reading(tmp_path: Path, times: Times) -> None:
+    """Earlier times do not count, and the load stays between 0 and 1."""
     host = Host(tmp_path)
     one = host.load()
     one.share()
@@ -126,8 +111,8 @@ def test_the_share_is_that_since_the_reading_before(tmp_path: Path, times: Times
     assert one.share() == 0.0
 
 
-def test_where_nothing_is_left_the_last_share_stays(tmp_path: Path, times: Times) -> None:
-    """A process that has all the CPU learns nothing of what others would take."""
+def test_a_process_that_uses_the_whole_cpu_keeps_the_last_load(tmp_path: Path, times: Times) -> None:
+    """As long as it leaves nothing to others, their load cannot be measured."""
     host = Host(tmp_path)
     one = host.load()
     one.share()
@@ -141,8 +126,8 @@ def test_where_nothing_is_left_the_last_share_stays(tmp_path: Path, times: Times
 
 
 @pytest.mark.parametrize("text", ["", "cpu a b c d\n", "intr 5\n"])
-def test_what_cannot_be_read_is_no_load(tmp_path: Path, times: Times, text: str) -> None:
-    """A machine without /proc/stat, or with another one, has load 0 and goes on."""
+def test_an_unreadable_proc_stat_means_no_load(tmp_path: Path, times: Times, text: str) -> None:
+    """If /proc/stat is empty or has another form, the load is 0 and nothing is raised."""
     host = Host(tmp_path)
     (host.root / "stat").write_text(text)
     one = host.load()
@@ -156,8 +141,8 @@ def machine(tmp_path: Path) -> Machine:
     return Machine(tmp_path)
 
 
-def test_in_a_group_with_a_quota_the_cpu_is_the_quota(machine: Machine, times: Times) -> None:
-    """Others who take a quarter CPU of a quota of a half are a load of a half."""
+def test_under_a_quota_the_load_is_a_share_of_the_quota(machine: Machine, times: Times) -> None:
+    """If others use 0.25 CPUs of a quota of 0.5 CPUs, the load is 0.5."""
     point = machine.mount("", "cgroup2")
     machine.process("", "/robot")
     group = machine.write(point / "robot", cpu_max="50000 100000\n", cpu_stat="usage_usec 6000000\n")
@@ -172,8 +157,8 @@ def test_in_a_group_with_a_quota_the_cpu_is_the_quota(machine: Machine, times: T
     assert share == pytest.approx(0.5, abs=0.01)
 
 
-def test_the_capacity_is_what_quota_and_clock_leave(machine: Machine, times: Times, tmp_path: Path) -> None:
-    """Of one CPU at full clock, at the next reading; a quota that is given later is found."""
+def test_quota_and_clock_limit_lower_the_capacity(machine: Machine, times: Times, tmp_path: Path) -> None:
+    """Both multiply, also if they are set after the first reading."""
     point = machine.mount("", "cgroup2")
     machine.process("", "/robot")
     group = machine.write(point / "robot", cpu_max="max 100000\n", cpu_stat="usage_usec 6000000\n")
@@ -198,8 +183,8 @@ def test_the_capacity_is_what_quota_and_clock_leave(machine: Machine, times: Tim
     assert one.capacity == 0.75
 
 
-def test_what_the_workers_of_this_process_take_is_no_load(tmp_path: Path, times: Times) -> None:
-    """Whoever asks says what is his own."""
+def test_the_work_of_worker_processes_is_no_load(tmp_path: Path, times: Times) -> None:
+    """CPU time that `own_s` reports does not count as load."""
     host = Host(tmp_path)
     own_s = 5.0
     one = Load(host.root / "self", host.root, own_s=lambda: own_s)
@@ -211,8 +196,8 @@ def test_what_the_workers_of_this_process_take_is_no_load(tmp_path: Path, times:
         assert one.share() == pytest.approx(0.0, abs=2 * TICK_S / EVERY_S)
 
 
-def test_a_group_that_counts_nothing_is_the_sum_of_its_processes(machine: Machine, times: Times) -> None:
-    """Quota and count in other hierarchies: CPU times come from /proc/PID/stat, odd names too."""
+def test_a_group_without_a_usage_file_is_summed_over_its_processes(machine: Machine, times: Times) -> None:
+    """Then the CPU times come from /proc/PID/stat, also for processes with brackets in their names."""
     limited = machine.mount("cpu", "cgroup", "rw,cpu")
     machine.mount("cpuacct", "cgroup", "rw,cpuacct")
     machine.process("cpuacct", "/")
@@ -239,74 +224,24 @@ def test_a_group_that_counts_nothing_is_the_sum_of_its_processes(machine: Machin
     assert share == pytest.approx(0.5, abs=0.05)
 
 
-def test_a_watch_reads_in_a_thread_of_its_own() -> None:
-    """But for the first look, as nothing is read before; once it is closed nothing is read either."""
-    counted = Counted(Path("/proc/self"))
-    watch = LoadWatch(counted)
-    assert counted.read_by == []
-    until = time.monotonic() + 10
-    assert watch.latest()[0] == 1
-    while watch.latest()[0] < 3:
-        assert time.monotonic() < until
-        time.sleep(0.01)
-    first, second, *_ = counted.read_by
-    assert first is threading.current_thread()
-    assert counted.read_by.count(first) == 1
-    watch.close()
-    second.join(10)
-    assert not second.is_alive()
-
-
-def test_a_watch_asks_how_long_to_wait() -> None:
-    """Before each reading but the first, with its interval."""
-    counted, asked, done = Counted(Path("/proc/self")), [], threading.Event()
-
-    def pause_s(usual_s: float) -> float:
-        asked.append(usual_s)
-        if len(asked) == 3:
-            done.set()
-            return 60.0
-        return 0.001
-
-    watch = LoadWatch(counted, 7.0, pause_s)
-    watch.latest()
-    assert done.wait(10)
-    time.sleep(0.05)
-    assert (asked, watch.latest()[0]) == ([7.0, 7.0, 7.0], 3)
-    watch.close()
-
-
-def test_who_hurries_reads_at_once_and_not_too_often(tmp_path: Path, times: Times) -> None:
-    """A load that has just begun is seen before the next reading is due; a shorter time tells nothing."""
+def test_a_hurried_reading_comes_early_but_not_too_early(tmp_path: Path, times: Times) -> None:
+    """It sees a load that has just begun, but not within HURRIED_S of the last reading."""
     host = Host(tmp_path)
     host.busy_s(50.0)
     one = host.load()
     one.share()
     later(times, 2 * HURRIED_S)
     host.busy_s(50.0 + 2 * HURRIED_S * CPUS)
-    assert one.share() == 0.0, "the next reading is not due"
+    assert one.share() == 0.0, "a usual reading is not due yet"
     assert one.share(HURRIED_S) == pytest.approx(1.0, abs=TICK_S / HURRIED_S)
     later(times, HURRIED_S / 2)
-    assert one.share(HURRIED_S) == pytest.approx(1.0, abs=TICK_S / HURRIED_S), "it has just been read"
+    assert one.share(HURRIED_S) == pytest.approx(1.0, abs=TICK_S / HURRIED_S), (
+        "the last reading is too recent"
+    )
 
 
-def test_a_watch_that_is_hurried_reads_in_the_callers_thread() -> None:
-    """Once it was looked at: before, nobody wants to know."""
-    counted = Counted(Path("/proc/self"))
-    watch = LoadWatch(counted)
-    watch.hurry()
-    assert counted.read_by == []
-    until = time.monotonic() + 10
-    while not watch.latest()[0]:
-        assert time.monotonic() < until
-        time.sleep(0.01)
-    watch.hurry()
-    assert threading.current_thread() in counted.read_by
-    watch.close()
-
-
-def test_a_hurried_reading_looks_back_until_it_can_tell(machine: Machine, times: Times) -> None:
-    """Under a small quota two of them may be a tick of CPU time apart: what others took is not 0 then."""
+def test_a_hurried_reading_looks_back_far_enough(machine: Machine, times: Times) -> None:
+    """Under a small quota, two hurried readings are less than one kernel tick apart; older ones help."""
     quota, soon_s = 0.1, 1.01 * HURRIED_S
     point = machine.mount("", "cgroup2")
     machine.process("", "/robot")
@@ -322,16 +257,16 @@ def test_a_hurried_reading_looks_back_until_it_can_tell(machine: Machine, times:
         later(times, EVERY_S)
         used(1.0 + n * quota * EVERY_S)
         assert one.share() == pytest.approx(1.0, abs=0.01)
-    later(times, soon_s)  # the kernel has not counted yet what ran since
+    later(times, soon_s)  # the kernel has not counted this time yet
     assert one.share(HURRIED_S) == pytest.approx(EVERY_S / (EVERY_S + soon_s), abs=0.01)
     for _ in range(READINGS_MAX):
         later(times, soon_s)
         share = one.share(HURRIED_S)
-    assert share == 0.0, "for so long nobody ran"
+    assert share == 0.0, "nobody used the CPU since the oldest reading"
 
 
-def test_a_new_quota_is_not_held_against_what_was_before(machine: Machine, times: Times) -> None:
-    """Others who took half of what there was are a load of a half, also once there is less."""
+def test_a_new_quota_does_not_change_the_load_before_it(machine: Machine, times: Times) -> None:
+    """If others always use half of what is there, the load stays 0.5 while the quota changes."""
     point = machine.mount("", "cgroup2")
     machine.process("", "/robot")
     group = machine.write(point / "robot", cpu_max="100000 100000\n", cpu_stat="usage_usec 1000000\n")

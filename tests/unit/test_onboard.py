@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from offboard.common.errors import OffloadError, Overtaken, Unwanted
-from offboard.common.host.load import LoadWatch
+from offboard.common.host.load_watch import LoadWatch
 from offboard.common.tasks import Task, kind_of, task
 from offboard.common.wanted import check_wanted
 from offboard.robot_client.sites import onboard

@@ -1,10 +1,11 @@
-"""The task `plan_path`: what blocks a cell, what each status means, and what is kept between requests."""
+"""The task `plan_path`: which cells are blocked, the statuses, and the maps kept between requests."""
 
 import gc
 import math
 import subprocess
 import sys
 import threading
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,13 @@ import pytest
 from numpy.typing import NDArray
 
 from offboard.common.planning import maps, planner, search
+from offboard.common.planning.map_files import read_map
 from offboard.common.planning.maps import GridMap
 from offboard.common.planning.planner import Plan, Point, Pose, Scan, plan_path
 from offboard.common.tasks import kind_of
 
 ROOT = Path(__file__).parents[2]
-planner.warm()  # compiles before the clock of any test runs
+planner.warm()  # compile now, so that the timeout of no test includes it
 
 
 def room(height: int = 40, width: int = 60, resolution: float = 0.1) -> GridMap:
@@ -42,15 +44,15 @@ def one_beam(range_m: float, angle: float = 0.0) -> Scan:
         (Pose(1.0, 1.0), Point(5.8, 3.0), "GOAL_OCCUPIED"),
     ],
 )
-def test_statuses_have_nav2s_names(pose: Pose, goal: Point, status: str) -> None:
-    """Each reason for no path is an answer of its own, with an empty path."""
+def test_statuses_have_the_names_of_nav2(pose: Pose, goal: Point, status: str) -> None:
+    """Each reason for having no path has its own status, and an empty path."""
     plan = plan_path(room(), None, pose, goal, 0.2)
     assert plan.status == status
     assert (len(plan.cells) > 0) == (len(plan.metres) > 0) == (plan.cost > 0) == (status == "NONE")
 
 
 def test_walled_off_goals_have_no_valid_path() -> None:
-    """A wall across the room is NO_VALID_PATH, and the search says how far it came."""
+    """Behind a wall across the room the status is NO_VALID_PATH, and `expanded` counts the reached cells."""
     cells = room().cells.copy()
     cells[:, 30] = 100
     plan = plan_path(GridMap(cells, 0.1), None, Pose(1.0, 1.0), Point(5.0, 3.0), 0.0)
@@ -59,7 +61,7 @@ def test_walled_off_goals_have_no_valid_path() -> None:
 
 @pytest.mark.parametrize("yaw", [0.0, 0.6])
 def test_a_plan_is_in_cells_and_in_the_map_frame(yaw: float) -> None:
-    """Metres are the centres of the cells, whatever the origin; the cost is the length of the path."""
+    """`metres` are the centres of the cells for any origin, and the cost is the length of the path."""
     grid = GridMap(room().cells, 0.1, (10.0, -5.0, yaw))
     (start_x, start_y), (goal_x, goal_y) = grid.metres(np.array([[10, 10], [30, 50]], np.int32))
     plan = plan_path(grid, None, Pose(start_x, start_y), Point(goal_x, goal_y), 0.2)
@@ -73,7 +75,7 @@ def test_a_plan_is_in_cells_and_in_the_map_frame(yaw: float) -> None:
 
 
 def test_unknown_is_blocked_and_half_occupied_is_not() -> None:
-    """Passable is 0 to 99: -1 and 100 are not."""
+    """Values 0 to 99 are passable; -1 and 100 are not."""
     for value, status in ((-1, "GOAL_OCCUPIED"), (99, "NONE"), (100, "GOAL_OCCUPIED"), (50, "NONE")):
         cells = room().cells.copy()
         cells[20, 20] = value
@@ -83,7 +85,7 @@ def test_unknown_is_blocked_and_half_occupied_is_not() -> None:
 @pytest.mark.parametrize("yaw", [0.0, 1.1])
 @pytest.mark.parametrize("heading", [0.0, -2.0])
 def test_a_scan_blocks_the_disc_around_its_hit(yaw: float, heading: float) -> None:
-    """The cell behind the end of the beam is blocked with the robot's radius around it, not farther."""
+    """The cell at the end of the beam is blocked, and so are those within the robot's radius of it."""
     grid = GridMap(np.zeros((60, 60), np.int8), 0.1, (1.0, 2.0, yaw))
     hit_cell, radius_cells = np.array([30, 42]), 3.0
     (x, y), (hit_x, hit_y) = grid.metres(np.array([[30, 20], hit_cell], np.int32))
@@ -96,16 +98,16 @@ def test_a_scan_blocks_the_disc_around_its_hit(yaw: float, heading: float) -> No
         assert plan.status == ("GOAL_OCCUPIED" if inside else "NONE"), cell
 
 
-def test_beams_that_met_nothing_block_nothing() -> None:
-    """Infinity, not-a-number, the maximum range and beyond are no hits."""
+def test_beams_without_a_hit_block_nothing() -> None:
+    """Infinite, NaN and negative ranges, and those from the maximum range on, are no hits."""
     ranges = np.array([np.inf, np.nan, 5.0, 7.0, -1.0], np.float32)
     pose = Pose(2.0, 2.0)
     scan = Scan(ranges, 0.0, 1.0, 5.0)
     assert planner.scan_hits(room(), scan, pose, 0.2).rows.size == 0
 
 
-def test_a_robot_is_never_walled_in_by_its_own_start() -> None:
-    """An obstacle nearer than the radius leaves the robot's cell, and the way back, open."""
+def test_a_near_obstacle_does_not_block_the_robots_own_cell() -> None:
+    """If an obstacle is nearer than the radius, the robot can still drive away from it."""
     grid = room()
     for angle in np.linspace(0, 2 * math.pi, 24, endpoint=False):
         for distance in (0.01, 0.06, 0.11, 0.2, 0.3):
@@ -116,7 +118,7 @@ def test_a_robot_is_never_walled_in_by_its_own_start() -> None:
 
 
 def test_costs_weigh_the_path_as_navfn_does() -> None:
-    """A dear strip is gone round when that is cheaper, and its cost in metres is the weighted length."""
+    """The path avoids an expensive strip if that is cheaper; the cost is the weighted length in metres."""
     grid = GridMap(np.zeros((21, 21), np.int8), 0.5)
     costs = np.zeros((21, 21), np.uint8)
     costs[8:13, 10] = 252
@@ -131,8 +133,8 @@ def test_costs_weigh_the_path_as_navfn_does() -> None:
     assert plan_path(grid, None, Pose(2.75, 5.25), Point(7.75, 5.25), 0.0, costs).status == "GOAL_OCCUPIED"
 
 
-def test_costs_of_any_layout_are_taken() -> None:
-    """Read-only and column-major costs give the plan of plain ones."""
+def test_costs_may_have_any_memory_layout() -> None:
+    """Read-only and column-major costs give the same plan."""
     costs = np.random.default_rng(2).integers(0, 253, (40, 60)).astype(np.uint8)
     frozen = costs.copy()
     frozen.flags.writeable = False
@@ -164,7 +166,7 @@ GOOD = (room(), one_beam(1.0), Pose(1.0, 1.0), Point(5.0, 3.0), 0.2, None)
     ],
 )
 def test_wrong_arguments_are_named(place: int, value: object, said: str) -> None:
-    """What cannot be planned with is a ValueError that names the argument, before anything is computed."""
+    """A wrong argument is a ValueError that names it, before anything is computed."""
     args = [*GOOD]
     args[place] = value  # type: ignore[call-overload]
     with pytest.raises(ValueError, match=said):
@@ -172,7 +174,7 @@ def test_wrong_arguments_are_named(place: int, value: object, said: str) -> None
 
 
 def test_the_task_is_registered_with_the_papers_size() -> None:
-    """Its size is d of the straight line, over the cells of the map."""
+    """Its input size is the d of the straight line, divided by the cells of the map."""
     kind = kind_of(plan_path)
     assert kind.types == (GridMap, Scan, Pose, Point, Plan)
     args = kind.bind((room(), None, Pose(1.0, 1.0), Point(5.0, 4.0)), {})
@@ -180,8 +182,8 @@ def test_the_task_is_registered_with_the_papers_size() -> None:
     assert kind.warm is planner.warm
 
 
-def test_a_map_is_prepared_once_a_radius(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same cells are inflated once for each radius, in a grid object of any age; others anew."""
+def test_a_map_is_prepared_once_for_each_radius(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Grids with the same cells share the prepared map; a grid with other cells gets its own."""
     made: list[float] = []
 
     def counted(grid: GridMap, radius_m: float) -> NDArray[np.bool_]:
@@ -198,23 +200,32 @@ def test_a_map_is_prepared_once_a_radius(monkeypatch: pytest.MonkeyPatch) -> Non
     assert made == [0.2, 0.3, 0.2]
 
 
-def test_prepared_maps_are_bounded_and_die_with_their_cells() -> None:
-    """No more maps are kept than allowed, and none whose cells are gone."""
+def test_prepared_maps_are_bounded_and_die_with_their_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At most PREPARED_MAX maps are kept, and none whose cells are gone."""
+    alive: weakref.WeakSet[search.Field] = weakref.WeakSet()
+
+    class Watched(search.Field):
+        def __init__(self, passable: NDArray[np.bool_]) -> None:
+            super().__init__(passable)
+            alive.add(self)
+
+    monkeypatch.setattr(search, "Field", Watched)
     grids = [room() for _ in range(planner.PREPARED_MAX + 3)]
     for grid in grids:
         plan_path(grid, None, Pose(1.0, 1.0), Point(5.0, 3.0), 0.2)
-    assert len(planner._fields) == planner.PREPARED_MAX
+    gc.collect()
+    assert len(alive) == planner.PREPARED_MAX
     del grids, grid
     gc.collect()
     last = room()
     plan_path(last, None, Pose(1.0, 1.0), Point(5.0, 3.0), 0.2)
-    assert [cells() is last.cells for cells, _ in planner._fields.values() if cells() is last.cells] == [True]
-    assert all(cells() is not None for cells, _ in planner._fields.values())
+    gc.collect()
+    assert len(alive) == 1
 
 
-def test_two_threads_plan_on_one_map_as_alone() -> None:
-    """Requests with different scans at once answer as each does alone, the first of a map included."""
-    willow = maps.read_map(ROOT / "maps/willow-full-0.05.yaml")
+def test_two_threads_plan_on_one_map() -> None:
+    """Both get the plans that one thread gets alone, also for the first request on a map."""
+    willow = read_map(ROOT / "maps/willow-full-0.05.yaml")
     pairs = willow.metres(maps.free_pairs(willow, 12, seed=3, radius_m=0.2).reshape(-1, 2)).reshape(-1, 2, 2)
 
     def answers(grid: GridMap) -> list[tuple[str, float, list[list[int]]]]:
@@ -237,7 +248,7 @@ def test_two_threads_plan_on_one_map_as_alone() -> None:
 
 
 def test_without_numba_planning_names_the_extra() -> None:
-    """The module imports, and the first plan says what to install."""
+    """The module can be imported, and the first plan raises an error that names the extra."""
     code = (
         "import sys; sys.modules['numba'] = None\n"
         "import numpy as np\n"
@@ -250,8 +261,8 @@ def test_without_numba_planning_names_the_extra() -> None:
     assert ran.stdout.strip() == "planning needs the extra 'planning': pip install 'offboard[planning]'"
 
 
-def test_hits_reach_the_search_in_cells() -> None:
-    """The reach of a hit is the radius in cells, and one cell short of the robot."""
+def test_scan_hits_are_in_cells() -> None:
+    """The reach of a hit is the radius in cells, but ends one cell before the robot."""
     hits = planner.scan_hits(
         room(), Scan(np.array([0.3, 3.0], np.float32), 0.0, 0.0, 5.0), Pose(1.05, 1.05), 0.5
     )

@@ -1,4 +1,4 @@
-"""The compiled search against a plain heap planner, and against the published optima of MovingAI."""
+"""Dijkstra's search, compared with a planner in plain Python and with the published optima of MovingAI."""
 
 import itertools
 import math
@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 
 from offboard.common.errors import Unwanted
-from offboard.common.planning import maps, planner, search
-from offboard.common.planning.flood import DISTANCE_MAX, PAUSE_CELLS, STRAIGHT
+from offboard.common.planning import maps, planner, search, workspaces
+from offboard.common.planning.dijkstra import DISTANCE_MAX, PAUSE_CELLS, STRAIGHT
+from offboard.common.planning.map_files import read_map
 from offboard.common.planning.search import Field, Hits
 from offboard.common.wanted import call_while
-from tests.mazes import check, oracle, random_cells, random_maze, serpentine
+from tests.mazes import BENCHMARKS, benchmark, check, oracle, random_cells, random_maze, serpentine
 
 ROOT = Path(__file__).parents[2]
 SAMPLES = ROOT / "tests/samples"
-MOVINGAI = ROOT.parent / "shared/maps/movingai"
-planner.warm()  # compiles before the clock of any test runs
+planner.warm()  # compile now, so that the timeout of no test includes it
 
 
-def test_two_thousand_small_mazes_equal_the_heap() -> None:
-    """Cost, path and reachability equal textbook Dijkstra's, plain and weighted alike."""
+def test_two_thousand_small_mazes_match_a_plain_planner() -> None:
+    """Cost, path and reachability are those of textbook Dijkstra, with and without costs."""
     rng = np.random.default_rng(11)
     unreachable = same = 0
     for n in range(2_000):
@@ -44,7 +44,7 @@ def test_two_thousand_small_mazes_equal_the_heap() -> None:
 
 
 def test_a_corner_is_never_cut() -> None:
-    """Two free cells that touch at a corner are joined only round a free cell beside both."""
+    """Two free cells that touch only at a corner are connected only through a free cell beside both."""
     crossed = np.array([[1, 0], [0, 1]], np.bool_)
     half = np.array([[1, 1], [0, 1]], np.bool_)
     assert Field(crossed).route((0, 0), (1, 1)).status == "NO_VALID_PATH"
@@ -53,7 +53,7 @@ def test_a_corner_is_never_cut() -> None:
 
 
 def test_the_search_stops_at_the_goal() -> None:
-    """A near goal settles few cells of a large map, and start = goal none."""
+    """If the goal is near, few cells of a large map are settled; if the goal is the start, none."""
     field = Field(np.ones((400, 400), np.bool_))
     assert field.route((200, 200), (200, 210)).expanded < 4 * 11**2
     here = field.route((7, 7), (7, 7))
@@ -61,7 +61,7 @@ def test_the_search_stops_at_the_goal() -> None:
 
 
 def test_a_path_too_long_for_uint32_is_exact() -> None:
-    """Beyond 53,166 cells the float64 search takes over, and the corridor's length is exact."""
+    """For more than 53,166 cells the float64 search is used, and the length of the corridor is exact."""
     free = serpentine(331)
     end = (330, 330 if (330 // 2) % 2 == 0 else 0)
     moves = int(free.sum()) - 1
@@ -70,8 +70,8 @@ def test_a_path_too_long_for_uint32_is_exact() -> None:
     assert (route.status, route.cost, len(route.cells)) == ("NONE", moves, moves + 1)
 
 
-def test_the_longest_path_that_uint32_holds_is_exact() -> None:
-    """Just below the bound no distance overflows."""
+def test_the_longest_path_for_uint32_is_exact() -> None:
+    """Just below the limit no distance overflows."""
     free = serpentine(331)
     end = (330, 330 if (330 // 2) % 2 == 0 else 0)
     moves = int(free[12:].sum()) - 1
@@ -80,9 +80,9 @@ def test_the_longest_path_that_uint32_holds_is_exact() -> None:
 
 
 @pytest.mark.parametrize("name", ["random512-10-0-crop", "32room_000-crop"])
-def test_the_float64_search_equals_the_uint32_search(name: str) -> None:
-    """Both kernels give the same cost and reach on real maps."""
-    grid = maps.read_map(SAMPLES / f"{name}.map")
+def test_both_kernels_find_the_same_costs(name: str) -> None:
+    """On real maps the float64 search finds the costs of the uint32 search, with about the same work."""
+    grid = read_map(SAMPLES / f"{name}.map")
     field, level = Field(maps.passable(grid)), np.zeros(grid.cells.shape, np.uint8)
     for start, goal in maps.free_pairs(grid, 100, seed=2).tolist():
         plain, weighted = field.route(start, goal), field.route(start, goal, costs=level)
@@ -91,9 +91,9 @@ def test_the_float64_search_equals_the_uint32_search(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["random512-10-0-crop", "32room_000-crop"])
-def test_crops_of_the_benchmarks_equal_the_heap(name: str) -> None:
-    """On the samples in the repository every optimum is that of an independent planner."""
-    grid = maps.read_map(SAMPLES / f"{name}.map")
+def test_crops_of_the_benchmarks_match_a_plain_planner(name: str) -> None:
+    """On the sample maps of the repository every cost is that of an independent planner."""
+    grid = read_map(SAMPLES / f"{name}.map")
     free = grid.cells == 0
     field = Field(free)
     rng = np.random.default_rng(8)
@@ -105,25 +105,19 @@ def test_crops_of_the_benchmarks_equal_the_heap(name: str) -> None:
         check(free, start, goal, field.route(start, goal, costs=weights), expected, weights)
 
 
-@pytest.mark.skipif(not MOVINGAI.is_dir(), reason="the MovingAI files of ../shared/maps are not here")
 @pytest.mark.parametrize("part", [0, 1, 2])
-@pytest.mark.parametrize("name", ["arena", "32room_000", "random512-10-0", "Berlin_1_1024"])
-def test_published_optima(name: str, part: int) -> None:
-    """All problems of arena and 300 spread over each other file have the published length within 1e-3."""
-    grid = maps.read_map(MOVINGAI / f"{name}.map")
+@pytest.mark.parametrize("name", BENCHMARKS)
+def test_published_optima(tmp_path: Path, name: str, part: int) -> None:
+    """300 problems of each benchmark map have the published length within 1e-3."""
+    grid, problems = benchmark(name, tmp_path)
     field = Field(maps.passable(grid))
-    problems = (MOVINGAI / f"{name}.map.scen").read_text().splitlines()[1:]
-    if name != "arena":
-        problems = [problems[k] for k in np.linspace(0, len(problems) - 1, 300).astype(int)]
-    assert len(problems) == (160 if name == "arena" else 300)
-    for line in problems[part::3]:
-        *_, x, y, goal_x, goal_y, optimum = line.split()
-        route = field.route((int(y), int(x)), (int(goal_y), int(goal_x)))
-        assert route.cost == pytest.approx(float(optimum), abs=1e-3), line
+    assert len(problems) == 300
+    for start, goal, optimum in problems[part::3]:
+        assert field.route(start, goal).cost == pytest.approx(optimum, abs=1e-3), (start, goal)
 
 
 def test_hits_block_their_discs_for_one_request_only() -> None:
-    """A route goes round the disc of a hit, and the next request does not know of it."""
+    """A route avoids the disc of a hit, and the next request is not affected."""
     free = np.ones((41, 41), np.bool_)
     field = Field(free)
     rng = np.random.default_rng(5)
@@ -143,7 +137,7 @@ def test_hits_block_their_discs_for_one_request_only() -> None:
 
 
 def test_hits_at_the_border_stay_on_the_map() -> None:
-    """Discs that reach over the border, or hits outside the map, touch nothing else."""
+    """Discs across the border and hits outside the map block no other cells."""
     field = Field(np.ones((9, 9), np.bool_))
     outside = Hits(np.array([-3, 12, 4, 0]), np.array([4, 4, -50, 8]), np.array([1.0, 1.0, 2.0, 3.0]))
     assert field.route((8, 0), (4, 4), outside).status == "NONE"
@@ -152,21 +146,21 @@ def test_hits_at_the_border_stay_on_the_map() -> None:
     assert field.route((0, 8), (8, 0)).cost == pytest.approx(8 * math.sqrt(2))
 
 
-def test_buckets_grow_when_a_frontier_is_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A search that starts with room for a few cells grows and ends at the same answer."""
+def test_buckets_grow_when_they_are_full(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search that starts with tiny buckets finds the same route with the same work."""
     free = np.random.default_rng(1).random((200, 200)) > 0.1
     free[0, 0] = free[199, 199] = True
     costs = np.full(free.shape, 30, np.uint8)
     wide = [Field(free).route((0, 0), (199, 199), costs=weights) for weights in (None, costs)]
-    monkeypatch.setattr(search, "_first_capacity", lambda *_: 8)
+    monkeypatch.setattr(workspaces, "first_capacity", lambda *_: 8)
     small = [Field(free).route((0, 0), (199, 199), costs=weights) for weights in (None, costs)]
     for one, other in zip(wide, small, strict=True):
         assert (one.cost, one.expanded) == (other.cost, other.expanded)
         assert one.cells.tolist() == other.cells.tolist()
 
 
-def test_requests_allocate_nothing_of_the_maps_size() -> None:
-    """After the first request of each form, the peak of another is far below one byte a cell."""
+def test_later_requests_allocate_little_memory() -> None:
+    """After the first request of each kind, another one allocates far less than one byte per cell."""
     field = Field(np.ones((1000, 1000), np.bool_))
     costs = np.zeros((1000, 1000), np.uint8)
     for weights in (None, costs):
@@ -181,21 +175,21 @@ def test_requests_allocate_nothing_of_the_maps_size() -> None:
 
 
 def test_idle_workspaces_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """However many searches ran at once, only so many workspaces are kept; a failed one is not."""
+    """At most IDLE_MAX workspaces are kept, and none whose search failed."""
     monkeypatch.setattr(search, "IDLE_MAX", 2)
-    pool = search._Pool(object)
+    pool = search.Pool(object)
     borrowed = [pool.borrow() for _ in range(5)]
     assert len({id(one.__enter__()) for one in borrowed}) == 5
     for one in borrowed:
         one.__exit__(None, None, None)
-    assert len(pool._idle) == 2
+    assert len(pool) == 2
     with pytest.raises(KeyError), pool.borrow():
         raise KeyError
-    assert len(pool._idle) == 1
+    assert len(pool) == 1
 
 
-def test_a_search_stops_where_nobody_waits_for_it() -> None:
-    """Within PAUSE_CELLS cells, and the next search on the same map finds what it should."""
+def test_a_search_stops_if_nobody_waits_for_it() -> None:
+    """It stops within PAUSE_CELLS cells, and the next search on the same map is correct."""
     field = Field(np.ones((1000, 1000), np.bool_))
     looks = itertools.count()
 

@@ -26,8 +26,8 @@ def test_keys_are_made_once(tmp_path: Path) -> None:
         again = run(*flags)
         assert again.returncode == 2
         assert again.stderr == (
-            f"{package.replace('_', '-')} keys: --out: {tmp_path / f'{name}{PRIVATE}'} exists already, "
-            "and is not overwritten\n"
+            f"{package.replace('_', '-')} keys: --out: {tmp_path / f'{name}{PRIVATE}'} already exists and "
+            "is not overwritten; choose another folder\n"
         )
         assert (tmp_path / f"{name}{PRIVATE}").read_bytes() == private
         shown = run(*flags, "--help")
@@ -62,7 +62,7 @@ def test_a_private_key_that_others_may_use_is_refused(keys: Keys, tmp_path: Path
         assert done.returncode == 2
         prog = package.replace("_", "-") + (" call" if package == "robot_client" else "")
         assert done.stderr == (
-            f"{prog}: {flag}: {path} has mode {mode:04o}, so group or others may use it: chmod 600 {path}\n"
+            f"{prog}: {flag}: {path} has mode {mode:04o}, so other users may access it: chmod 600 {path}\n"
         )
 
 
@@ -104,7 +104,7 @@ def test_a_wrong_folder_of_robots_is_refused(keys: Keys) -> None:
     assert done.returncode == 2
     assert done.stderr == (
         f"cloud-server: --robots: {keys.robots}: No such file or directory; "
-        "the public key of each robot is wanted there\n"
+        "it must hold the public key of each robot\n"
     )
 
 

@@ -1,0 +1,76 @@
+"""One run of a task: the call, the running itself, and its outcome.
+
+Threads and worker processes run tasks with this module; `executors` and `worker_pool` decide where.
+"""
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from offboard.common import tasks
+from offboard.common.errors import ProtocolError, Unwanted, describe
+from offboard.common.host import cpu_time
+from offboard.common.wanted import always, call_while
+from offboard.common.wire.blobs import Buffer, StoredBlob
+from offboard.common.wire.values import decode, encode
+
+Blobs = Mapping[bytes, StoredBlob]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Call:
+    """A task to run.
+
+    `frames` are the encoded arguments; `blobs` holds the large ones by digest. `wanted` tells whether
+    anybody still waits for the answer. After `budget_s` nobody does.
+    """
+
+    kind: str
+    frames: Sequence[Buffer]
+    blobs: Blobs = field(default_factory=dict)
+    wanted: Callable[[], bool] = always
+    budget_s: float = math.inf
+
+
+@dataclass(slots=True)
+class Outcome:
+    """How a task went: `status` is ok, failed, or busy if it could not start.
+
+    `run_s` is the time in the worker. `cpu_s` is the CPU time used during the run, by all processes under the
+    same quota, or else by the process that ran the task. `server_fault`: the task failed, but the task is not
+    the cause. `crashed`: its worker process died.
+    """
+
+    status: str
+    error: str = ""
+    run_s: float = 0.0
+    cpu_s: float | None = None
+    frames: list[Buffer] = field(default_factory=list)
+    server_fault: bool = False
+    crashed: bool = False
+
+
+def run_task(call: Call) -> Outcome:
+    """Decode the arguments, call the task, encode its result. Every exception becomes the outcome."""
+    cpu_before_s, started = cpu_time.used_s(), time.perf_counter()
+    status, failure, unwanted = "ok", "", False
+    result: list[Buffer] = []
+    try:
+        kind = tasks.kind_named(call.kind)
+        args = decode(call.frames, kind.types, call.blobs)
+        if not isinstance(args, list):
+            raise ProtocolError("the body is not a list of arguments")
+        result = encode(call_while(call.wanted, kind.function, args), kind.types).frames
+    except BaseException as error:  # noqa: BLE001 - a task may raise anything
+        status, failure, unwanted = "failed", describe(error), isinstance(error, Unwanted)
+    run_s, cpu_s = time.perf_counter() - started, cpu_time.used_s() - cpu_before_s
+    return Outcome(status, failure, run_s, cpu_s, frames=result, server_fault=unwanted)
+
+
+def warm_kinds() -> None:
+    """Run `warm` of each kind. Once per process, before its first task."""
+    cpu_time.used_s()  # the first call looks for the cgroup
+    for kind in tasks.kinds():
+        if kind.warm is not None:
+            kind.warm()

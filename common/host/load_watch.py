@@ -1,0 +1,60 @@
+"""Reads the load of this computer in a background thread.
+
+`load` says how load and capacity are measured.
+"""
+
+import threading
+from collections.abc import Callable
+
+from offboard.common.host.load import EVERY_S, HURRIED_S, Load
+
+
+class LoadWatch:
+    """Reads a `Load` when `latest` is first called, and from then on in a thread of its own.
+
+    A process that asks for its CPU time may have to wait for its quota at that moment. The thread that
+    decides where a task runs must therefore not be the one that asks.
+
+    Parameters: `every_s` is the usual time between two readings; `pause_s` turns it into the time to wait
+    before the next one.
+    """
+
+    def __init__(
+        self, load: Load, every_s: float = EVERY_S, pause_s: Callable[[float], float] = float
+    ) -> None:
+        self._load = load
+        self._every_s = every_s
+        self._pause_s = pause_s
+        self._latest = (0.0, 1.0)
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="load", daemon=True)
+        self._starting = threading.Lock()
+        self._reading = threading.Lock()
+
+    def latest(self) -> tuple[float, float]:
+        """The load and the capacity of the last reading."""
+        if self._thread.ident is None:
+            with self._starting:
+                if self._thread.ident is None and not self._closed.is_set():
+                    self._read()
+                    self._thread.start()
+        return self._latest
+
+    def hurry(self) -> None:
+        """Read now, in the caller's thread. Does nothing before the first `latest` or during a reading."""
+        if self._thread.ident is not None and self._reading.acquire(blocking=False):
+            try:
+                self._read()
+            finally:
+                self._reading.release()
+
+    def close(self) -> None:
+        self._closed.set()
+
+    def _run(self) -> None:
+        while not self._closed.wait(self._pause_s(self._every_s)):
+            with self._reading:
+                self._read()
+
+    def _read(self) -> None:
+        self._latest = (self._load.share(HURRIED_S), self._load.capacity)

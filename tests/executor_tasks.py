@@ -1,0 +1,91 @@
+"""Tasks for the tests of executors, and how to run them."""
+
+from pathlib import Path
+from typing import Any
+
+from offboard.cloud_server.executors import Executor
+from offboard.cloud_server.task_run import Call, Outcome
+from offboard.common.wire.messages import StoredBlob, decode, encode
+
+WAIT_S = 8
+ROOT = Path(__file__).parents[1]
+MODULE = '''
+import asyncio, os, pathlib, threading, time
+from offboard.common.tasks import task
+from offboard.common.wanted import check_wanted
+
+warmed = []
+
+@task("exec_sum", size=lambda array: array.size, warm=lambda: warmed.append(1))
+def exec_sum(array):
+    return float(array.sum())
+
+@task("exec_where", size=lambda array: 0)
+def exec_where(array):
+    """Process, times warmed, identity of the array."""
+    return [os.getpid(), len(warmed), id(array)]
+
+@task("exec_raise", size=lambda text: 0)
+def exec_raise(text):
+    raise ValueError(text)
+
+@task("exec_exit", size=lambda: 0)
+def exec_exit():
+    raise SystemExit(3)
+
+@task("exec_cancel", size=lambda: 0)
+def exec_cancel():
+    raise asyncio.CancelledError("late")
+
+class Mute(Exception):
+    def __str__(self):
+        raise RuntimeError
+
+@task("exec_mute", size=lambda: 0)
+def exec_mute():
+    raise Mute
+
+@task("exec_object", size=lambda: 0)
+def exec_object():
+    return object()
+
+@task("exec_echo", size=lambda value: 0)
+def exec_echo(value):
+    return value
+
+@task("exec_wait_for_file", size=lambda path: 0)
+def exec_wait_for_file(path):
+    with open(path) as pipe:  # a named pipe: opening waits for the writer
+        return pipe.read()
+
+@task("exec_burn", size=lambda seconds: seconds)
+def exec_burn(seconds):
+    """Compute until this thread has used this many CPU seconds; returns the exact number."""
+    start = time.thread_time()
+    while (used := time.thread_time() - start) < seconds:
+        pass
+    return used
+
+@task("exec_look", size=lambda path: 0)
+def exec_look(path):
+    pathlib.Path(path).write_text("begun")  # a named pipe: waits for the reader
+    while True:
+        check_wanted()
+        time.sleep(0.001)
+'''
+
+
+def call(kind: str, *args: Any, **options: Any) -> Call:
+    """A call with encoded arguments."""
+    body = encode(args, blobs=True)
+    blobs = {digest: StoredBlob(data) for digest, data in body.blobs.items()}
+    return Call(kind, body.frames, blobs, **options)
+
+
+def run(executor: Executor, kind: str, *args: Any) -> Outcome:
+    return executor.submit(call(kind, *args), lambda _: None).result(WAIT_S)
+
+
+def value(outcome: Outcome) -> Any:
+    assert outcome.status == "ok", outcome.error
+    return decode(outcome.frames, [], {})

@@ -1,0 +1,57 @@
+"""Large arguments that the server keeps."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from offboard.cloud_server.executors import EXECUTORS
+from offboard.common.wire.messages import Blob
+from tests.integration.server.peers import Join, Serve
+
+pytestmark = pytest.mark.integration
+
+
+@pytest.mark.parametrize("executor", sorted(EXECUTORS))
+def test_a_blob_is_asked_for_once(serve: Serve, join: Join, executor: str) -> None:
+    """The server asks for a missing blob, then answers, and keeps the blob for the next robot."""
+    running = serve(executor)
+    peer, other = join(running.server.endpoint), join(running.server.endpoint)
+    array = np.arange(50_000.0)
+    blobs = peer.request(1, "served_sum", array)
+    reply = peer.reply()
+    assert (reply.status, reply.missing) == ("need_blob", tuple(blobs))
+    peer.send(Blob(next(iter(blobs.values()))))
+    assert peer.value(2, "served_sum", array) == array.sum()
+    assert other.value(1, "served_sum", array) == array.sum()
+    assert running.counted("blob_bytes") == array.nbytes
+
+
+def test_stored_blobs_are_bounded(serve: Serve, join: Join) -> None:
+    """Beyond the limit the least recently used blob is deleted, and the server asks for it again."""
+    running = serve(blob_bytes_max=1_000_000)
+    peer = join(running.server.endpoint)
+    arrays = [np.full(50_000, n, float) for n in range(4)]
+    for n, array in enumerate(arrays):
+        for data in peer.request(n, "served_sum", array).values():
+            assert peer.reply().status == "need_blob"
+            peer.send(Blob(data))
+        assert peer.value(10 + n, "served_sum", array) == array.sum()
+    assert running.counted("blob_bytes") == 2 * arrays[0].nbytes
+    assert peer.value(20, "served_sum", arrays[3]) == arrays[3].sum()
+    peer.request(21, "served_sum", arrays[0])
+    assert peer.reply().status == "need_blob"
+
+
+def test_a_waiting_request_keeps_its_blobs(serve: Serve, join: Join, pipe: Path) -> None:
+    """A blob that leaves the store while a request waits for its turn is still there when it runs."""
+    peer = join(serve(blob_bytes_max=500_000).server.endpoint)
+    arrays = [np.full(50_000, n, float) for n in range(2)]
+    peer.send(Blob(arrays[0].tobytes()))
+    peer.request(1, "served_pipe", str(pipe))
+    peer.request(2, "served_sum", arrays[0])
+    peer.send(Blob(arrays[1].tobytes()))
+    peer.request(3, "served_sum", arrays[0])
+    assert (peer.reply().status, pipe.write_text("go")) == ("need_blob", 2)
+    replies = {reply.id: reply for reply in (peer.reply(), peer.reply())}
+    assert replies[1].status == replies[2].status == "ok"

@@ -1,0 +1,70 @@
+"""Reading the load in a background thread."""
+
+import threading
+from pathlib import Path
+from queue import SimpleQueue
+
+from offboard.common.host.load import EVERY_S, Load
+from offboard.common.host.load_watch import LoadWatch
+
+WAIT_S = 8.0
+
+
+class Counted(Load):
+    """Its load is the number of readings so far; `read_by` gets the thread of each reading."""
+
+    def __init__(self) -> None:
+        super().__init__(Path("/proc/self"))
+        self.read_by: SimpleQueue[threading.Thread] = SimpleQueue()
+        self._count = 0
+
+    def share(self, every_s: float = EVERY_S) -> float:  # noqa: ARG002
+        self._count += 1
+        self.read_by.put(threading.current_thread())
+        return float(self._count)
+
+
+def test_only_the_first_reading_is_in_the_callers_thread() -> None:
+    """Nothing is read before `latest` is called; from then on a thread reads, until `close`."""
+    counted = Counted()
+    watch = LoadWatch(counted, 0.001)
+    assert counted.read_by.empty()
+    assert watch.latest()[0] >= 1
+    assert counted.read_by.get(timeout=WAIT_S) is threading.current_thread()
+    reader = counted.read_by.get(timeout=WAIT_S)
+    assert reader is not threading.current_thread()
+    assert counted.read_by.get(timeout=WAIT_S) is reader
+    watch.close()
+    reader.join(WAIT_S)
+    assert not reader.is_alive()
+
+
+def test_the_pause_before_each_reading_can_be_changed() -> None:
+    """`pause_s` gets the usual interval before every reading but the first."""
+    counted, asked, done = Counted(), list[float](), threading.Event()
+
+    def pause_s(usual_s: float) -> float:
+        asked.append(usual_s)
+        if len(asked) < 3:
+            return 0.001
+        done.set()
+        return 60.0
+
+    watch = LoadWatch(counted, 7.0, pause_s)
+    watch.latest()
+    assert done.wait(WAIT_S)
+    assert (asked, watch.latest()[0]) == ([7.0, 7.0, 7.0], 3)
+    watch.close()
+
+
+def test_a_hurried_watch_reads_in_the_callers_thread() -> None:
+    """`hurry` reads at once, but not before the first `latest`."""
+    counted = Counted()
+    watch = LoadWatch(counted, 60.0)
+    watch.hurry()
+    assert counted.read_by.empty()
+    watch.latest()
+    watch.hurry()
+    readers = [counted.read_by.get(timeout=WAIT_S) for _ in range(2)]
+    assert readers == [threading.current_thread()] * 2
+    watch.close()
