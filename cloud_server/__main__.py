@@ -10,7 +10,7 @@ import signal
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from offboard.cloud_server.config import ROBOTS, ServerConfig
 from offboard.common.command_line import load, run_command
@@ -58,24 +58,17 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
     sys.path.insert(0, str(Path.cwd()))  # as `python -m` does, so that --tasks finds modules of the user
     # These load heavy libraries, which --help and a wrong flag do not need.
     from offboard.cloud_server.executors import EXECUTORS
-    from offboard.cloud_server.http_api import HttpServer, create_app
     from offboard.cloud_server.metrics import Metrics
     from offboard.cloud_server.server import Limits, Server
     from offboard.common.security.exposure import warn_each_minute
     from offboard.common.security.keys import server_keys
     from offboard.common.security.private_files import read_token
-    from offboard.common.tasks import kinds, load_modules
 
     sys.setswitchinterval(SWITCH_S)
     files_max = raise_file_limit()
     token = read_token(config.token_file)
     keys = server_keys(config.keys) if config.keys else None
-
-    load_modules(config.tasks)
-    if not kinds():
-        raise ConfigError(f"--tasks: {','.join(config.tasks)} registers no task")
-    modules = (*config.tasks, EMPTY_TASK_MODULE)  # for `robot-client check`
-    load_modules(modules)
+    modules = load_tasks(config.tasks)
     log.info("settings: %s", as_dict(config))
     log.info("up to %d files may be open; each connected robot needs one", files_max)
     metrics = Metrics()
@@ -95,15 +88,7 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
         keys=keys,
         robots=config.robots_folder,
     )
-    app = create_app(
-        server.status,
-        metrics.registry,
-        as_dict(config),
-        token=token,
-        loopback=config.http_on_loopback,
-        insecure=bool(config.open_ways),
-    )
-    web = HttpServer(app, config.http_address)
+    web = make_http(config, server, metrics.registry, token=token)
     web.start()
     if config.open_ways:
         warn_each_minute(config.open_ways)
@@ -114,13 +99,42 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
     finally:
         web.close()
     if not answered:
-        log.error(
-            "some tasks were still running after the drain time of %g s; they are abandoned", config.drain_s
-        )
-        logging.shutdown()
-        os._exit(1)  # a normal exit would wait for the abandoned threads, which cannot be stopped
+        abandon(config.drain_s)
     log.info("stopped; every accepted request was answered")
     return 0
+
+
+def make_http(config: ServerConfig, server: Any, registry: Any, *, token: str | None) -> Any:
+    """The HTTP side of the server: health, metrics, settings and tasks."""
+    from offboard.cloud_server.http_api import HttpServer, create_app
+
+    app = create_app(
+        server.status,
+        registry,
+        as_dict(config),
+        token=token,
+        loopback=config.http_on_loopback,
+        insecure=bool(config.open_ways),
+    )
+    return HttpServer(app, config.http_address)
+
+
+def abandon(drain_s: float) -> NoReturn:
+    """End the process at once: a normal exit would wait for tasks that cannot be stopped."""
+    log.error("some tasks were still running after the drain time of %g s; they are abandoned", drain_s)
+    logging.shutdown()
+    os._exit(1)
+
+
+def load_tasks(modules: Sequence[str]) -> tuple[str, ...]:
+    """Import the modules of the user's tasks, and of the empty task that `robot-client check` runs."""
+    from offboard.common.tasks import kinds, load_modules
+
+    load_modules(modules)
+    if not kinds():
+        raise ConfigError(f"--tasks: {','.join(modules)} registers no task")
+    load_modules([EMPTY_TASK_MODULE])
+    return (*modules, EMPTY_TASK_MODULE)
 
 
 def raise_file_limit() -> int:

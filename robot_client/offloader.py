@@ -18,12 +18,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
-from offboard.common.errors import BadValue, ConfigError, Overtaken
+from offboard.common.errors import ConfigError, Overtaken
 from offboard.common.tasks import Kind, Task, kind_of
-from offboard.common.wire.values import encode
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.execution.batch import Batch, Placed, arguments
-from offboard.robot_client.execution.pin import check_where, pinned
+from offboard.robot_client.execution.choice import check_where, decided, pinned
+from offboard.robot_client.execution.crossing_check import CrossingCheck
 from offboard.robot_client.execution.race import Plan, Race, answer_of
 from offboard.robot_client.learning.conditions import Conditions
 from offboard.robot_client.learning.flights import Flights
@@ -31,7 +31,6 @@ from offboard.robot_client.learning.forecaster import Forecaster
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.learner import Learner, PendingTask
 from offboard.robot_client.learning.memories import Memories
-from offboard.robot_client.learning.store import Store
 from offboard.robot_client.policies import BOTH, PINNED, Decision, Forecast, Policy
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.predictors.window import WINDOW
@@ -39,9 +38,8 @@ from offboard.robot_client.records.trace import Late, Record
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites import heartbeat
 from offboard.robot_client.sites.clock import Clock, SystemClock
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, TIMEOUT_S, Execution, Runner
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, TIMEOUT_S, Execution, Runner, checked_timeout
 
-TIMEOUT_MAX_S = 24 * 3600.0
 POLL_S = 0.01
 LATE_MAX = 64  # executions that ended after their task was answered, kept for the next record
 
@@ -78,7 +76,7 @@ class Offloader:
         self._policy = policy
         self._memories = memories
         self._allowance = allowance or Allowance()
-        self._timeout_s = _checked_timeout(timeout_s)
+        self._timeout_s = checked_timeout(timeout_s)
         self._observers = tuple(observers)
         self._clock = clock or SystemClock()
         self._flights = Flights(self._runners)
@@ -86,7 +84,7 @@ class Offloader:
         self._forecaster = Forecaster(conditions, self._flights, self._allowance)
         self._learner = Learner(conditions, self._allowance)
         self._late: deque[Late] = deque(maxlen=LATE_MAX)
-        self._crossed: set[str] = set()  # kinds whose values are known to cross the wire
+        self._crossing = CrossingCheck()
         self._lock = threading.Lock()
         self._numbers = itertools.count()
         self._session = secrets.token_hex(4)
@@ -116,33 +114,22 @@ class Offloader:
         server.key (None: no encryption).
         `observers`: called with the record of every task. `settings`: options that few robots need.
         """
-        from offboard.robot_client.runners import make_runners  # zmq is loaded only for a connection
+        from offboard.robot_client.sites.make_runners import (
+            make_runners,  # zmq is loaded only for a connection
+        )
 
         rare = settings or Settings()
-        allowance = rare.allowance()
-        if allowance.capped and "budget" not in policy.split(":"):
-            policy = f"budget:{policy}"
-        chosen = policies.make(policy, rare.seed)
-        name = policies.predictor_of(policy) if rare.predictor is None else rare.predictor
-        plain = name.removeprefix(predictors.WORK)
-        make = partial(predictors.make, plain, window, rare.seed)
-        make()  # a wrong name or window is an error now, not at the first task
-        memories = Memories(
-            make,
-            shared_work=name != plain,
-            objective=rare.objective,
-            energy=rare.energy,
-            store=None if rare.memory is None else Store(rare.memory),
-        )
+        chosen, memories = rare.make_policy(policy), rare.make_memories(policy, window)
         servers = ({CLOUD: endpoint} if endpoint else {}) | dict(sites or {})
-        heartbeat_s = heartbeat.EVERY_S if predictors.conditional(plain) else 0.0
+        beats = predictors.conditional(rare.predictor_for(policy))
+        heartbeat_s = heartbeat.EVERY_S if beats else 0.0
         runners = make_runners(servers, keys=keys, heartbeat_s=heartbeat_s, seed=rare.seed)
         try:
             return cls(
                 runners,
                 policy=chosen,
                 memories=memories,
-                allowance=allowance,
+                allowance=rare.allowance(),
                 timeout_s=timeout_s,
                 observers=observers,
             )
@@ -164,7 +151,7 @@ class Offloader:
         `where` pins the call to a site, or to `both` to measure all of them. `timeout_s` bounds the wait for
         a remote site, after which the task runs onboard.
         """
-        budget_s = self._timeout_s if timeout_s is None else _checked_timeout(timeout_s)
+        budget_s = self._timeout_s if timeout_s is None else checked_timeout(timeout_s)
         kind = kind_of(function)
         args = kind.bind(args, kwargs)
         answer, _ = self._answer(where, budget_s, Task(kind, args, kind.size_of(args)))
@@ -186,7 +173,7 @@ class Offloader:
         in the order of the items. If tasks fail, the error of the first one is raised when all have ended.
         `where` and `timeout_s` are those of a single call. Observers are called in threads of the batch.
         """
-        budget_s = self._timeout_s if timeout_s is None else _checked_timeout(timeout_s)
+        budget_s = self._timeout_s if timeout_s is None else checked_timeout(timeout_s)
         kind = kind_of(function)
         tasks = [Task(kind, args, kind.size_of(args)) for args in arguments(kind, items)]
         sites = tuple(self._runners)
@@ -238,16 +225,13 @@ class Offloader:
         self, where: str | None, budget_s: float, task: Task, placed: Placed | None = None
     ) -> tuple[Execution, Record]:
         """One task from its arguments to its record; `placed` replaces the policy."""
-        kind = task.kind
-        first = kind.name not in self._crossed and len(self._runners) > 1
-        if first:
-            _check_crosses(kind, "arguments", list(task.args))
+        if len(self._runners) > 1:
+            self._crossing.check_arguments(task)
         answer, record = self._offload(task, where, budget_s, placed)
         self.last = record
         self._tell(record)
-        if first and answer.failure is None:
-            _check_crosses(kind, "result", answer.value)
-            self._crossed.add(kind.name)
+        if len(self._runners) > 1 and answer.failure is None:
+            self._crossing.check_result(task.kind, answer.value)
         return answer, record
 
     def _offload(
@@ -327,28 +311,14 @@ class Offloader:
             check_where(where, task.kind, self._runners)
             decision = pinned(where, forecast)
         else:
-            decision = self._decide(memory, forecast, absent, placed or self._policy)
+            decision = decided(
+                placed or self._policy, forecast, task.kind, absent=absent, known=memory.observations
+            )
             if placed is None:
                 self._note_move(memory, decision)
         return PendingTask(
             task=task, id=id, memory=memory, forecast=forecast, amount=amount, decision=decision
         )
-
-    def _decide(
-        self, memory: KindMemory, forecast: Forecast, absent: Mapping[str, str], policy: Policy
-    ) -> Decision:
-        if len(forecast.sites) == 1:
-            why = "; ".join(f"{site}: {why}" for site, why in absent.items()) or "no other site"
-            return Decision(ONBOARD, why, "none")
-        decision = policy.decide(forecast)
-        if memory.kind.duplicate:
-            return decision
-        if decision.both:
-            # Warm-up without a second run: the site that is known least learns next.
-            heard = [site for site in forecast.sites if site not in decision.spared]
-            site = min(heard, key=lambda site: (len(memory.site(site).predictor), site != ONBOARD))
-            return Decision(site, f"{decision.reason}; never on two sites", decision.policy)
-        return decision if decision.second is None else decision._replace(second=None)
 
     def _note_move(self, memory: KindMemory, decision: Decision) -> None:
         if decision.site == memory.last_site:
@@ -405,10 +375,7 @@ class Offloader:
     def _take_duplicate(self) -> bool:
         """Whether a second run may start; it is then counted. A fallback needs no permission."""
         with self._lock:
-            allowed = self._allowance.duplicates >= 1
-            if allowed:
-                self._allowance.duplicate()
-            return allowed
+            return self._allowance.take_duplicate()
 
     def _learn(self, pending: PendingTask, executions: Sequence[Execution]) -> None:
         """Learn the runs that have ended by now."""
@@ -421,15 +388,7 @@ class Offloader:
     def _ended_late(self, pending: PendingTask, site: str, execution: Execution) -> None:
         """A run has ended after its task was answered; called in any thread."""
         with self._lock:
-            self._late.append(
-                Late(
-                    id=pending.id,
-                    site=site,
-                    seconds=execution.seconds,
-                    ok=execution.ok,
-                    censored=execution.censored,
-                )
-            )
+            self._late.append(Late.of(pending.id, site, execution))
             self._flights.end(site, pending.task.id)
             if execution.started and not self._closed:
                 self._learner.learn_late(pending, execution)
@@ -438,17 +397,3 @@ class Offloader:
         with self._lock:
             if not self._closed:
                 self._learner.use_idle_time()
-
-
-def _check_crosses(kind: Kind, what: str, value: Any) -> None:
-    """BadValue at the first call, wherever it runs, and not at the first call that goes to a server."""
-    try:
-        encode(value, kind.types)
-    except BadValue as error:
-        raise BadValue(f"{what} of task {kind.name}: {error}") from error
-
-
-def _checked_timeout(timeout_s: float) -> float:
-    if not 0 < timeout_s <= TIMEOUT_MAX_S:
-        raise ConfigError(f"timeout_s {timeout_s}: must be above 0 and at most {TIMEOUT_MAX_S:g}")
-    return timeout_s

@@ -4,8 +4,13 @@ The common options are keywords of `Offloader.connect` itself.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+from offboard.robot_client import policies, predictors
+from offboard.robot_client.learning.memories import Memories
+from offboard.robot_client.learning.store import Store
+from offboard.robot_client.policies import Policy
 from offboard.robot_client.policies.allowance import DUPLICATES, Allowance
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.objectives import Mean, Objective
@@ -38,3 +43,29 @@ class Settings:
     def allowance(self) -> Allowance:
         """A fresh allowance: what tasks may spend from now on."""
         return Allowance(self.duplicates, self.bytes_a_minute, self.joules_a_minute)
+
+    def make_policy(self, name: str) -> Policy:
+        """The policy with this name; caps add the wrapper `budget` to it."""
+        capped = self.allowance().capped and "budget" not in name.split(":")
+        return policies.make(f"budget:{name}" if capped else name, self.seed)
+
+    def predictor_for(self, policy: str) -> str:
+        """The name of the predictor: the one in these settings, else the one that the policy is meant for."""
+        return policies.predictor_of(policy) if self.predictor is None else self.predictor
+
+    def make_memories(self, policy: str, window: int) -> Memories:
+        """What is known of each kind: nothing yet, or what the file `memory` holds.
+
+        A wrong predictor or window is an error now, and not at the first task.
+        """
+        name = self.predictor_for(policy)
+        plain = name.removeprefix(predictors.WORK)
+        make = partial(predictors.make, plain, window, self.seed)
+        make()
+        return Memories(
+            make,
+            shared_work=name != plain,
+            objective=self.objective,
+            energy=self.energy,
+            store=None if self.memory is None else Store(self.memory),
+        )

@@ -108,14 +108,14 @@ def plan_path(
     All planners find the same cost: `dijkstra`, `astar`, or `jps`, which takes no `costs`.
     """
     check_planner(planner, weighted=costs is not None)
-    _check(grid, scan, pose, goal, radius_m, costs)
+    _check(grid, scan, pose, goal, radius_m=radius_m, costs=costs)
     start, end = grid.cell(pose.x, pose.y), grid.cell(goal.x, goal.y)
     if start is None:
         return _plan(grid, search.no_route("START_OUTSIDE_MAP"))
     if end is None:
         return _plan(grid, search.no_route("GOAL_OUTSIDE_MAP"))
     hits = search.NO_HITS if scan is None else scan_hits(grid, scan, pose, radius_m)
-    return _plan(grid, _prepared(grid, radius_m).route(start, end, hits, costs, planner))
+    return _plan(grid, _prepared(grid, radius_m).route(start, end, hits=hits, costs=costs, planner=planner))
 
 
 def scan_hits(grid: GridMap, scan: Scan, pose: Pose, radius_m: float) -> search.Hits:
@@ -172,6 +172,7 @@ def _check(
     scan: Scan | None,
     pose: Pose,
     goal: Point,
+    *,
     radius_m: float,
     costs: NDArray[np.uint8] | None,
 ) -> None:

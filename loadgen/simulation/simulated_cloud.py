@@ -121,7 +121,9 @@ class SimulatedCloud:
         budget_s = pending.deadline_s - self._clock.now_s()
         cpu_s = self._costs.cpu_s(CLOUD, pending.call)
         reply = partial(self._reply, pending)
-        request = partial(self._server.request, self._key(pending), cpu_s, budget_s, reply)
+        request = partial(
+            self._server.request, self._key(pending), cpu_s=cpu_s, budget_s=budget_s, answer=reply
+        )
         self.connection.send(Message(size, f"{TASK}{pending.attempt}", pending.number), request)
 
     def _reply(self, pending: _Pending, reply: Reply) -> None:

@@ -44,15 +44,16 @@ class Conditions:
         if not (unexpected or freed):
             return outlook
         self._runners[ONBOARD].hurry()
-        load, capacity = before.load, before.capacity
-        if unexpected:
-            load = self._load(execution.site)
-        if onboard:
-            now = self._runners[ONBOARD].condition().capacity
-            capacity = min(capacity, now) if later else max(capacity, now)
+        load = self._load(execution.site) if unexpected else before.load
+        capacity = self._capacity(before.capacity, later=later) if onboard else before.capacity
         if (load, capacity) == (before.load, before.capacity):
             return outlook
         return outlook._replace(condition=before._replace(load=load, capacity=capacity))
+
+    def _capacity(self, before: float, *, later: bool) -> float:
+        """The capacity of the robot now, as far as it explains a run that was late or early."""
+        now = self._runners[ONBOARD].condition().capacity
+        return min(before, now) if later else max(before, now)
 
     def _load(self, site: str) -> float:
         """The load of the robot; for a server only while it is so high that it changes the server's times."""

@@ -53,6 +53,10 @@ class KindMemory:
             self.sites[name] = SiteMemory(name, self._make, self._objective, self._energy)
         return self.sites[name]
 
+    def observations(self, site: str) -> int:
+        """How many observations the predictor of a site rests on."""
+        return len(self.site(site).predictor)
+
     def amount(self, size: float) -> float | None:
         """What the predictors are asked for: the expected work of this size, or the size itself."""
         return size if self._work is None else self._work.predict(size)

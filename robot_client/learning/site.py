@@ -174,8 +174,7 @@ class SiteMemory:
         if seconds is None:
             self._use(execution.bytes_out + execution.bytes_in, execution.cpu_s)
             return
-        behind = self.conditional and self._site == ONBOARD and outlook is not None and outlook.in_flight > 0
-        waited_s = (execution.queue_s or 0.0) if behind else 0.0
+        waited_s = self._waited_s(execution, outlook)
         to_interval = not beside and self._tells_of_the_interval(execution, seconds, outlook)
         self._take(
             Observation(
@@ -192,6 +191,11 @@ class SiteMemory:
                 ahead=ahead,
             )
         )
+
+    def _waited_s(self, execution: Execution, outlook: Outlook | None) -> float:
+        """How long an onboard run waited for other tasks of the robot, which its outlook included."""
+        behind = self.conditional and self._site == ONBOARD and outlook is not None and outlook.in_flight > 0
+        return (execution.queue_s or 0.0) if behind else 0.0
 
     def recall(self, observations: Iterable[Observation], *, age: int) -> None:
         """Learn observations of an earlier process again, oldest first; the site is then `age` tasks old."""

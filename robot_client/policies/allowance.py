@@ -74,6 +74,13 @@ class Allowance:
         self._second.take(1.0)
         self._second.level = max(-DUPLICATES_MAX, self._second.level)
 
+    def take_duplicate(self) -> bool:
+        """Whether a second run may start; it is then counted."""
+        allowed = self.duplicates >= 1
+        if allowed:
+            self.duplicate()
+        return allowed
+
     def spend(self, bytes_moved: float, joules: float) -> None:
         """An execution took these bytes and joules."""
         if self._bytes is not None:

@@ -117,7 +117,7 @@ def huber_line(x: Column, y: Column) -> tuple[float, float, float]:
     side of the line. Its minimum has a closed form. Newton's method steps towards that minimum, and halves a
     step that does not lower the objective.
     """
-    fit = _step(x, y, _Fit(0.0, 0.0, 0.0), np.zeros(len(x)), 0.0)
+    fit = _step(x, y, _Fit(0.0, 0.0, 0.0), np.zeros(len(x)), sigma_min=0.0)
     last = None
     for _ in range(STEPS_MAX):
         if fit.sigma == 0:
@@ -125,7 +125,7 @@ def huber_line(x: Column, y: Column) -> tuple[float, float, float]:
         residuals = y - fit.intercept - fit.slope * x
         sides = np.sign(residuals) * (np.abs(residuals) > EPSILON * fit.sigma)
         same = last is not None and np.array_equal(sides, last)
-        aim = _step(x, y, fit, sides, 0.0 if same else SHRINK_MAX * fit.sigma)
+        aim = _step(x, y, fit, sides, sigma_min=0.0 if same else SHRINK_MAX * fit.sigma)
         new = _shorten(x, y, fit, aim)
         moved = max(abs(now - was) for now, was in zip(new, fit, strict=True))
         settled = moved <= TOLERANCE * fit.sigma
@@ -135,7 +135,7 @@ def huber_line(x: Column, y: Column) -> tuple[float, float, float]:
     return fit
 
 
-def _step(x: Column, y: Column, fit: _Fit, sides: Column, sigma_min: float) -> _Fit:
+def _step(x: Column, y: Column, fit: _Fit, sides: Column, *, sigma_min: float) -> _Fit:
     """The minimum of one piece: inliers count by squares, outliers by a constant pull.
 
     `sides` is -1 or 1 for outliers and 0 for inliers. For a given sigma, the line is that of least squares on

@@ -91,13 +91,13 @@ class Window:
         count = len(self._observations)
         mean_x, mean_y = self._sx / count, self._sy / count
         return Moments(
-            count,
-            self._origin_d,
-            mean_x,
-            self._origin_t + mean_y,
-            self._sxx - self._sx * mean_x,
-            self._sxy - self._sx * mean_y,
-            self._syy - self._sy * mean_y,
+            count=count,
+            origin=self._origin_d,
+            mean_offset=mean_x,
+            mean_seconds=self._origin_t + mean_y,
+            sdd=self._sxx - self._sx * mean_x,
+            sdt=self._sxy - self._sx * mean_y,
+            stt=self._syy - self._sy * mean_y,
         )
 
     def _recentre(self) -> None:

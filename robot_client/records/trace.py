@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from offboard.robot_client.learning.regret import Regret
 from offboard.robot_client.policies import Decision, Hedge, Outlook
@@ -61,6 +61,10 @@ class Late:
     seconds: float
     ok: bool
     censored: bool
+
+    @classmethod
+    def of(cls, id: str, site: str, execution: Execution) -> Self:
+        return cls(id, site, seconds=execution.seconds, ok=execution.ok, censored=execution.censored)
 
 
 @dataclass(slots=True)

@@ -203,8 +203,16 @@ class Run:
         if self._stopped:
             return None
         if self._answers:
-            own_id = record.id if record else None
-            self._answers.write(Answered(number, own_id, due_s, began_s, ended_s, error, described))
+            answered = Answered(
+                i=number,
+                id=record.id if record else None,
+                due_s=due_s,
+                began_s=began_s,
+                ended_s=ended_s,
+                error=error,
+                answer=described,
+            )
+            self._answers.write(answered)
         self._note(record, answer, error, late_s=began_s - due_s)
         if self._references and self._references.due(number) and record is not None:
             self._references.measure(

@@ -44,12 +44,12 @@ class PendingRequest:
 
     def message(self, now_s: float) -> wire.Request:
         return wire.Request(
-            self.task.id,
-            self.task.kind.name,
-            self.deadline_s - now_s,
-            self.attempt,
-            tuple(self.body.blobs),
-            self.body.frames,
+            id=self.task.id,
+            kind=self.task.kind.name,
+            budget_s=self.deadline_s - now_s,
+            attempt=self.attempt,
+            blobs=tuple(self.body.blobs),
+            body=self.body.frames,
         )
 
     def answered(self, reply: wire.Reply, received_s: float, bytes_in: int) -> Execution:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # --help needs only the names of the sites
 ONBOARD = "onboard"
 CLOUD = "cloud"
 TIMEOUT_S = 2.0  # default time that a remote site has for a task
+TIMEOUT_MAX_S = 24 * 3600.0
 PORT_MAX = 65_535
 
 _ENDPOINT = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5})")
@@ -112,6 +113,13 @@ class Runner(Protocol):
 
     def close(self) -> None:
         """Stop, and give up the tasks in flight. Safe to call twice."""
+
+
+def checked_timeout(timeout_s: float) -> float:
+    """The same number; ConfigError unless it is a time that a task may have, in seconds."""
+    if not 0 < timeout_s <= TIMEOUT_MAX_S:
+        raise ConfigError(f"timeout_s {timeout_s}: must be above 0 and at most {TIMEOUT_MAX_S:g}")
+    return timeout_s
 
 
 def check_endpoint(where: str, endpoint: str) -> None:

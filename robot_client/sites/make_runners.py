@@ -1,6 +1,6 @@
 """Makes the runners of an offloader: one for each server, and one for onboard.
 
-What a runner does is in `sites`.
+What a runner does is in the other files of this folder.
 """
 
 from collections.abc import Mapping

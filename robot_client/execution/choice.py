@@ -1,0 +1,56 @@
+"""The decision for one task: by the caller, who pins it to a site, or by the policy.
+
+What a policy compares is in `policies`.
+"""
+
+from collections.abc import Callable, Collection, Mapping
+
+from offboard.common.errors import ConfigError
+from offboard.common.tasks import Kind
+from offboard.robot_client.policies import BOTH, PINNED, Decision, Forecast, Policy
+from offboard.robot_client.sites.runner import ONBOARD
+
+
+def check_where(where: str, kind: Kind, sites: Collection[str]) -> None:
+    """ConfigError unless a task of this kind may be pinned there."""
+    if where != BOTH and where not in sites:
+        raise ConfigError(f"where={where!r} is not one of {', '.join([*sites, BOTH])}")
+    if where == BOTH and not kind.duplicate:
+        raise ConfigError(f"where='both': task {kind.name} is declared duplicate=False")
+
+
+def pinned(where: str, forecast: Forecast) -> Decision:
+    """The decision for a pinned call; it runs onboard if its site cannot take it."""
+    if where == BOTH:
+        both = len(forecast.sites) > 1
+        why = "measured on both" if both else "only onboard was there"
+        return Decision(ONBOARD, why, PINNED, both=both)
+    if where not in forecast.sites:
+        return Decision(ONBOARD, f"pinned to {where}, which cannot take it", PINNED)
+    return Decision(where, "pinned by the caller", PINNED)
+
+
+def decided(
+    policy: Policy,
+    forecast: Forecast,
+    kind: Kind,
+    *,
+    absent: Mapping[str, str],
+    known: Callable[[str], int],
+) -> Decision:
+    """The decision of the policy, without a second run if the kind must not run twice.
+
+    `absent` says why sites are not in the forecast; `known` counts the observations of a site.
+    """
+    if len(forecast.sites) == 1:
+        why = "; ".join(f"{site}: {why}" for site, why in absent.items()) or "no other site"
+        return Decision(ONBOARD, why, "none")
+    decision = policy.decide(forecast)
+    if kind.duplicate:
+        return decision
+    if decision.both:
+        # Warm-up without a second run: the site that is known least learns next.
+        heard = [site for site in forecast.sites if site not in decision.spared]
+        site = min(heard, key=lambda site: (known(site), site != ONBOARD))
+        return Decision(site, f"{decision.reason}; never on two sites", decision.policy)
+    return decision if decision.second is None else decision._replace(second=None)
