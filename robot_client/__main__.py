@@ -102,8 +102,8 @@ def _run(config: RobotConfig) -> int:
     """Run the tasks, then measure those of --alone."""
     # These are imported after the flags are read, so that --help compiles nothing.
     from offboard.robot_client.records.trace import Trace, alone_path
-    from offboard.robot_client.simulated.alone import measure_alone
     from offboard.robot_client.simulated.answers import Answers
+    from offboard.robot_client.simulated.measure_alone import measure_alone
     from offboard.robot_client.simulated.work import make_work
 
     answers = Answers(config.answers) if config.answers else None

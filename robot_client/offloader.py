@@ -26,11 +26,11 @@ from offboard.robot_client.execution.choice import check_where, decided, pinned
 from offboard.robot_client.execution.crossing_check import CrossingCheck
 from offboard.robot_client.execution.race import Plan, Race, answer_of
 from offboard.robot_client.learning.conditions import Conditions
-from offboard.robot_client.learning.flights import Flights
 from offboard.robot_client.learning.forecaster import Forecaster
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.learner import Learner, PendingTask
 from offboard.robot_client.learning.memories import Memories
+from offboard.robot_client.learning.runs_in_flight import Flights
 from offboard.robot_client.policies import BOTH, PINNED, Decision, Forecast, Policy
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.predictors.window import WINDOW

@@ -6,8 +6,8 @@ The times come from the memories; what is measured of the sites comes from `cond
 from collections.abc import Collection, Mapping
 
 from offboard.robot_client.learning.conditions import Conditions
-from offboard.robot_client.learning.flights import Flights
 from offboard.robot_client.learning.kind import KindMemory
+from offboard.robot_client.learning.runs_in_flight import Flights
 from offboard.robot_client.policies import Forecast, Outlook
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition

@@ -35,7 +35,7 @@ class MapSettings:
     map: Path = setting(REQUIRED, "map to drive on: ROS map.yaml or MovingAI .map", group=PLANS)
     resolution: float | None = setting(
         None,
-        "size of a cell to plan at, in metres (default: that of the map, which must be a multiple; "
+        "cell size to plan at, in metres (default: that of the map; another one must divide it evenly; "
         "a MovingAI map keeps its 1 m)",
         group=PLANS,
         minimum=0.001,

@@ -13,8 +13,8 @@ from offboard.common.planning.planner import plan_path, warm
 from offboard.common.tasks import Task
 from offboard.robot_client.offloader import BOTH
 from offboard.robot_client.records.trace import Record
-from offboard.robot_client.simulated.alone import WAYS, measure_alone
 from offboard.robot_client.simulated.config import DriveConfig
+from offboard.robot_client.simulated.measure_alone import WAYS, measure_alone
 from offboard.robot_client.simulated.references import orders
 from offboard.robot_client.simulated.robot import SimulatedRobot
 from offboard.robot_client.simulated.work import Plans
