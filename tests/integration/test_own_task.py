@@ -44,5 +44,5 @@ def test_all_parts_find_a_module_in_the_current_folder(tmp_path: Path) -> None:
     assert done.returncode == 1, done.stdout + done.stderr
     assert "holds  wrong at most 0 tasks: 0" in done.stdout
     assert "FAILS  mean_ms at most 0.001 ms: " in done.stdout
-    assert " too much" in done.stdout
+    assert " above the limit" in done.stdout
     assert done.stderr == "loadgen run: 1 of 2 checks of mine failed\n"
