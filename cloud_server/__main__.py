@@ -58,6 +58,7 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
     sys.path.insert(0, str(Path.cwd()))  # as `python -m` does, so that --tasks finds modules of the user
     # These load heavy libraries, which --help and a wrong flag do not need.
     from offboard.cloud_server.executors import EXECUTORS
+    from offboard.cloud_server.http_api import make_http
     from offboard.cloud_server.metrics import Metrics
     from offboard.cloud_server.server import Limits, Server
     from offboard.common.security.exposure import warn_each_minute
@@ -88,7 +89,7 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
         keys=keys,
         robots=config.robots_folder,
     )
-    web = make_http(config, server, metrics.registry, token=token)
+    web = make_http(config, server.status, metrics.registry, token=token)
     web.start()
     if config.open_ways:
         warn_each_minute(config.open_ways)
@@ -102,21 +103,6 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
         abandon(config.drain_s)
     log.info("stopped; every accepted request was answered")
     return 0
-
-
-def make_http(config: ServerConfig, server: Any, registry: Any, *, token: str | None) -> Any:
-    """The HTTP side of the server: health, metrics, settings and tasks."""
-    from offboard.cloud_server.http_api import HttpServer, create_app
-
-    app = create_app(
-        server.status,
-        registry,
-        as_dict(config),
-        token=token,
-        loopback=config.http_on_loopback,
-        insecure=bool(config.open_ways),
-    )
-    return HttpServer(app, config.http_address)
 
 
 def abandon(drain_s: float) -> NoReturn:

@@ -13,8 +13,10 @@ from typing import Any
 
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
 
+from offboard.cloud_server.config import ServerConfig
 from offboard.cloud_server.metrics import Status
 from offboard.common import VERSION, tasks
+from offboard.common.config import as_dict
 from offboard.common.errors import ConfigError, MissingExtra
 from offboard.common.security.http_guard import HttpGuard
 from offboard.common.token_bucket import Bucket
@@ -32,6 +34,21 @@ CONNECTIONS_A_S, CONNECTIONS_AT_ONCE = 100, 512  # new connections per second, a
 STALL_S = 2.0  # a turn of the server's loop takes at most 0.5 s
 STOP_S = 2.0
 TICKS, UVICORN_TICK_S = 5, 0.1  # five of uvicorn's ten ticks per second are done at once
+
+
+def make_http(
+    config: ServerConfig, status: Callable[[], Status], registry: CollectorRegistry, *, token: str | None
+) -> "HttpServer":
+    """The HTTP server of the process, bound to its address but not started."""
+    app = create_app(
+        status,
+        registry,
+        as_dict(config),
+        token=token,
+        loopback=config.http_on_loopback,
+        insecure=bool(config.open_ways),
+    )
+    return HttpServer(app, config.http_address)
 
 
 def create_app(

@@ -130,7 +130,7 @@ def test_a_missing_extra_is_named(command: list[str], extra: str) -> None:
         "import runpy, sys\n"
         "sys.modules['uvicorn'] = sys.modules['fastapi'] = None\n"
         f"sys.argv = {command!r}\n"
-        "runpy.run_module(sys.argv[0], run_name='__main__')\n"
+        "runpy.run_module(f'offboard.{sys.argv[0]}', run_name='__main__')\n"
     )
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, timeout=30)
     assert done.returncode == 2
@@ -142,7 +142,9 @@ def test_a_reader_that_stops_early_is_not_an_error(tmp_path: Path) -> None:
     """`loadgen table ... | head -1` ends without a message."""
     rows = "\n".join(f"{n},{n},1" for n in range(1, 40))
     (tmp_path / "rows.csv").write_text(f"size,onboard_s,cloud_s\n{rows}\n")
-    table = f"{sys.executable} -m loadgen table rows.csv --windows {','.join(map(str, range(2, 35)))}"
+    table = (
+        f"{sys.executable} -m offboard.loadgen table rows.csv --windows {','.join(map(str, range(2, 35)))}"
+    )
     done = subprocess.run(
         f"{table} --format json | true", shell=True, cwd=tmp_path, capture_output=True, text=True, timeout=30
     )
