@@ -167,4 +167,4 @@ def test_a_full_disk_costs_the_trace_and_no_task(
     with pytest.raises(OffloadError, match="robot ended with exit code 1"):
         played.check_robots()
     log = (tmp_path / "logs" / "robot.log").read_text()
-    assert f"{played.scenario.workload.tasks} tasks are not in {FULL_DISK}" in log
+    assert f"{played.scenario.workload.tasks} tasks could not be written to {FULL_DISK}" in log
