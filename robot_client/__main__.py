@@ -193,9 +193,8 @@ def _warn_of_absent(doing: str, absent: Mapping[str, str]) -> None:
     import logging
 
     for site, why in absent.items():
-        logging.getLogger("offboard.robot_client").warning(
-            "%s without %s: %s; tasks run %s", doing, site, why, ONBOARD
-        )
+        instead = "tasks run elsewhere" if site == ONBOARD else f"tasks run {ONBOARD}"
+        logging.getLogger("offboard.robot_client").warning("%s without %s: %s; %s", doing, site, why, instead)
 
 
 def _metrics(config: RobotConfig) -> list[Observer]:

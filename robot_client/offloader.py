@@ -9,7 +9,6 @@ import itertools
 import logging
 import secrets
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
@@ -37,10 +36,10 @@ from offboard.robot_client.predictors.window import WINDOW
 from offboard.robot_client.records.trace import Late, Record
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites import heartbeat
+from offboard.robot_client.sites.absence import Absent, absent_sites, wait_for_sites
 from offboard.robot_client.sites.clock import Clock, SystemClock
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, TIMEOUT_S, Execution, Runner, checked_timeout
 
-POLL_S = 0.01
 LATE_MAX = 64  # executions that ended after their task was answered, kept for the next record
 
 log = logging.getLogger(__name__)
@@ -194,14 +193,12 @@ class Offloader:
         """The same call for asyncio; the event loop is free while the task runs."""
         return await asyncio.to_thread(self, function, *args, **options)
 
-    def wait_for_sites(self, function: Callable[..., Any], timeout_s: float) -> dict[str, str]:
-        """Wait until every site can take this task; returns why some still cannot after `timeout_s`."""
-        kind, until = kind_of(function), time.monotonic() + timeout_s
-        while True:
-            absent = self._absent(kind)
-            if not absent or time.monotonic() >= until:
-                return absent
-            time.sleep(POLL_S)
+    def wait_for_sites(self, function: Callable[..., Any], timeout_s: float) -> Absent:
+        """Wait until every site can take this task, and onboard has run its setup, for at most `timeout_s`.
+
+        Returns why some sites still cannot: a dictionary by site, which is empty if all can.
+        """
+        return wait_for_sites(self._runners, kind_of(function), timeout_s)
 
     def close(self) -> None:
         """Close all runners and save what was learnt. Safe to call twice."""
@@ -240,7 +237,7 @@ class Offloader:
         """Predict, decide, execute, learn, record."""
         started_at, started = datetime.now(UTC), self._clock.now_s()
         number = next(self._numbers)
-        absent = self._absent(task.kind)
+        absent = absent_sites(self._runners, task.kind)
         with self._lock:
             pending = self._ask(
                 task,
@@ -284,10 +281,6 @@ class Offloader:
             except Exception:  # an observer is the user's own code
                 log.exception("observer %r failed on task %d", observe, record.i)
 
-    def _absent(self, kind: Kind) -> dict[str, str]:
-        """The sites that cannot take this kind now, and why."""
-        return {site: why for site, runner in self._runners.items() if (why := runner.unavailable(kind))}
-
     def _ask(
         self,
         task: Task,
@@ -329,7 +322,7 @@ class Offloader:
 
     def _expect(self, kind: Kind, timeout_s: float, size: float, own: Mapping[str, int]) -> Forecast:
         """What a batch is placed by; `own` holds how many of its tasks each site has."""
-        absent = self._absent(kind) if len(own) > 1 else {}
+        absent = absent_sites(self._runners, kind) if len(own) > 1 else {}
         present = {site: count for site, count in own.items() if site not in absent}
         with self._lock:
             memory = self._memories.of(kind, self._runners)
