@@ -1,6 +1,7 @@
 """The runner of the robot's own computer: it runs tasks in threads of this process."""
 
 import contextlib
+import logging
 import os
 import threading
 import time
@@ -25,7 +26,11 @@ from offboard.robot_client.sites.runner import ONBOARD, Condition, Execution
 
 ABANDONED_MAX = 4  # cancelled runs that go on at the same time
 ABANDONED_NICE = 10  # their niceness: a tenth of the CPU time of a task with niceness 0 (sched(7))
-CLOSE_WAIT_S = 1.0  # for the runs that go on when the runner is closed
+# For the runs that go on when the runner is closed: a task takes a second or two, and an abandoned one longer,
+# at its low priority. More would delay the end of a robot whose task hangs.
+CLOSE_WAIT_S = 5.0
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(eq=False, slots=True)
@@ -153,7 +158,14 @@ class OnboardRunner:
                 self._queue.put(None)
         for run in waiting:
             run.future.cancel()
-        join_all(self._started, CLOSE_WAIT_S)
+        if count := join_all(self._started, CLOSE_WAIT_S):
+            log.warning(
+                "%s: %d of its threads still run a task %g s after the close; if that is native code, "
+                "it may crash when the process ends",
+                ONBOARD,
+                count,
+                CLOSE_WAIT_S,
+            )
 
     def _start_thread(self) -> None:
         self._threads += 1
