@@ -17,8 +17,8 @@ from offboard.cloud_server.worker_pool import WorkerPool
 from offboard.common.task_states import TaskStates
 from offboard.common.threads import join_all
 
-# To wait for threads whose tasks are abandoned. This may be short: `--drain-s` was the time for those tasks, and
-# if some still run, `cloud-server` ends without the teardown in which native code could crash.
+# To wait for threads whose tasks are abandoned. This may be short: `--drain-s` was the time for those tasks,
+# and if some still run, `cloud-server` ends without the teardown in which native code could crash.
 CLOSE_WAIT_S = 1.0
 
 

@@ -26,8 +26,8 @@ from offboard.robot_client.sites.runner import ONBOARD, Condition, Execution
 
 ABANDONED_MAX = 4  # cancelled runs that go on at the same time
 ABANDONED_NICE = 10  # their niceness: a tenth of the CPU time of a task with niceness 0 (sched(7))
-# For the runs that go on when the runner is closed: a task takes a second or two, and an abandoned one longer,
-# at its low priority. More would delay the end of a robot whose task hangs.
+# For the runs that go on when the runner is closed: a task takes a second or two, an abandoned one longer, at
+# its low priority. A longer wait would only delay the end of a robot whose task hangs.
 CLOSE_WAIT_S = 5.0
 
 log = logging.getLogger(__name__)
