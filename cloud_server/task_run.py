@@ -12,6 +12,7 @@ from offboard.common import tasks
 from offboard.common.errors import ProtocolError, Unwanted, describe
 from offboard.common.host import cpu_time
 from offboard.common.task_states import TaskStates
+from offboard.common.tracebacks import traceback_of
 from offboard.common.wanted import always, call_while
 from offboard.common.wire.blobs import Buffer, StoredBlob
 from offboard.common.wire.values import decode, encode
@@ -40,7 +41,7 @@ class Outcome:
 
     `run_s` is the time in the worker. `cpu_s` is the CPU time used during the run, by all processes under the
     same quota, or else by the process that ran the task. `server_fault`: the task failed, but the task is not
-    the cause. `crashed`: its worker process died.
+    the cause. `crashed`: its worker process died. `traceback`: of a task that raised, else empty.
     """
 
     status: str
@@ -50,12 +51,13 @@ class Outcome:
     frames: list[Buffer] = field(default_factory=list)
     server_fault: bool = False
     crashed: bool = False
+    traceback: str = ""
 
 
 def run_task(call: Call, states: TaskStates) -> Outcome:
     """Decode the arguments, call the task, encode its result. Every exception becomes the outcome."""
     cpu_before_s, started = cpu_time.used_s(), time.perf_counter()
-    status, failure, unwanted = "ok", "", False
+    status, failure, unwanted, traceback = "ok", "", False, ""
     result: list[Buffer] = []
     try:
         kind = tasks.kind_named(call.kind)
@@ -67,8 +69,9 @@ def run_task(call: Call, states: TaskStates) -> Outcome:
         result = encode(value, kind.types).frames
     except BaseException as error:  # noqa: BLE001 - a task may raise anything
         status, failure, unwanted = "failed", describe(error), isinstance(error, Unwanted)
+        traceback = "" if unwanted else traceback_of(error)
     run_s, cpu_s = time.perf_counter() - started, cpu_time.used_s() - cpu_before_s
-    return Outcome(status, failure, run_s, cpu_s, frames=result, server_fault=unwanted)
+    return Outcome(status, failure, run_s, cpu_s, frames=result, server_fault=unwanted, traceback=traceback)
 
 
 def warm_kinds(states: TaskStates) -> None:

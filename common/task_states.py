@@ -13,6 +13,7 @@ from typing import Any
 
 from offboard.common.errors import TaskFailed, describe
 from offboard.common.tasks import Kind
+from offboard.common.tracebacks import traceback_of
 
 SETUPS_MAX = 64  # setups whose times are remembered: more than the tasks of one queue can wait for
 
@@ -110,7 +111,8 @@ class TaskStates:
             state = kind.setup()
             made = True
         except BaseException as error:
-            raise TaskFailed(f"setup of task {kind.name}: {describe(error)}") from error
+            text = f"setup of task {kind.name}: {describe(error)}"
+            raise TaskFailed(text, traceback_of(error, TaskStates._make)) from error
         finally:
             setup.ended_s = time.perf_counter()
             with self._changed:

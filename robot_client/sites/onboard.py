@@ -20,6 +20,7 @@ from offboard.common.host.load_watch import LoadWatch
 from offboard.common.task_states import TaskStates
 from offboard.common.tasks import Kind, Task
 from offboard.common.threads import join_all
+from offboard.common.tracebacks import traceback_of
 from offboard.common.wanted import call_while
 from offboard.robot_client.sites.own_cpu import OWN_CPU
 from offboard.robot_client.sites.runner import ONBOARD, Condition, Execution
@@ -231,7 +232,7 @@ def _call(run: _Run, state: tuple[Any, ...], states: TaskStates) -> Execution:
     try:
         value = call_while(lambda: run.wanted, run.task.kind.function, (*state, *run.task.args))
     except BaseException as error:  # noqa: BLE001 - anything that the function raises is the task's failure
-        failure = TaskFailed(describe(error))
+        failure = TaskFailed(describe(error), traceback_of(error))
         failure.__cause__ = error
         if isinstance(error, Unwanted) and not run.wanted:
             return _overtaken(run, started=True)
