@@ -15,7 +15,7 @@ from concurrent.futures import Future
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar, cast
 
 from offboard.common.errors import ConfigError, Overtaken
 from offboard.common.tasks import Kind, Task, kind_of
@@ -41,6 +41,8 @@ from offboard.robot_client.sites.clock import Clock, SystemClock
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, TIMEOUT_S, Execution, Runner, checked_timeout
 
 LATE_MAX = 64  # executions that ended after their task was answered, kept for the next record
+
+R = TypeVar("R")
 
 log = logging.getLogger(__name__)
 
@@ -139,12 +141,12 @@ class Offloader:
 
     def __call__(
         self,
-        function: Callable[..., Any],
+        function: Callable[..., R],
         *args: Any,
         where: str | None = None,
         timeout_s: float | None = None,
         **kwargs: Any,
-    ) -> Any:
+    ) -> R:
         """Run a `@task` function and return its result; TaskFailed if the function itself raised.
 
         `where` pins the call to a site, or to `both` to measure all of them. `timeout_s` bounds the wait for
@@ -156,16 +158,16 @@ class Offloader:
         answer, _ = self._answer(where, budget_s, Task(kind, args, kind.size_of(args)))
         if answer.failure is not None:
             raise answer.failure
-        return answer.value
+        return cast("R", answer.value)
 
     def map(
         self,
-        function: Callable[..., Any],
+        function: Callable[..., R],
         items: Iterable[Any],
         *,
         where: str | None = None,
         timeout_s: float | None = None,
-    ) -> list[Any]:
+    ) -> list[R]:
         """Run a `@task` function on every item, on all sites at once, so that the last one ends soonest.
 
         An item is the argument, or a tuple of all arguments if the function takes several. The results come
@@ -189,7 +191,7 @@ class Offloader:
         )
         return batch.run()
 
-    async def run(self, function: Callable[..., Any], *args: Any, **options: Any) -> Any:
+    async def run(self, function: Callable[..., R], *args: Any, **options: Any) -> R:
         """The same call for asyncio; the event loop is free while the task runs."""
         return await asyncio.to_thread(self, function, *args, **options)
 
