@@ -12,6 +12,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -33,6 +34,7 @@ from offboard.robot_client.learning.runs_in_flight import Flights
 from offboard.robot_client.policies import BOTH, PINNED, Decision, Forecast, Policy
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.predictors.window import WINDOW
+from offboard.robot_client.records.recording import Recording, tell
 from offboard.robot_client.records.trace import Late, Record
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites import heartbeat
@@ -79,6 +81,7 @@ class Offloader:
         self._allowance = allowance or Allowance()
         self._timeout_s = checked_timeout(timeout_s)
         self._observers = tuple(observers)
+        self._recording: Recording | None = None
         self._clock = clock or SystemClock()
         self._flights = Flights(self._runners)
         conditions = Conditions(self._runners)
@@ -103,6 +106,8 @@ class Offloader:
         timeout_s: float = TIMEOUT_S,
         keys: Path | str | None = None,
         observers: Iterable[Callable[[Record], None]] = (),
+        metrics: str | None = None,
+        trace: Path | str | None = None,
         settings: Settings | None = None,
     ) -> Self:
         """An offloader for onboard, a server `cloud` at `endpoint` (tcp://HOST:PORT), and further servers.
@@ -114,6 +119,7 @@ class Offloader:
         `keys`: the folder of `robot-client keys`, with the public key of each server in NAME.key or
         server.key (None: no encryption).
         `observers`: called with the record of every task. `settings`: options that few robots need.
+        `metrics`: HOST:PORT where Prometheus reads `/metrics`. `trace`: the file that gets every record.
         """
         from offboard.robot_client.sites.make_runners import (
             make_runners,  # zmq is loaded only for a connection
@@ -124,20 +130,23 @@ class Offloader:
         servers = ({CLOUD: endpoint} if endpoint else {}) | dict(sites or {})
         beats = predictors.conditional(rare.predictor_for(policy))
         heartbeat_s = heartbeat.EVERY_S if beats else 0.0
-        runners = make_runners(servers, keys=keys, heartbeat_s=heartbeat_s, seed=rare.seed)
-        try:
-            return cls(
+        with ExitStack() as opened:
+            recording = Recording(trace=trace, metrics=metrics)
+            opened.callback(recording.close)
+            runners = make_runners(servers, keys=keys, heartbeat_s=heartbeat_s, seed=rare.seed)
+            for runner in runners:
+                opened.callback(runner.close)
+            offload = cls(
                 runners,
                 policy=chosen,
                 memories=memories,
                 allowance=rare.allowance(),
                 timeout_s=timeout_s,
-                observers=observers,
+                observers=[*observers, *recording.observers],
             )
-        except ConfigError:
-            for runner in runners:
-                runner.close()
-            raise
+            opened.pop_all()
+        offload._recording = recording
+        return offload
 
     def __call__(
         self,
@@ -203,7 +212,7 @@ class Offloader:
         return wait_for_sites(self._runners, kind_of(function), timeout_s)
 
     def close(self) -> None:
-        """Close all runners and save what was learnt. Safe to call twice."""
+        """Close all runners, trace and metrics, and save what was learnt. Safe to call twice."""
         with self._lock:
             first, self._closed = not self._closed, True
             if first:
@@ -213,6 +222,8 @@ class Offloader:
             runner.close()
         if last is not None:
             self._memories.save_last(last)
+        if self._recording is not None:
+            self._recording.close()
 
     def __enter__(self) -> Self:
         return self
@@ -228,7 +239,7 @@ class Offloader:
             self._crossing.check_arguments(task)
         answer, record = self._offload(task, where, budget_s, placed)
         self.last = record
-        self._tell(record)
+        tell(self._observers, record)
         if len(self._runners) > 1 and answer.failure is None:
             self._crossing.check_result(task.kind, answer.value)
         return answer, record
@@ -274,14 +285,6 @@ class Offloader:
             started_at=started_at,
         )
         return answer, record
-
-    def _tell(self, record: Record) -> None:
-        """An observer that fails must not cost the caller its answer."""
-        for observe in self._observers:
-            try:
-                observe(record)
-            except Exception:  # an observer is the user's own code
-                log.exception("observer %r failed on task %d", observe, record.i)
 
     def _ask(
         self,

@@ -1,4 +1,4 @@
-"""Calls of an offloader, with the types that a type checker must see. Mypy reads this file; nobody runs it."""
+"""Calls of an offloader, with the types that a type checker must see. Mypy reads this file; it never runs."""
 
 from typing import Any, assert_type
 
