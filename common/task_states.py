@@ -7,7 +7,7 @@ import threading
 import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,8 @@ from offboard.common.tasks import Kind
 from offboard.common.tracebacks import traceback_of
 
 SETUPS_MAX = 64  # setups whose times are remembered: more than the tasks of one queue can wait for
+
+_NOTHING: AbstractContextManager[tuple[Any, ...]] = nullcontext(())  # shared: most kinds have no setup
 
 
 @dataclass(eq=False, slots=True)
@@ -54,15 +56,15 @@ class TaskStates:
         with self._changed:
             return kind.setup is None or (self._made[name] == self._workers and not self._making[name])
 
-    @contextmanager
-    def lend(self, kind: Kind) -> Iterator[tuple[Any, ...]]:
+    def lend(self, kind: Kind) -> AbstractContextManager[tuple[Any, ...]]:
         """The arguments that come before those of the caller: a state, or nothing if the kind has no setup.
 
         If no state is free, it is made now, or else the call waits for one. TaskFailed if the setup raises.
         """
-        if kind.setup is None:
-            yield ()
-            return
+        return _NOTHING if kind.setup is None else self._lent(kind)
+
+    @contextmanager
+    def _lent(self, kind: Kind) -> Iterator[tuple[Any, ...]]:
         state = self._take(kind)
         try:
             yield (state,)
