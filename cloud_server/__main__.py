@@ -106,7 +106,7 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
 
 
 def abandon(drain_s: float) -> NoReturn:
-    """End the process at once: a normal exit would wait for tasks that cannot be stopped."""
+    """End the process at once: the teardown of a normal exit can crash native code that still runs."""
     log.error("some tasks were still running after the drain time of %g s; they are abandoned", drain_s)
     logging.shutdown()
     os._exit(1)

@@ -14,9 +14,12 @@ from typing import Protocol
 
 from offboard.cloud_server.task_run import Call, Outcome, run_task, warm_kinds
 from offboard.cloud_server.worker_pool import WorkerPool
+from offboard.common.task_states import TaskStates
 from offboard.common.threads import join_all
 
-CLOSE_WAIT_S = 1.0  # to wait for threads whose tasks are abandoned
+# To wait for threads whose tasks are abandoned. This may be short: `--drain-s` was the time for those tasks,
+# and if some still run, `cloud-server` ends without the teardown in which native code could crash.
+CLOSE_WAIT_S = 1.0
 
 
 class Executor(Protocol):
@@ -29,7 +32,7 @@ class Executor(Protocol):
         """The workers that run a task or can take one. The others are being started again."""
 
     def warm(self, changed: Callable[[str], None] = lambda _: None) -> "Future[None]":
-        """Start all workers and run `warm` of each kind in each of them. Called once; does not wait.
+        """Start all workers, and run `setup` and `warm` of each kind in them. Called once; does not wait.
 
         From then on `changed` is called, in any thread, with one word for the reason when a worker dies, and
         with an empty text when a worker is up again.
@@ -64,6 +67,7 @@ class ThreadExecutor:
 
     def __init__(self, workers: int) -> None:
         self.workers = self.up = workers
+        self._states = TaskStates(workers)
         self._calls: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._threads = [
             threading.Thread(target=self._work, name=f"task-{n}", daemon=True)
@@ -74,18 +78,18 @@ class ThreadExecutor:
 
     def warm(self, changed: Callable[[str], None] = lambda _: None) -> "Future[None]":  # noqa: ARG002
         warmed: Future[None] = Future()
-        self._calls.put(partial(_warm, warmed))
+        self._calls.put(partial(_warm, self._states, warmed))
         return warmed
 
     def submit(self, call: Call, done: "Callable[[Future[Outcome]], None]") -> "Future[Outcome]":
         outcome: Future[Outcome] = Future()
         outcome.add_done_callback(done)
-        self._calls.put(lambda: outcome.set_result(run_task(call)))
+        self._calls.put(lambda: outcome.set_result(run_task(call, self._states)))
         return outcome
 
     def run(self, call: Call, *, meanwhile: Callable[[], None]) -> Outcome | None:
         self._calls.put(meanwhile)
-        return run_task(call)
+        return run_task(call, self._states)
 
     def used_s(self) -> float:
         return time.process_time()
@@ -109,9 +113,9 @@ EXECUTORS: dict[str, Callable[..., Executor]] = {
 }
 
 
-def _warm(warmed: "Future[None]") -> None:
+def _warm(states: TaskStates, warmed: "Future[None]") -> None:
     try:
-        warm_kinds()
+        warm_kinds(states)
     except BaseException as error:  # noqa: BLE001 - a task's own code may raise anything
         warmed.set_exception(error)
     else:

@@ -4,6 +4,7 @@
 the lock of the channel.
 """
 
+import logging
 import time
 from collections import OrderedDict
 from dataclasses import dataclass, replace
@@ -21,6 +22,9 @@ from offboard.common.wire.messages import Reply, Request, byte_count
 
 CRASHES_MAX = 3  # workers that one request may cost
 CRASHED_KEPT = 1024  # requests whose crashes are remembered
+FAILURES_KEPT = 256  # kinds and types of errors that are logged: a task may make types without limit
+
+log = logging.getLogger("offboard.cloud_server")
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +67,7 @@ class Scheduler:
         self._load = load
         self._queue = FairQueue(queue_max)
         self._crashes = CrashCount()
+        self._failures = FailureLog()
         self._running: set[Work] = set()
         self._chosen: list[Work] = []  # counts as running; the thread that chose it starts it
 
@@ -175,6 +180,7 @@ class Scheduler:
         if size > self._message_bytes_max:
             error = f"BadValue: the result takes {size} bytes, at most {self._message_bytes_max} are allowed"
             outcome = replace(outcome, status="failed", error=error, frames=[], server_fault=True)
+        self._failures.note(request.kind, outcome)
         if work.wanted:
             self._load.hurry()  # the load during the task, not before it
             load, capacity = self._load.latest()
@@ -182,6 +188,7 @@ class Scheduler:
                 request.id, outcome.status, outcome.error, work.queue_s,
                 run_s=outcome.run_s, queue_depth=len(self._queue), server_fault=outcome.server_fault,
                 body=outcome.frames, cpu_s=outcome.cpu_s, load=load, capacity=capacity,
+                traceback=outcome.traceback,
             )  # fmt: skip
             self._sender.send(work.peer, reply)
         self._count(request, outcome.status if work.wanted else "cancelled")
@@ -230,3 +237,21 @@ class CrashCount:
 
     def __len__(self) -> int:
         return len(self._counts)
+
+
+class FailureLog:
+    """Logs the traceback of a failing task, once for each kind and type of error."""
+
+    def __init__(self) -> None:
+        self._logged: set[tuple[str, str]] = set()
+
+    def note(self, kind: str, outcome: Outcome) -> None:
+        failure = kind, outcome.error.partition(":")[0]
+        if not outcome.traceback or failure in self._logged or len(self._logged) == FAILURES_KEPT:
+            return
+        self._logged.add(failure)
+        log.warning(
+            "task %s failed; its next failures with %s are not logged\n%s",
+            *failure,
+            outcome.traceback.rstrip(),
+        )

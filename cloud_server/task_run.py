@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from offboard.common import tasks
 from offboard.common.errors import ProtocolError, Unwanted, describe
 from offboard.common.host import cpu_time
+from offboard.common.task_states import TaskStates
+from offboard.common.tracebacks import traceback_of
 from offboard.common.wanted import always, call_while
 from offboard.common.wire.blobs import Buffer, StoredBlob
 from offboard.common.wire.values import decode, encode
@@ -39,7 +41,7 @@ class Outcome:
 
     `run_s` is the time in the worker. `cpu_s` is the CPU time used during the run, by all processes under the
     same quota, or else by the process that ran the task. `server_fault`: the task failed, but the task is not
-    the cause. `crashed`: its worker process died.
+    the cause. `crashed`: its worker process died. `traceback`: of a task that raised, else empty.
     """
 
     status: str
@@ -49,28 +51,33 @@ class Outcome:
     frames: list[Buffer] = field(default_factory=list)
     server_fault: bool = False
     crashed: bool = False
+    traceback: str = ""
 
 
-def run_task(call: Call) -> Outcome:
+def run_task(call: Call, states: TaskStates) -> Outcome:
     """Decode the arguments, call the task, encode its result. Every exception becomes the outcome."""
     cpu_before_s, started = cpu_time.used_s(), time.perf_counter()
-    status, failure, unwanted = "ok", "", False
+    status, failure, unwanted, traceback = "ok", "", False, ""
     result: list[Buffer] = []
     try:
         kind = tasks.kind_named(call.kind)
         args = decode(call.frames, kind.types, call.blobs)
         if not isinstance(args, list):
             raise ProtocolError("the body is not a list of arguments")
-        result = encode(call_while(call.wanted, kind.function, args), kind.types).frames
+        with states.lend(kind) as state:
+            value = call_while(call.wanted, kind.function, (*state, *args))
+        result = encode(value, kind.types).frames
     except BaseException as error:  # noqa: BLE001 - a task may raise anything
         status, failure, unwanted = "failed", describe(error), isinstance(error, Unwanted)
+        traceback = "" if unwanted else traceback_of(error)
     run_s, cpu_s = time.perf_counter() - started, cpu_time.used_s() - cpu_before_s
-    return Outcome(status, failure, run_s, cpu_s, frames=result, server_fault=unwanted)
+    return Outcome(status, failure, run_s, cpu_s, frames=result, server_fault=unwanted, traceback=traceback)
 
 
-def warm_kinds() -> None:
-    """Run `warm` of each kind. Once per process, before its first task."""
+def warm_kinds(states: TaskStates) -> None:
+    """Make the states of each kind, and run its `warm`. Once per process, before its first task."""
     cpu_time.used_s()  # the first call looks for the cgroup
     for kind in tasks.kinds():
+        states.prepare(kind)
         if kind.warm is not None:
             kind.warm()

@@ -14,6 +14,7 @@ import sys
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ import msgpack
 from offboard.cloud_server.task_run import Call, Outcome, run_task, warm_kinds
 from offboard.common import tasks
 from offboard.common.errors import describe
+from offboard.common.task_states import TaskStates
 from offboard.common.wire.blobs import BlobStore, StoredBlob
 from offboard.common.wire.messages import ERROR_LENGTH_MAX, byte_count
 
@@ -30,7 +32,7 @@ ANSWER_BYTES_MAX = (1 << 31) - (1 << 20)  # no message is larger
 PR_SET_PDEATHSIG = 1
 # Prepared in advance, for the case that no memory is left to build an answer.
 NOTHING_LEFT: bytes = msgpack.packb(
-    ["failed", "MemoryError: too little memory is left for an answer", 0.0, None, [], False, True]
+    ["failed", "MemoryError: too little memory is left for an answer", 0.0, None, [], False, False, "", True]
 )
 
 
@@ -56,17 +58,18 @@ def work(parent: int, pipe_fd: int, flag: int, setup: Setup) -> None:
     if sys.stderr is not None:
         faulthandler.enable()  # the server's log then shows where a task crashed
     pipe, stop = socket.socket(fileno=pipe_fd), mmap.mmap(flag, 1)
+    states = TaskStates(workers=1)
     try:
         tasks.load_modules(setup.modules)
-        warm_kinds()
+        warm_kinds(states)
     except BaseException as error:  # noqa: BLE001 - a user's module may raise anything
         traceback.print_exc()
         pipe.sendall(msgpack.packb(describe(error), unicode_errors="replace"))
         return
     pipe.sendall(msgpack.packb(""))
-    store = BlobStore(setup.blob_bytes_max)
+    store, run = BlobStore(setup.blob_bytes_max), partial(run_task, states=states)
     while (call := _receive(pipe)) is not None:
-        pipe.sendall(_answer(call, store, Path(setup.folder), wanted=lambda: not stop[0]))
+        pipe.sendall(_answer(call, store, Path(setup.folder), wanted=lambda: not stop[0], run=run))
         del call  # free its memory before the next one comes
 
 
@@ -87,7 +90,14 @@ def _receive(pipe: socket.socket) -> Any | None:
     return None
 
 
-def _answer(message: list[Any], store: BlobStore, folder: Path, wanted: Callable[[], bool]) -> bytes:
+def _answer(
+    message: list[Any],
+    store: BlobStore,
+    folder: Path,
+    *,
+    wanted: Callable[[], bool],
+    run: Callable[[Call], Outcome],
+) -> bytes:
     """Run one task; returns the message about its outcome."""
     kind, frames, digests = message
     try:
@@ -95,7 +105,7 @@ def _answer(message: list[Any], store: BlobStore, folder: Path, wanted: Callable
             blobs = {digest: _blob(store, folder, digest) for digest in digests}
         except OSError as error:
             return _message(Outcome("failed", describe(error), server_fault=True))
-        return _message(run_task(Call(kind, frames, blobs, wanted)))
+        return _message(run(Call(kind, frames, blobs, wanted)))
     except MemoryError:
         return NOTHING_LEFT
 
@@ -113,9 +123,10 @@ def _message(outcome: Outcome) -> bytes:
     size = byte_count(outcome.frames)
     if size > ANSWER_BYTES_MAX:
         error = f"BadValue: the result takes {size} bytes, at most {ANSWER_BYTES_MAX} are allowed"
-        outcome = replace(outcome, status="failed", error=error, frames=[])
+        outcome = replace(outcome, status="failed", error=error, frames=[], traceback="")
     error, full = outcome.error[:ERROR_LENGTH_MAX], _full(outcome.error)
     fields = [outcome.status, error, outcome.run_s, outcome.cpu_s, outcome.frames, outcome.server_fault]
+    fields += [outcome.crashed, outcome.traceback]
     message: bytes = msgpack.packb([*fields, full], unicode_errors="replace")
     return message
 

@@ -37,7 +37,14 @@ class UnknownTask(TaskError):
 
 
 class TaskFailed(TaskError):
-    """The function of the task raised an exception. The message has its type and text."""
+    """The function of the task raised an exception. The message has its type and text.
+
+    `traceback` is its traceback on the site where it ran, at most 4,000 characters; empty if it is unknown.
+    """
+
+    def __init__(self, message: str, traceback: str = "") -> None:
+        super().__init__(message)
+        self.traceback = traceback
 
 
 class BadValue(TaskError):

@@ -27,7 +27,8 @@ class Kind:
     `size` maps the arguments to the input size d (finite, >= 0). `types` are the dataclasses that arguments
     and result may contain. `warm` is called once per process before the first task. A kind with
     `duplicate=False` never runs on two sites. `work` maps a result to the amount of work that it took, in any
-    unit.
+    unit. `setup` is called once per worker; its result is the first argument of the function, which callers
+    do not give.
     """
 
     name: str
@@ -39,14 +40,19 @@ class Kind:
     source_hash: str = ""
     work: Callable[[Any], float] | None = None
     positional: int | None = None  # a call with this many positional arguments needs no binding
+    setup: Callable[[], Any] | None = None
 
     def bind(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:
         """The call as positional arguments with defaults filled in. TypeError as if it were called."""
         if not kwargs and self.positional is not None and len(args) == self.positional:
             return args
-        bound = inspect.signature(self.function).bind(*args, **kwargs)
+        bound = self.signature().bind(*args, **kwargs)
         bound.apply_defaults()
         return bound.args
+
+    def signature(self) -> inspect.Signature:
+        """What a caller gives: the parameters of the function, without the first one if there is a setup."""
+        return _without_state(inspect.signature(self.function), self.setup)
 
     def size_of(self, args: tuple[Any, ...]) -> float:
         """The input size d of a call. BadValue if the size function returns no finite number >= 0."""
@@ -84,6 +90,7 @@ def task(
     types: tuple[type, ...] = (),
     warm: Callable[[], None] | None = None,
     work: Callable[[Any], float] | None = None,
+    setup: Callable[[], Any] | None = None,
 ) -> Callable[[F], F]:
     """Register a function as a kind of task. It can still be called as an ordinary function.
 
@@ -95,7 +102,10 @@ def task(
         raise ConfigError(f"task {name}: {KINDS_MAX} tasks are registered already, the most allowed")
 
     def register(function: F) -> F:
-        parameters = inspect.signature(function).parameters.values()
+        signature = inspect.signature(function)
+        if setup is not None:
+            _check_first_parameter(name, signature)
+        parameters = _without_state(signature, setup).parameters.values()
         for parameter in parameters:
             if parameter.kind in (parameter.KEYWORD_ONLY, parameter.VAR_KEYWORD):
                 raise ConfigError(
@@ -106,6 +116,7 @@ def task(
         kind = Kind(
             name, function, size, duplicate,
             types=types, warm=warm, source_hash=_source_hash(function), work=work, positional=count,
+            setup=setup,
         )  # fmt: skip
         known = _kinds.get(name)
         if known is not None and known.source_hash != kind.source_hash:
@@ -147,6 +158,19 @@ def load_modules(names: Iterable[str]) -> None:
             importlib.import_module(name)
         except Exception as error:
             raise ConfigError(f"task module {name!r} cannot be imported: {describe(error)}") from error
+
+
+def _check_first_parameter(name: str, signature: inspect.Signature) -> None:
+    first = next(iter(signature.parameters.values()), None)
+    if first is None or first.kind not in (first.POSITIONAL_ONLY, first.POSITIONAL_OR_KEYWORD):
+        raise ConfigError(f"task {name}: setup= needs a function whose first parameter takes its result")
+
+
+def _without_state(signature: inspect.Signature, setup: object) -> inspect.Signature:
+    if setup is None:
+        return signature
+    _, *given = signature.parameters.values()
+    return signature.replace(parameters=given)
 
 
 def _source_hash(function: Callable[..., Any]) -> str:

@@ -16,7 +16,7 @@ from offboard.common.command_line import Command, CommandParser, add_flags, load
 from offboard.common.config import as_dict, resolve
 from offboard.common.errors import ConfigError, OffloadError
 from offboard.robot_client.simulated.config import CallConfig, DriveConfig, RobotConfig
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, PORT_MAX, check_endpoint
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, check_endpoint
 
 if TYPE_CHECKING:
     from offboard.robot_client.offloader import Offloader
@@ -193,28 +193,17 @@ def _warn_of_absent(doing: str, absent: Mapping[str, str]) -> None:
     import logging
 
     for site, why in absent.items():
-        logging.getLogger("offboard.robot_client").warning(
-            "%s without %s: %s; tasks run %s", doing, site, why, ONBOARD
-        )
+        instead = "tasks run elsewhere" if site == ONBOARD else f"tasks run {ONBOARD}"
+        logging.getLogger("offboard.robot_client").warning("%s without %s: %s; %s", doing, site, why, instead)
 
 
 def _metrics(config: RobotConfig) -> list[Observer]:
-    """The observer that serves metrics, if an address is given for it."""
+    """The observer that serves metrics until the process ends, if an address is given for it."""
     if config.metrics is None:
         return []
-    from prometheus_client import CollectorRegistry
+    from offboard.robot_client.records.metrics import serve_metrics
 
-    from offboard.robot_client.records.metrics import Metrics
-
-    host, _, port = config.metrics.rpartition(":")
-    if not host or not port.isdecimal() or int(port) > PORT_MAX:
-        raise ConfigError(f"--metrics: {config.metrics!r} is not HOST:PORT with a port 0 to {PORT_MAX}")
-    metrics = Metrics(CollectorRegistry())
-    try:
-        metrics.serve(host, int(port))
-    except (OSError, UnicodeError) as error:
-        raise ConfigError(f"--metrics: {config.metrics} cannot be served: {error}") from error
-    return [metrics]
+    return [serve_metrics(config.metrics, "--metrics")]
 
 
 def _interrupt(*_: object) -> NoReturn:

@@ -9,14 +9,14 @@ import itertools
 import logging
 import secrets
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar, cast
 
 from offboard.common.errors import ConfigError, Overtaken
 from offboard.common.tasks import Kind, Task, kind_of
@@ -34,14 +34,17 @@ from offboard.robot_client.learning.runs_in_flight import Flights
 from offboard.robot_client.policies import BOTH, PINNED, Decision, Forecast, Policy
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.predictors.window import WINDOW
+from offboard.robot_client.records.recording import Recording, tell
 from offboard.robot_client.records.trace import Late, Record
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites import heartbeat
+from offboard.robot_client.sites.absence import Absent, absent_sites, wait_for_sites
 from offboard.robot_client.sites.clock import Clock, SystemClock
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, TIMEOUT_S, Execution, Runner, checked_timeout
 
-POLL_S = 0.01
 LATE_MAX = 64  # executions that ended after their task was answered, kept for the next record
+
+R = TypeVar("R")
 
 log = logging.getLogger(__name__)
 
@@ -78,6 +81,7 @@ class Offloader:
         self._allowance = allowance or Allowance()
         self._timeout_s = checked_timeout(timeout_s)
         self._observers = tuple(observers)
+        self._recording: Recording | None = None
         self._clock = clock or SystemClock()
         self._flights = Flights(self._runners)
         conditions = Conditions(self._runners)
@@ -102,6 +106,8 @@ class Offloader:
         timeout_s: float = TIMEOUT_S,
         keys: Path | str | None = None,
         observers: Iterable[Callable[[Record], None]] = (),
+        metrics: str | None = None,
+        trace: Path | str | None = None,
         settings: Settings | None = None,
     ) -> Self:
         """An offloader for onboard, a server `cloud` at `endpoint` (tcp://HOST:PORT), and further servers.
@@ -113,6 +119,7 @@ class Offloader:
         `keys`: the folder of `robot-client keys`, with the public key of each server in NAME.key or
         server.key (None: no encryption).
         `observers`: called with the record of every task. `settings`: options that few robots need.
+        `metrics`: HOST:PORT where Prometheus reads `/metrics`. `trace`: the file that gets every record.
         """
         from offboard.robot_client.sites.make_runners import (
             make_runners,  # zmq is loaded only for a connection
@@ -123,29 +130,32 @@ class Offloader:
         servers = ({CLOUD: endpoint} if endpoint else {}) | dict(sites or {})
         beats = predictors.conditional(rare.predictor_for(policy))
         heartbeat_s = heartbeat.EVERY_S if beats else 0.0
-        runners = make_runners(servers, keys=keys, heartbeat_s=heartbeat_s, seed=rare.seed)
-        try:
-            return cls(
+        with ExitStack() as opened:
+            recording = Recording(trace=trace, metrics=metrics)
+            opened.callback(recording.close)
+            runners = make_runners(servers, keys=keys, heartbeat_s=heartbeat_s, seed=rare.seed)
+            for runner in runners:
+                opened.callback(runner.close)
+            offload = cls(
                 runners,
                 policy=chosen,
                 memories=memories,
                 allowance=rare.allowance(),
                 timeout_s=timeout_s,
-                observers=observers,
+                observers=[*observers, *recording.observers],
             )
-        except ConfigError:
-            for runner in runners:
-                runner.close()
-            raise
+            opened.pop_all()
+        offload._recording = recording
+        return offload
 
     def __call__(
         self,
-        function: Callable[..., Any],
+        function: Callable[..., R],
         *args: Any,
         where: str | None = None,
         timeout_s: float | None = None,
         **kwargs: Any,
-    ) -> Any:
+    ) -> R:
         """Run a `@task` function and return its result; TaskFailed if the function itself raised.
 
         `where` pins the call to a site, or to `both` to measure all of them. `timeout_s` bounds the wait for
@@ -157,16 +167,16 @@ class Offloader:
         answer, _ = self._answer(where, budget_s, Task(kind, args, kind.size_of(args)))
         if answer.failure is not None:
             raise answer.failure
-        return answer.value
+        return cast("R", answer.value)
 
     def map(
         self,
-        function: Callable[..., Any],
+        function: Callable[..., R],
         items: Iterable[Any],
         *,
         where: str | None = None,
         timeout_s: float | None = None,
-    ) -> list[Any]:
+    ) -> list[R]:
         """Run a `@task` function on every item, on all sites at once, so that the last one ends soonest.
 
         An item is the argument, or a tuple of all arguments if the function takes several. The results come
@@ -190,21 +200,19 @@ class Offloader:
         )
         return batch.run()
 
-    async def run(self, function: Callable[..., Any], *args: Any, **options: Any) -> Any:
+    async def run(self, function: Callable[..., R], *args: Any, **options: Any) -> R:
         """The same call for asyncio; the event loop is free while the task runs."""
         return await asyncio.to_thread(self, function, *args, **options)
 
-    def wait_for_sites(self, function: Callable[..., Any], timeout_s: float) -> dict[str, str]:
-        """Wait until every site can take this task; returns why some still cannot after `timeout_s`."""
-        kind, until = kind_of(function), time.monotonic() + timeout_s
-        while True:
-            absent = self._absent(kind)
-            if not absent or time.monotonic() >= until:
-                return absent
-            time.sleep(POLL_S)
+    def wait_for_sites(self, function: Callable[..., Any], timeout_s: float) -> Absent:
+        """Wait until every site can take this task, and onboard has run its setup, for at most `timeout_s`.
+
+        Returns why some sites still cannot: a dictionary by site, which is empty if all can.
+        """
+        return wait_for_sites(self._runners, kind_of(function), timeout_s)
 
     def close(self) -> None:
-        """Close all runners and save what was learnt. Safe to call twice."""
+        """Close all runners, trace and metrics, and save what was learnt. Safe to call twice."""
         with self._lock:
             first, self._closed = not self._closed, True
             if first:
@@ -214,6 +222,8 @@ class Offloader:
             runner.close()
         if last is not None:
             self._memories.save_last(last)
+        if self._recording is not None:
+            self._recording.close()
 
     def __enter__(self) -> Self:
         return self
@@ -229,7 +239,7 @@ class Offloader:
             self._crossing.check_arguments(task)
         answer, record = self._offload(task, where, budget_s, placed)
         self.last = record
-        self._tell(record)
+        tell(self._observers, record)
         if len(self._runners) > 1 and answer.failure is None:
             self._crossing.check_result(task.kind, answer.value)
         return answer, record
@@ -240,7 +250,7 @@ class Offloader:
         """Predict, decide, execute, learn, record."""
         started_at, started = datetime.now(UTC), self._clock.now_s()
         number = next(self._numbers)
-        absent = self._absent(task.kind)
+        absent = absent_sites(self._runners, task.kind)
         with self._lock:
             pending = self._ask(
                 task,
@@ -275,18 +285,6 @@ class Offloader:
             started_at=started_at,
         )
         return answer, record
-
-    def _tell(self, record: Record) -> None:
-        """An observer that fails must not cost the caller its answer."""
-        for observe in self._observers:
-            try:
-                observe(record)
-            except Exception:  # an observer is the user's own code
-                log.exception("observer %r failed on task %d", observe, record.i)
-
-    def _absent(self, kind: Kind) -> dict[str, str]:
-        """The sites that cannot take this kind now, and why."""
-        return {site: why for site, runner in self._runners.items() if (why := runner.unavailable(kind))}
 
     def _ask(
         self,
@@ -329,7 +327,7 @@ class Offloader:
 
     def _expect(self, kind: Kind, timeout_s: float, size: float, own: Mapping[str, int]) -> Forecast:
         """What a batch is placed by; `own` holds how many of its tasks each site has."""
-        absent = self._absent(kind) if len(own) > 1 else {}
+        absent = absent_sites(self._runners, kind) if len(own) > 1 else {}
         present = {site: count for site, count in own.items() if site not in absent}
         with self._lock:
             memory = self._memories.of(kind, self._runners)

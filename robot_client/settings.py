@@ -12,6 +12,7 @@ from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.learning.store import Store
 from offboard.robot_client.policies import Policy
 from offboard.robot_client.policies.allowance import DUPLICATES, Allowance
+from offboard.robot_client.policies.decision import Named
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.objectives import Mean, Objective
 
@@ -45,9 +46,9 @@ class Settings:
         return Allowance(self.duplicates, self.bytes_a_minute, self.joules_a_minute)
 
     def make_policy(self, name: str) -> Policy:
-        """The policy with this name; caps add the wrapper `budget` to it."""
+        """The policy with this name; caps add the wrapper `budget` to it, but not to its name."""
         capped = self.allowance().capped and "budget" not in name.split(":")
-        return policies.make(f"budget:{name}" if capped else name, self.seed)
+        return Named(policies.make(f"budget:{name}" if capped else name, self.seed), name)
 
     def predictor_for(self, policy: str) -> str:
         """The name of the predictor: the one in these settings, else the one that the policy is meant for."""

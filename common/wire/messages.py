@@ -13,6 +13,7 @@ import msgpack
 
 from offboard.common.errors import BadValue, ProtocolError
 from offboard.common.tasks import NAME_LENGTH_MAX
+from offboard.common.tracebacks import TRACEBACK_LENGTH_MAX, bounded
 from offboard.common.wire.blobs import BlobStore, Buffer, StoredBlob
 from offboard.common.wire.fields import IDLE, TEXT_LENGTH_MAX, Fields
 from offboard.common.wire.values import (
@@ -95,7 +96,8 @@ class Reply:
 
     `server_fault`: the task failed, but the task is not the cause, so another site may answer it. `cpu_s` is
     the CPU time that the server used while the task ran. It is None, and not sent, if the task did not run or
-    if the server is too old to send it. `load` and `capacity` are as in a pong.
+    if the server is too old to send it. `load` and `capacity` are as in a pong. `traceback` is that of a task
+    that raised; an empty one is not sent.
     """
 
     id: int
@@ -110,6 +112,7 @@ class Reply:
     cpu_s: float | None = None
     load: float = 0.0
     capacity: float = 1.0
+    traceback: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +157,11 @@ def pack(message: Message) -> list[Buffer]:
     fields = {field: getattr(message, field) for field in names}
     if isinstance(message, Reply):
         if message.error:
-            fields["error"] = message.error[:ERROR_LENGTH_MAX].encode("utf-8", "replace").decode()
+            fields["error"] = _sendable(message.error[:ERROR_LENGTH_MAX])
+        if message.traceback:
+            fields["traceback"] = _sendable(bounded(message.traceback))
+        else:
+            del fields["traceback"]
         if message.cpu_s is None:
             del fields["cpu_s"]
     if isinstance(message, Reply | Pong):
@@ -173,6 +180,10 @@ def pack(message: Message) -> list[Buffer]:
             f"at most {HEADER_BYTES_MAX} bytes and {FRAMES_MAX} frames are allowed"
         )
     return frames
+
+
+def _sendable(text: str) -> str:
+    return text.encode("utf-8", "replace").decode()
 
 
 def unpack(frames: Sequence[Buffer]) -> Message:
@@ -236,6 +247,7 @@ def _reply(fields: Fields, rest: list[Buffer]) -> Reply:
         cpu_s=fields.seconds("cpu_s") if "cpu_s" in fields.values else None,
         load=fields.share("load"),
         capacity=fields.share("capacity"),
+        traceback=fields.text("traceback", TRACEBACK_LENGTH_MAX) if "traceback" in fields.values else "",
     )
 
 

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from offboard.common.planning.grid_kernels import covered
 from offboard.common.planning.maps import GridMap, passable
 from offboard.common.planning.planner import Plan, scan_hits
+from offboard.common.task_states import TaskStates
+from offboard.common.tasks import kind_of
 from offboard.loadgen.scenario.outcome import Answered
 from offboard.loadgen.scenario.scenario import Workload
 from offboard.robot_client.simulated import answers
@@ -28,19 +30,19 @@ def verified(answered: Sequence[Answered], workload: Workload, seed: int) -> lis
     """
     if not workload.known()["jump"]:
         return list(answered)
-    work, at = make_work(workload.robot(seed)), 0
+    work, states, at = make_work(workload.robot(seed)), TaskStates(workers=1), 0
     found = []
     for one in sorted(answered, key=lambda one: one.i):
         while at < one.i:
             work.advance(None)
             at += 1
-        found.append(replace(one, wrong=None if one.error is not None else _wrong(work, one.answer)))
+        found.append(replace(one, wrong=None if one.error is not None else _wrong(work, states, one.answer)))
     return found
 
 
-def _wrong(work: Work, answer: Mapping[str, Any]) -> str | None:
+def _wrong(work: Work, states: TaskStates, answer: Mapping[str, Any]) -> str | None:
     request = work.request()
-    expected = work.function(*request)
+    expected = states.call(kind_of(work.function), request)
     if isinstance(expected, Plan):
         return wrong_plan(answer, expected, request)
     described = work.describe(expected)

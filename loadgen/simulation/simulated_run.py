@@ -22,6 +22,7 @@ from offboard.robot_client import policies, predictors
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import BOTH
+from offboard.robot_client.policies.decision import Named
 from offboard.robot_client.records.trace import Record, as_dict
 from offboard.robot_client.simulated.run import OwnRecord
 from offboard.robot_client.simulated.workload import CLOSED, due_instants
@@ -91,7 +92,7 @@ class _Run:
         robot = scenario.robot
         self.offload = Offloader(
             [self._testbed.cloud, self._testbed.onboard],
-            policy=policies.make(robot.policy, scenario.seed),
+            policy=Named(policies.make(robot.policy, scenario.seed), robot.policy),
             memories=Memories(
                 partial(predictors.make, plain, robot.window, scenario.seed), shared_work=name != plain
             ),

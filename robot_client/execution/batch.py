@@ -3,7 +3,6 @@
 Which task goes where is decided in `placement`; each task is then run by the offloader as any other.
 """
 
-import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -173,7 +172,7 @@ class Batch:
 
 def arguments(kind: Kind, items: Iterable[Any]) -> list[tuple[Any, ...]]:
     """The arguments of each item: a tuple holds all of them if the function takes several."""
-    parameters = inspect.signature(kind.function).parameters.values()
+    parameters = kind.signature().parameters.values()
     several = len(parameters) > 1 or any(one.kind is one.VAR_POSITIONAL for one in parameters)
     return [kind.bind(item if several and isinstance(item, tuple) else (item,), {}) for item in items]
 

@@ -12,6 +12,7 @@ from offboard.common.errors import BadValue, CloudBroken, CloudError, Overtaken,
 from offboard.common.tasks import Kind, Task
 from offboard.robot_client.policies import Hedge, Probe
 from offboard.robot_client.sites.clock import Clock
+from offboard.robot_client.sites.onboard import OnboardAnswer
 from offboard.robot_client.sites.runner import ONBOARD, Execution, Runner
 
 
@@ -133,7 +134,8 @@ class Race:
         if not keep:
             self._runners[site].cancel(self._task)
         failure = Overtaken("another site answered first")
-        return Execution(site, self._clock.now_s() - began_s, failure=failure, censored=True)
+        setup_s = run.setup_s() if isinstance(run, OnboardAnswer) else 0.0
+        return Execution(site, self._clock.now_s() - began_s - setup_s, failure=failure, censored=True)
 
 
 def answer_of(executions: tuple[Execution, ...]) -> Execution:

@@ -38,7 +38,8 @@ class Decision(NamedTuple):
     """Run the task on `site`; with `both`, on all sites except those in `spared`, in parallel.
 
     `why` is the reason for people, or a function that makes it: few reasons are ever read.
-    `policy` is the name of the rule that decided. `second` is a second run on another site.
+    `policy` names who decided: the rule, or the whole policy once it is `Named`. `second` is a second run on
+    another site.
     """
 
     site: str
@@ -60,6 +61,17 @@ class Policy(Protocol):
     """
 
     def decide(self, forecast: Forecast) -> Decision: ...
+
+
+class Named:
+    """Gives the decisions of a policy the name that the user wrote, such as `hedge:probe:greedy`."""
+
+    def __init__(self, policy: Policy, name: str) -> None:
+        self._policy = policy
+        self._name = name
+
+    def decide(self, forecast: Forecast) -> Decision:
+        return self._policy.decide(forecast)._replace(policy=self._name)
 
 
 def decide_among(sites: Collection[str], forecast: Forecast, policy: Policy) -> Decision:

@@ -3,10 +3,15 @@
 The records are made in `offloader`.
 """
 
+import logging
+from threading import Thread
+from wsgiref.simple_server import WSGIServer
+
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, start_http_server
 
+from offboard.common.errors import ConfigError
 from offboard.robot_client.records.trace import Record
-from offboard.robot_client.sites.runner import Execution
+from offboard.robot_client.sites.runner import PORT_MAX, Execution
 
 SECONDS_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
 
@@ -16,12 +21,16 @@ REGRET = {
     "_high": "Upper end of the 95 % interval of robot_regret_seconds",
 }
 
+log = logging.getLogger(__name__)
+
 
 class Metrics:
     """An observer of the offloader that counts into `registry`."""
 
     def __init__(self, registry: CollectorRegistry) -> None:
         self._registry = registry
+        self._server: WSGIServer | None = None
+        self._thread: Thread | None = None
         self._tasks = Counter(
             "robot_tasks", "Tasks, by the site whose answer was used", ["kind", "site"], registry=registry
         )
@@ -91,5 +100,26 @@ class Metrics:
         self._interval.labels(record.kind, execution.site, inside).inc()
 
     def serve(self, host: str, port: int) -> None:
-        """Answer GET /metrics in a background thread."""
-        start_http_server(port, host, registry=self._registry)
+        """Answer GET /metrics in a background thread until `close`."""
+        self._server, self._thread = start_http_server(port, host, registry=self._registry)
+        log.info("metrics: http://%s:%d/metrics", host, self._server.server_port)
+
+    def close(self) -> None:
+        """Stop serving."""
+        if self._server is not None and self._thread is not None:
+            self._server.shutdown()
+            self._server.server_close()
+            self._thread.join()
+
+
+def serve_metrics(address: str, where: str) -> Metrics:
+    """Metrics that are served at HOST:PORT. A ConfigError, which begins with `where`, if that fails."""
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or int(port) > PORT_MAX:
+        raise ConfigError(f"{where}: {address!r} is not HOST:PORT with a port 0 to {PORT_MAX}")
+    metrics = Metrics(CollectorRegistry())
+    try:
+        metrics.serve(host, int(port))
+    except (OSError, UnicodeError) as error:
+        raise ConfigError(f"{where}: {address} cannot be served: {error}") from error
+    return metrics

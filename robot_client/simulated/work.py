@@ -3,7 +3,6 @@
 When they are asked for is up to `run`; where they run is up to the offloader.
 """
 
-import inspect
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -152,7 +151,7 @@ def _find_task(name: str) -> Callable[..., Any]:
         function = getattr(sys.modules[module], function_name, None)
         if not callable(function):
             raise ConfigError(f"{module} has no function {function_name!r}")
-        inspect.signature(kind_of(function).function).bind(0)
+        kind_of(function).signature().bind(0)
     except (OffloadError, TypeError) as error:
         raise ConfigError(f"--task: {name!r} is not {TASK_ALLOWED}: {error}") from error
     return kind_of(function).function

@@ -1,27 +1,37 @@
 """The runner of the robot's own computer: it runs tasks in threads of this process."""
 
 import contextlib
+import logging
 import os
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from queue import SimpleQueue
+from typing import Any
 
-from offboard.common.errors import OffloadError, Overtaken, TaskFailed, describe
+from offboard.common.errors import OffloadError, Overtaken, TaskFailed, Unwanted, describe
 from offboard.common.host import cpu_time
 from offboard.common.host.cgroup import SELF
 from offboard.common.host.load import LOADED, Load
 from offboard.common.host.load_watch import LoadWatch
+from offboard.common.task_states import TaskStates
 from offboard.common.tasks import Kind, Task
 from offboard.common.threads import join_all
+from offboard.common.tracebacks import traceback_of
 from offboard.common.wanted import call_while
 from offboard.robot_client.sites.own_cpu import OWN_CPU
 from offboard.robot_client.sites.runner import ONBOARD, Condition, Execution
 
 ABANDONED_MAX = 4  # cancelled runs that go on at the same time
 ABANDONED_NICE = 10  # their niceness: a tenth of the CPU time of a task with niceness 0 (sched(7))
-CLOSE_WAIT_S = 1.0  # for the runs that go on when the runner is closed
+# For the runs that go on when the runner is closed: a task takes a second or two, an abandoned one longer, at
+# its low priority. A longer wait would only delay the end of a robot whose task hangs.
+CLOSE_WAIT_S = 5.0
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(eq=False, slots=True)
@@ -29,21 +39,38 @@ class _Run:
     """One run of a task.
 
     thread: native id of the thread that runs it; None while it waits in the queue.
-    abandoned: it was cancelled while it ran, and goes on.
+    wanted: false once it was cancelled.
+    abandoned: it was cancelled while it ran, and goes on without a place among the workers.
     """
 
     task: Task
     published_s: float
-    future: "Future[Execution]" = field(default_factory=Future)
+    future: "OnboardAnswer"
     thread: int | None = None
+    wanted: bool = True
     abandoned: bool = False
+
+
+class OnboardAnswer(Future[Execution]):
+    """The future of a run, which knows how much of the time so far went into setups."""
+
+    def __init__(self, states: TaskStates, published_s: float) -> None:
+        super().__init__()
+        self._states = states
+        self._published_s = published_s
+
+    def setup_s(self) -> float:
+        return self._states.setup_s(self._published_s, time.perf_counter())
 
 
 class OnboardRunner:
     """Runs at most `workers` tasks at a time. The seconds of a task include its wait in the queue.
 
     Python cannot stop a thread. So a run that is cancelled is abandoned: it goes on at a low priority until
-    it ends or calls `check_wanted`, and a new thread takes its place.
+    it ends or calls `check_wanted`, and a new thread takes its place. But a kind with a setup has one state
+    per worker, so its run keeps state and place, and the next task waits until it ends.
+
+    A setup runs when its kind first runs here, or in `prepare`. No time of a task includes it.
     """
 
     site = ONBOARD
@@ -55,6 +82,8 @@ class OnboardRunner:
         self._threads = 0  # without those of abandoned runs
         self._started: list[threading.Thread] = []  # all that have not ended, and a few that have
         self._abandoned = 0
+        self._states = TaskStates(workers)
+        self._preparing: dict[str, Future[None]] = {}  # by kind
         self._closed = False
         self._lock = threading.Lock()
         self._load = LoadWatch(Load(SELF), pause_s=OWN_CPU.pause_s)
@@ -64,7 +93,8 @@ class OnboardRunner:
         return None
 
     def submit(self, task: Task, budget_s: float) -> "Future[Execution]":  # noqa: ARG002 - a thread cannot be stopped
-        run = _Run(task, time.perf_counter())
+        published_s = time.perf_counter()
+        run = _Run(task, published_s, OnboardAnswer(self._states, published_s))
         with self._lock:
             if self._closed:
                 raise OffloadError("the onboard runner is closed")
@@ -75,18 +105,34 @@ class OnboardRunner:
         return run.future
 
     def cancel(self, task: Task) -> None:
-        """Remove the task from the queue, or abandon its run; past ABANDONED_MAX a run is left alone."""
+        """Remove the task from the queue, or let its run stop early; past ABANDONED_MAX it is left alone."""
         with self._lock:
             run = self._runs.get(task.id)
-            if run is None or run.abandoned or (run.thread is not None and self._abandoned == ABANDONED_MAX):
+            if run is None or not run.wanted:
                 return
             if run.thread is None:
                 del self._runs[task.id]
+            elif task.kind.setup is not None:
+                run.wanted = False
+                return
+            elif self._abandoned == ABANDONED_MAX:
+                return
             else:
                 self._abandon(run, run.thread)
-        failure = Overtaken("another site answered first")
-        seconds, started = time.perf_counter() - run.published_s, run.thread is not None
-        run.future.set_result(Execution(ONBOARD, seconds, failure=failure, censored=True, started=started))
+        run.future.set_result(_overtaken(run, started=run.thread is not None))
+
+    def prepare(self, kind: Kind) -> "Future[None]":
+        """Begin the setup of a kind in each worker, unless it was made. The future may hold TaskFailed."""
+        with self._lock:
+            known = self._preparing.get(kind.name)
+            if known is not None and (not known.done() or known.exception() is None):
+                return known
+            prepared = self._preparing[kind.name] = Future[None]()
+            if self._closed or self._states.ready(kind):
+                prepared.set_result(None)
+            else:
+                self._start(partial(self._prepare, kind, prepared))
+        return prepared
 
     def hurry(self) -> None:
         self._load.hurry()
@@ -113,21 +159,42 @@ class OnboardRunner:
                 self._queue.put(None)
         for run in waiting:
             run.future.cancel()
-        join_all(self._started, CLOSE_WAIT_S)
+        if count := join_all(self._started, CLOSE_WAIT_S):
+            log.warning(
+                "%s: %d of its threads still run a task %g s after the close; if that is native code, "
+                "it may crash when the process ends",
+                ONBOARD,
+                count,
+                CLOSE_WAIT_S,
+            )
 
     def _start_thread(self) -> None:
         self._threads += 1
-        thread = threading.Thread(target=self._work, name=ONBOARD, daemon=True)
+        self._start(self._work)
+
+    def _start(self, target: Callable[[], None]) -> None:
+        thread = threading.Thread(target=target, name=ONBOARD, daemon=True)
         thread.start()
         self._started = [*(other for other in self._started if other.is_alive()), thread]
 
     def _abandon(self, run: _Run, thread: int) -> None:
-        run.abandoned = True
+        run.wanted, run.abandoned = False, True
         self._abandoned += 1
         with contextlib.suppress(OSError, AttributeError):  # on systems without priorities for threads
             os.setpriority(os.PRIO_PROCESS, thread, ABANDONED_NICE)
         self._threads -= 1
         self._start_thread()
+
+    def _prepare(self, kind: Kind, prepared: "Future[None]") -> None:
+        OWN_CPU.begin()
+        try:
+            self._states.prepare(kind)
+        except TaskFailed as failure:
+            prepared.set_exception(failure)
+        else:
+            prepared.set_result(None)
+        finally:
+            OWN_CPU.end(time.perf_counter())
 
     def _work(self) -> None:
         """Run tasks until a run is abandoned or the runner is closed. Each thread does this."""
@@ -136,7 +203,7 @@ class OnboardRunner:
                 if self._runs.get(run.task.id) is not run:  # cancelled, or closed
                     continue
                 run.thread = threading.get_native_id()
-            execution = _run(run)
+            execution = _run(run, self._states)
             with self._lock:
                 del self._runs[run.task.id]
                 if run.abandoned:
@@ -145,27 +212,48 @@ class OnboardRunner:
             run.future.set_result(execution)
 
 
-def _run(run: _Run) -> Execution:
-    cpu_before_s, started_s = cpu_time.used_s(), time.perf_counter()
-    value, failure = None, None
+def _run(run: _Run, states: TaskStates) -> Execution:
     OWN_CPU.begin()
     try:
-        value = call_while(lambda: not run.abandoned, run.task.kind.function, run.task.args)
+        with states.lend(run.task.kind) as state:
+            if not run.wanted:  # cancelled during the setup
+                return _overtaken(run, started=False)
+            return _call(run, state, states)
+    except TaskFailed as failure:  # of the setup
+        seconds = time.perf_counter() - run.published_s - run.future.setup_s()
+        return Execution(ONBOARD, seconds, failure=failure, queue_s=seconds, network_s=0.0, started=False)
+    finally:
+        OWN_CPU.end(time.perf_counter())
+
+
+def _call(run: _Run, state: tuple[Any, ...], states: TaskStates) -> Execution:
+    cpu_before_s, started_s = cpu_time.used_s(), time.perf_counter()
+    value, failure = None, None
+    try:
+        value = call_while(lambda: run.wanted, run.task.kind.function, (*state, *run.task.args))
     except BaseException as error:  # noqa: BLE001 - anything that the function raises is the task's failure
-        failure = TaskFailed(describe(error))
+        failure = TaskFailed(describe(error), traceback_of(error))
         failure.__cause__ = error
+        if isinstance(error, Unwanted) and not run.wanted:
+            return _overtaken(run, started=True)
     cpu_s = cpu_time.used_s() - cpu_before_s
     # Reading the CPU time makes the kernel charge this thread. A thread that has used more than its quota is
     # then stopped for a while, and the caller waits for that too.
     ended_s = time.perf_counter()
-    OWN_CPU.end(ended_s)
+    setup_s = states.setup_s(run.published_s, started_s)
     return Execution(
         ONBOARD,
-        ended_s - run.published_s,
+        ended_s - run.published_s - setup_s,
         value,
         failure,
-        queue_s=started_s - run.published_s,
+        queue_s=started_s - run.published_s - setup_s,
         run_s=ended_s - started_s,
         network_s=0.0,
         cpu_s=cpu_s,
     )
+
+
+def _overtaken(run: _Run, *, started: bool) -> Execution:
+    seconds = time.perf_counter() - run.published_s - run.future.setup_s()
+    failure = Overtaken("another site answered first")
+    return Execution(ONBOARD, seconds, failure=failure, censored=True, started=started)

@@ -88,7 +88,6 @@ class PendingRequest:
 
 
 _FAILURES: dict[str, Callable[[str], OffloadError]] = {
-    "failed": TaskFailed,
     "busy": CloudBusy,
     "expired": CloudBusy,
     "unknown_task": CloudBroken,
@@ -98,5 +97,7 @@ _FAILURES: dict[str, Callable[[str], OffloadError]] = {
 def _failure(reply: wire.Reply) -> OffloadError | None:
     if reply.status == "ok":
         return None
-    failure = CloudBroken if reply.server_fault else _FAILURES[reply.status]
-    return failure(reply.error or reply.status)
+    text = reply.error or reply.status
+    if reply.status == "failed" and not reply.server_fault:
+        return TaskFailed(text, reply.traceback)
+    return (CloudBroken if reply.server_fault else _FAILURES[reply.status])(text)

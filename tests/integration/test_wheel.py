@@ -162,6 +162,6 @@ def test_a_task_whose_source_differs_stays_onboard(installed: Path, server: str,
     (other / "mytasks.py").write_text(TASKS.replace("range(2, limit)", "range(2, limit + 1)"))
     (other / "program.py").write_text(CHANGED)
     output = run(installed / "python", "program.py", server, cwd=other)
-    assert "{'cloud': 'the source of task count_primes differs on the server'}" in output
+    assert "cloud: the source of task count_primes differs on the server" in output
     assert "[25, 25, 25] onboard" in output
     assert output.count("this task stays onboard") == 1

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from offboard.common.errors import BadValue, ProtocolError
+from offboard.common.tracebacks import TRACEBACK_LENGTH_MAX
 from offboard.common.wire import messages as wire
 from offboard.common.wire.messages import Blob, Cancel, Hello, Ping, Pong, Reply, Request
 from tests.wire_values import Pose, Positive, mutate
@@ -69,6 +70,17 @@ def test_the_cpu_time_of_a_reply_is_optional() -> None:
     reply = wire.unpack([msgpack.packb([1, "reply", REPLY]), b"\xc0"])
     assert isinstance(reply, Reply)
     assert reply.cpu_s is None
+
+
+def test_the_traceback_of_a_reply_is_optional() -> None:
+    """An empty one is not sent, a long one loses its beginning, and an older server sends none."""
+    assert b"traceback" not in wire.pack(Reply(7, "busy"))[0]
+    reply = wire.unpack([msgpack.packb([1, "reply", REPLY]), b"\xc0"])
+    assert isinstance(reply, Reply)
+    assert reply.traceback == ""
+    long = wire.unpack(wire.pack(Reply(7, "failed", "why", traceback="\udc80" + "ä" * 9_000 + "end")))
+    assert isinstance(long, Reply)
+    assert long.traceback == "..." + "ä" * (TRACEBACK_LENGTH_MAX - 6) + "end"
 
 
 def test_a_server_without_load_and_capacity_is_idle() -> None:

@@ -142,8 +142,9 @@ def test_cancelling_an_unknown_or_finished_task_does_nothing(runner: OnboardRunn
     runner.cancel(call(2))
 
 
-def test_closing_cancels_the_queue(runner: OnboardRunner) -> None:
+def test_closing_cancels_the_queue(runner: OnboardRunner, monkeypatch: pytest.MonkeyPatch) -> None:
     """The task that runs ends, those in the queue are cancelled, and new tasks are refused."""
+    monkeypatch.setattr(onboard, "CLOSE_WAIT_S", 0.05)
     runs, waits = runner.submit(call(1), 1.0), runner.submit(call(2), 1.0)
     until_begun(1)
     runner.close()
@@ -171,13 +172,31 @@ def test_after_closing_no_thread_is_left_that_could_end() -> None:
         assert {thread.name for thread in set(threading.enumerate()) - before} <= {"load"}
 
 
-def test_closing_has_a_limit(runner: OnboardRunner, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A task that does not end within CLOSE_WAIT_S is left running."""
+def test_closing_has_a_limit(
+    runner: OnboardRunner, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A task that does not end within CLOSE_WAIT_S is left running, and the log says so."""
     monkeypatch.setattr(onboard, "CLOSE_WAIT_S", 0.05)
     runs = runner.submit(call(1), 1.0)
     until_begun(1)
     runner.close()
     assert not runs.done()
+    assert "1 of its threads still run a task 0.05 s after the close" in caplog.text
+
+
+def test_closing_waits_for_abandoned_runs(runner: OnboardRunner) -> None:
+    """They may run native code, which must not go on while the process ends."""
+    one = call(1)
+    runner.submit(one, 1.0)
+    until_begun(1)
+    runner.cancel(one)
+    closing = threading.Thread(target=runner.close)
+    closing.start()
+    closing.join(0.05)
+    assert closing.is_alive()
+    gate.open.set()
+    closing.join(WAIT_S)
+    assert not closing.is_alive()
 
 
 @pytest.mark.usefixtures("runner")

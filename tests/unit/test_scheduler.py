@@ -1,6 +1,9 @@
-"""Requests that have cost too many workers."""
+"""Requests that have cost too many workers, and the log of failed tasks."""
 
-from offboard.cloud_server.scheduler import CRASHED_KEPT, CRASHES_MAX, CrashCount
+import pytest
+
+from offboard.cloud_server.scheduler import CRASHED_KEPT, CRASHES_MAX, FAILURES_KEPT, CrashCount, FailureLog
+from offboard.cloud_server.task_run import Outcome
 
 
 def test_a_request_is_refused_after_its_last_crash() -> None:
@@ -26,3 +29,18 @@ def test_the_memory_of_crashes_is_limited() -> None:
     crashes.note(b"robot", 0)
     assert len(crashes) == CRASHED_KEPT
     assert [crashes.too_many(b"robot", id) for id in (1, 2)] == [True, False]
+
+
+def test_a_failure_is_logged_once_for_each_kind_and_type(caplog: pytest.LogCaptureFixture) -> None:
+    """The warning has the traceback. Failures without one are not logged, and the memory is limited."""
+    failures = FailureLog()
+    for kind, error in [("plan", "ValueError: 1"), ("plan", "ValueError: 2"), ("plan", "OSError: 3")]:
+        failures.note(kind, Outcome("failed", error, traceback=f"Traceback\n{error}\n"))
+    failures.note("see", Outcome("failed", "the worker died"))
+    assert [record.getMessage() for record in caplog.records] == [
+        "task plan failed; its next failures with ValueError are not logged\nTraceback\nValueError: 1",
+        "task plan failed; its next failures with OSError are not logged\nTraceback\nOSError: 3",
+    ]
+    for number in range(2 * FAILURES_KEPT):
+        failures.note("plan", Outcome("failed", f"Error{number}: made up", traceback="Traceback"))
+    assert len(caplog.records) == FAILURES_KEPT

@@ -11,8 +11,11 @@ from offboard import Offloader, Settings
 from offboard.common.errors import ConfigError
 from offboard.common.tasks import task
 from offboard.robot_client.policies import Hedge, Outlook, Probe
+from offboard.robot_client.sites.onboard import OnboardRunner
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
+from tests.fakes import ScriptedRunner
 
-PARAMETERS_MAX = 8
+PARAMETERS_MAX = {"__init__": 8, "connect": 10}
 
 
 @task("settings_echo", size=lambda number: number)
@@ -23,7 +26,7 @@ def echo(number: int) -> int:
 @pytest.mark.parametrize("build", [Offloader.__init__, Offloader.connect], ids=["Offloader", "connect"])
 def test_an_offloader_is_built_with_few_parameters(build: Any) -> None:
     """Rare options are in Settings, so that the common ones are easy to see."""
-    assert len(inspect.signature(build).parameters.keys() - {"self"}) <= PARAMETERS_MAX
+    assert len(inspect.signature(build).parameters.keys() - {"self"}) <= PARAMETERS_MAX[build.__name__]
 
 
 @pytest.mark.parametrize(
@@ -49,6 +52,24 @@ def test_each_allowance_is_a_fresh_one() -> None:
     first.spend(900.0, 0.0)
     assert (first.bytes_left, second.bytes_left) == (100.0, 1000.0)
     assert not Settings().allowance().capped
+
+
+@pytest.mark.parametrize("name", ["default", "hedge:probe:greedy", "paper"])
+def test_a_record_has_the_policy_as_the_user_named_it(name: str) -> None:
+    """This holds with caps too. Pinned calls, batches and robots without a server have names of their own."""
+    settings, policies = Settings(bytes_a_minute=1e9), list[str]()
+    cloud = ScriptedRunner(CLOUD, lambda one: Execution(CLOUD, 0.01, one.args[0]))
+    for sites in ([cloud], []):
+        with Offloader(
+            [*sites, OnboardRunner()],
+            policy=settings.make_policy(name),
+            memories=settings.make_memories(name, 5),
+            observers=[lambda record: policies.append(record.decision.policy)],
+        ) as offload:
+            offload(echo, 1)
+            offload(echo, 1, where=ONBOARD)
+            offload.map(echo, [1])
+    assert policies == [name, "pinned", "map", "none", "pinned", "none"]
 
 
 def test_connect_uses_its_settings(tmp_path: Path) -> None:

@@ -133,6 +133,11 @@ def test_calls_get_whole_sizes() -> None:
     assert all(type(size) is int for (size,) in found)
 
 
+def test_a_task_with_a_setup_is_called_with_its_size_alone() -> None:
+    """Its first parameter is not for callers, so `robot-client call` takes it as a task of one number."""
+    assert calls("constant:2", task="tests.stateful_tasks:engine_twice").request() == (2,)
+
+
 def test_the_seed_decides_the_calls() -> None:
     """One seed always gives the same sizes, and seeds differ."""
 

@@ -11,9 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from offboard import Offloader
 from offboard.cloud_server.executors import EXECUTORS
 from offboard.common import VERSION
+from offboard.common.errors import TaskFailed
 from offboard.common.host.load import LOADED
+from offboard.common.tasks import kind_named
 from offboard.common.wire import messages as wire
 from offboard.common.wire.messages import Cancel, Hello, Ping, Pong
 from tests.integration.server.peers import WAIT_S, Join, Serve, until
@@ -43,11 +46,29 @@ def test_failed_and_unknown_tasks_are_answered(serve: Serve, join: Join, executo
     peer_reply = peer.reply()
     assert (peer_reply.id, peer_reply.status) == (1, "failed")
     assert peer_reply.error == "ValueError: no such place"
+    assert peer_reply.traceback.splitlines()[-1] == "ValueError: no such place"
     assert peer_reply.cpu_s > 0
     peer.request(2, "never_heard_of")
     reply = peer.reply()
     assert (reply.id, reply.status, reply.cpu_s) == (2, "unknown_task", None)
     assert running.counted("requests_total", kind="unknown", status="unknown_task") == 1
+
+
+@pytest.mark.parametrize("where", ["cloud", "onboard"])
+@pytest.mark.parametrize("executor", sorted(EXECUTORS))
+def test_a_failed_task_comes_with_its_traceback(serve: Serve, executor: str, where: str) -> None:
+    """It begins in the function of the task; the error itself keeps its text."""
+    running, function = serve(executor), kind_named("served_raise").function
+    with Offloader.connect(running.server.endpoint) as offload:
+        assert not offload.wait_for_sites(function, WAIT_S)
+        with pytest.raises(TaskFailed) as caught:
+            offload(function, "no such place", where=where)
+    assert str(caught.value) == "ValueError: no such place"
+    first, place, *_, last = caught.value.traceback.splitlines()
+    assert first == "Traceback (most recent call last):"
+    assert "served_tasks.py" in place
+    assert "in served_raise" in place
+    assert last == "ValueError: no such place"
 
 
 def test_hello_and_ping_are_answered(serve: Serve, join: Join) -> None:

@@ -1,0 +1,129 @@
+"""Owns what `@task(setup=...)` makes, such as a model: one state for each kind and worker.
+
+Runners and executors decide which thread or process runs a task, and when a state is made.
+"""
+
+import threading
+import time
+from collections import Counter, defaultdict, deque
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+from offboard.common.errors import TaskFailed, describe
+from offboard.common.tasks import Kind
+from offboard.common.tracebacks import traceback_of
+
+SETUPS_MAX = 64  # setups whose times are remembered: more than the tasks of one queue can wait for
+
+_NOTHING: AbstractContextManager[tuple[Any, ...]] = nullcontext(())  # shared: most kinds have no setup
+
+
+@dataclass(eq=False, slots=True)
+class _Setup:
+    began_s: float
+    ended_s: float = float("inf")
+
+
+class TaskStates:
+    """The states of `workers` workers, which run one task each at a time. Any thread may call any method.
+
+    A state serves one task at a time. The next task may use it in another thread.
+    """
+
+    def __init__(self, workers: int) -> None:
+        self._workers = workers
+        self._free: defaultdict[str, list[Any]] = defaultdict(list)  # by kind, as the next two
+        self._made: Counter[str] = Counter()  # with those that are being made
+        self._making: Counter[str] = Counter()
+        self._setups: deque[_Setup] = deque(maxlen=SETUPS_MAX)
+        self._changed = threading.Condition()
+
+    def prepare(self, kind: Kind) -> None:
+        """Make the missing states of a kind, one after the other. TaskFailed if its setup raises."""
+        while kind.setup is not None and not self.ready(kind):
+            with self._changed:
+                if self._made[kind.name] == self._workers:
+                    self._changed.wait()  # another thread makes the last one
+                    continue
+                self._reserve(kind)
+            self._give_back(kind, self._make(kind))
+
+    def ready(self, kind: Kind) -> bool:
+        """Whether each worker has its state of this kind."""
+        name = kind.name
+        with self._changed:
+            return kind.setup is None or (self._made[name] == self._workers and not self._making[name])
+
+    def lend(self, kind: Kind) -> AbstractContextManager[tuple[Any, ...]]:
+        """The arguments that come before those of the caller: a state, or nothing if the kind has no setup.
+
+        If no state is free, it is made now, or else the call waits for one. TaskFailed if the setup raises.
+        """
+        return _NOTHING if kind.setup is None else self._lent(kind)
+
+    @contextmanager
+    def _lent(self, kind: Kind) -> Iterator[tuple[Any, ...]]:
+        state = self._take(kind)
+        try:
+            yield (state,)
+        finally:
+            self._give_back(kind, state)
+
+    def call(self, kind: Kind, args: Sequence[Any]) -> Any:
+        """Call the function of a kind directly."""
+        with self.lend(kind) as state:
+            return kind.function(*state, *args)
+
+    def setup_s(self, since_s: float, until_s: float) -> float:
+        """The part of this time in which a setup ran, in seconds. The clock is `time.perf_counter`."""
+        if not self._setups:
+            return 0.0
+        total_s, counted_s = 0.0, since_s
+        with self._changed:
+            setups = sorted(self._setups, key=lambda setup: setup.began_s)
+        for setup in setups:
+            began_s, ended_s = max(setup.began_s, counted_s), min(setup.ended_s, until_s)
+            if ended_s > began_s:
+                total_s, counted_s = total_s + ended_s - began_s, ended_s
+        return total_s
+
+    def _take(self, kind: Kind) -> Any:
+        with self._changed:
+            while not self._free[kind.name]:
+                if self._made[kind.name] < self._workers:
+                    self._reserve(kind)
+                    break
+                self._changed.wait()
+            else:
+                return self._free[kind.name].pop()
+        return self._make(kind)
+
+    def _reserve(self, kind: Kind) -> None:
+        self._made[kind.name] += 1
+        self._making[kind.name] += 1
+
+    def _make(self, kind: Kind) -> Any:
+        assert kind.setup is not None
+        setup, made = _Setup(time.perf_counter()), False
+        with self._changed:
+            self._setups.append(setup)
+        try:
+            state = kind.setup()
+            made = True
+        except BaseException as error:
+            text = f"setup of task {kind.name}: {describe(error)}"
+            raise TaskFailed(text, traceback_of(error, TaskStates._make)) from error
+        finally:
+            setup.ended_s = time.perf_counter()
+            with self._changed:
+                self._making[kind.name] -= 1
+                self._made[kind.name] -= not made
+                self._changed.notify_all()
+        return state
+
+    def _give_back(self, kind: Kind, state: Any) -> None:
+        with self._changed:
+            self._free[kind.name].append(state)
+            self._changed.notify_all()

@@ -1,0 +1,51 @@
+"""The trace and the metrics that an offloader writes by itself, and how observers get a record.
+
+What is written is in `trace` and `metrics`.
+"""
+
+import logging
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
+from pathlib import Path
+
+from offboard.robot_client.records.trace import Record, Trace
+
+Observer = Callable[[Record], None]
+
+log = logging.getLogger(__name__)
+
+
+class Recording:
+    """A trace file and an address for metrics, both optional, open until `close`.
+
+    trace: the file that records are appended to.
+    metrics: HOST:PORT where Prometheus reads `/metrics`.
+    """
+
+    def __init__(self, *, trace: Path | str | None, metrics: str | None) -> None:
+        self.observers: tuple[Observer, ...] = ()
+        with ExitStack() as opened:
+            if trace is not None:
+                file = Trace(Path(trace))
+                opened.callback(file.close)
+                self.observers += (file.write,)
+            if metrics is not None:
+                from offboard.robot_client.records.metrics import serve_metrics  # only where it is wanted
+
+                served = serve_metrics(metrics, "metrics")
+                opened.callback(served.close)
+                self.observers += (served,)
+            self._opened = opened.pop_all()
+
+    def close(self) -> None:
+        """Write the waiting records, and stop serving metrics. Safe to call twice."""
+        self._opened.close()
+
+
+def tell(observers: Iterable[Observer], record: Record) -> None:
+    """Call each observer. One that fails must not cost the caller its answer."""
+    for observe in observers:
+        try:
+            observe(record)
+        except Exception:  # an observer is the user's own code
+            log.exception("observer %r failed on task %d", observe, record.i)

@@ -1,0 +1,61 @@
+"""The trace and the metrics that `Offloader.connect` keeps by itself."""
+
+import logging
+import re
+import threading
+import urllib.request
+from pathlib import Path
+from urllib.error import URLError
+
+import pytest
+
+from offboard import ConfigError, Offloader
+from offboard.robot_client.records import trace
+from tests.probes import echo
+
+pytestmark = pytest.mark.integration
+
+
+def test_an_offloader_serves_metrics_and_writes_a_trace_until_it_is_closed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Both have every task. After the close the port is free and the file complete; closing twice is safe."""
+    caplog.set_level(logging.INFO, logger="offboard.robot_client")
+    path, before = tmp_path / "new" / "trace.jsonl", threading.active_count()
+    with Offloader.connect(metrics="127.0.0.1:0", trace=str(path)) as offload:
+        assert [offload(echo, number) for number in range(3)] == [0, 1, 2]
+        found = re.search(r"metrics: (http://127\.0\.0\.1:(\d+)/metrics)", caplog.text)
+        assert found is not None
+        text = urllib.request.urlopen(found[1], timeout=5).read().decode()
+        assert 'robot_tasks_total{kind="echo",site="onboard"} 3.0' in text
+    offload.close()
+    assert [record["i"] for record in trace.read(path)] == [0, 1, 2]
+    with pytest.raises(URLError):
+        urllib.request.urlopen(found[1], timeout=5)
+    with Offloader.connect(metrics=f"127.0.0.1:{found[2]}", trace=path) as again:
+        again(echo)
+    assert len(list(trace.read(path))) == 4
+    names = {thread.name for thread in threading.enumerate()} - {"load"}
+    assert threading.active_count() <= before + 1, names
+
+
+@pytest.mark.parametrize(
+    ("metrics", "error"),
+    [
+        ("9100", "metrics: '9100' is not HOST:PORT with a port 0 to 65535"),
+        ("127.0.0.1:99999", "metrics: '127.0.0.1:99999' is not HOST:PORT"),
+        ("192.0.2.1:9100", "metrics: 192.0.2.1:9100 cannot be served: "),
+    ],
+)
+def test_a_bad_address_of_metrics_is_named(tmp_path: Path, metrics: str, error: str) -> None:
+    """The trace that was opened before is closed again."""
+    with pytest.raises(ConfigError, match=re.escape(error)):
+        Offloader.connect(metrics=metrics, trace=tmp_path / "trace.jsonl")
+    assert "trace" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_a_wrong_endpoint_closes_trace_and_metrics(tmp_path: Path) -> None:
+    """Nothing is left open after a ConfigError."""
+    with pytest.raises(ConfigError, match="is not tcp://HOST:PORT"):
+        Offloader.connect("cloud:5555", metrics="127.0.0.1:0", trace=tmp_path / "trace.jsonl")
+    assert "trace" not in {thread.name for thread in threading.enumerate()}

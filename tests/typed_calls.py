@@ -1,0 +1,38 @@
+"""Calls of an offloader, with the types that a type checker must see. Mypy reads this file; it never runs."""
+
+from typing import Any, assert_type
+
+from offboard import Offloader, TaskFailed, task
+
+
+class Detector:
+    """Stands for a model."""
+
+
+@task("typed_count", size=lambda limit: limit)
+def count(limit: int, scale: float = 1.0) -> str:
+    return str(limit * scale)
+
+
+@task("typed_detect", size=lambda frame: len(frame), setup=Detector)
+def detect(detector: Detector, frame: bytes) -> list[int]:
+    assert detector
+    return list(frame)
+
+
+def untyped(limit):  # type: ignore[no-untyped-def]
+    return limit
+
+
+async def calls(offload: Offloader) -> None:
+    assert_type(offload(count, 5), str)
+    assert_type(offload(count, 5, scale=2.0, where="cloud", timeout_s=1.0), str)
+    assert_type(offload(detect, b"frame"), list[int])
+    assert_type(offload(untyped, 5), Any)
+    assert_type(offload.map(count, [1, (2, 3.0)]), list[str])
+    assert_type(offload.map(detect, [b"frame"], where="both"), list[list[int]])
+    assert_type(await offload.run(count, 5, where="onboard"), str)
+    assert_type(await offload.run(detect, b"frame"), list[int])
+    assert_type(count(5), str)
+    assert_type(detect(Detector(), b"frame"), list[int])
+    assert_type(TaskFailed("why").traceback, str)
