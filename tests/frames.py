@@ -33,10 +33,10 @@ def same(a: Any, b: Any) -> bool:
 
 
 def frames(seed: int) -> Iterator[Frame]:
-    """Endless frames, each one the only argument."""
+    """Endless frames, dark and bright ones, each one the only argument."""
     random = np.random.default_rng(seed)
     while True:
-        yield random.integers(0, 255, SHAPE, np.uint8)
+        yield random.integers(0, random.integers(50, 255), SHAPE, np.uint8)
 
 
 def with_gain(seed: int) -> list[tuple[Frame, float]]:

@@ -227,6 +227,14 @@ def test_what_cannot_be_simulated_is_refused(read: Callable[..., Scenario], text
         check_simulated(read(text))
 
 
+def test_inputs_are_not_simulated(read: Callable[..., Scenario]) -> None:
+    """A scenario with inputs is refused before its modules are loaded."""
+    workload = replace(read().workload, task="no_module:f", sizes=(), inputs="no_module:inputs")
+    said = "^scenario small cannot be simulated: the costs of task no_module:f are not known"
+    with pytest.raises(ConfigError, match=said):
+        check_simulated(replace(read(), workload=workload))
+
+
 def test_a_task_of_unknown_cost_is_refused(read: Callable[..., Scenario]) -> None:
     """The error lists the tasks whose costs are known."""
     workload = replace(read().workload, task="tests.probes:zeros")
