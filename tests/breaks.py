@@ -6,9 +6,11 @@ Run as a program, this is a planning server that gives wrong answers, or leaks m
 import os
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from offboard.common.tasks import Kind, kinds, load_modules
 from offboard.loadgen.scenario.event_timeline import Event
@@ -47,10 +49,14 @@ BREAKS: dict[str, tuple[Callable[[Scenario], Scenario], str | None]] = {
 
 
 def lie(answer: Any) -> Any:
-    """A wrong answer of the right type."""
+    """A wrong answer of the right type: reversed bytes and arrays, or a list without its first item."""
     if isinstance(answer, bytes):
         return answer[::-1]
-    return replace(answer, cells=answer.cells[::-1].copy(), metres=answer.metres[::-1].copy())
+    if isinstance(answer, list):
+        return answer[1:]
+    values = {field.name: getattr(answer, field.name) for field in fields(answer)}
+    arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+    return replace(answer, **{name: value[::-1].copy() for name, value in arrays.items()})
 
 
 def leak(answer: Any) -> Any:
