@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from offboard.common.errors import ConfigError, OffloadError, describe
+from offboard.common.errors import ConfigError, MissingExtra, OffloadError, describe
 from offboard.common.tasks import Kind, kind_of, load_modules
 from offboard.robot_client.simulated import answers
 from offboard.robot_client.simulated.config import CallConfig
@@ -94,6 +94,8 @@ def _find_task(name: str, allowed: str) -> Callable[..., Any]:
     try:
         function = _find(name)
         kind = kind_of(function)
+    except MissingExtra:
+        raise
     except OffloadError as error:
         raise ConfigError(f"--task: {name!r} is not {allowed}: {error}") from error
     return kind.function
@@ -116,6 +118,8 @@ def _inputs(config: CallConfig, name: str, kind: Kind) -> Iterator[Arguments]:
     try:
         function = _find(name)
         inspect.signature(function).bind(config.seed)
+    except MissingExtra:
+        raise
     except (OffloadError, TypeError, ValueError) as error:
         raise ConfigError(f"{flag} is not {NAMED} with a function of the seed: {error}") from error
     return _checked(_made(flag, function, config.seed), flag, kind, needed)
@@ -155,11 +159,16 @@ def _checked(given: Iterator[Any], flag: str, kind: Kind, needed: int) -> Iterat
 
 
 def _find(name: str) -> Callable[..., Any]:
-    """The function that MODULE:FUNCTION names; a ConfigError says why there is none."""
+    """The function that MODULE:FUNCTION names. A ConfigError says why there is none, or what to install."""
     module, _, function_name = name.partition(":")
     if not (module and function_name):
         raise ConfigError("one of the two is missing")
-    load_modules([module])
+    try:
+        load_modules([module])
+    except ConfigError as error:
+        if isinstance(error.__cause__, MissingExtra):  # its text says what to install
+            raise error.__cause__ from None
+        raise
     function = getattr(sys.modules[module], function_name, None)
     if not callable(function):
         raise ConfigError(f"{module} has no function {function_name!r}")

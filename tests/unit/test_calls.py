@@ -74,6 +74,20 @@ def test_what_is_wrong_with_inputs_is_one_line(inputs: str, error: type[OffloadE
     assert error is ConfigError or isinstance(caught.value.__cause__, OSError)
 
 
+@pytest.mark.parametrize("missing", ["task", "inputs"])
+def test_a_missing_library_is_one_short_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: str
+) -> None:
+    """A module that raises MissingExtra when it is imported names the extra, and nothing else."""
+    raising = 'from offboard.common.errors import MissingExtra\nraise MissingExtra("tags", "apriltags")\n'
+    (tmp_path / "needy_module.py").write_text(raising)
+    monkeypatch.syspath_prepend(tmp_path)
+    named = {"task": "tests.frames:brightness", "inputs": "tests.frames:frames"}
+    with pytest.raises(ConfigError) as caught:
+        make_calls(CallConfig(**named | {missing: "needy_module:f"}))  # type: ignore[arg-type]
+    assert str(caught.value) == "tags needs the extra 'apriltags': pip install 'offboard[apriltags]'"
+
+
 def test_exactly_as_many_inputs_as_tasks_are_enough() -> None:
     """The inputs may end with the last task."""
     assert len(drawn(calls("with_gain", tasks=3), 3)) == 3
