@@ -83,5 +83,6 @@ if __name__ == "__main__":
     load_modules(modules.split(","))
     for one in kinds():
         _break(one, {"lie": lie, "leak": leak}[how])
-    sys.argv[1:] = flags
+    # Threads use the broken tasks of this process; worker processes would load the right ones.
+    sys.argv[1:] = [flag for flag in flags if not flag.startswith("--executor=")]
     sys.exit(main())
