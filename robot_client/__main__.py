@@ -43,7 +43,8 @@ def _drive(argv: Sequence[str]) -> int:
 
 def _call(argv: Sequence[str]) -> int:
     about = (
-        "Call a task with numbers, one after the other or at a rate. Each call runs onboard or in the cloud."
+        "Call a task with numbers or with inputs of yours, one after the other or at a rate. "
+        "Each call runs onboard or in the cloud."
     )
     config = _load(CallConfig, argv, "call", about)
     _find_modules_here()
@@ -103,7 +104,7 @@ def _run(config: RobotConfig) -> int:
     # These are imported after the flags are read, so that --help compiles nothing.
     from offboard.robot_client.records.trace import Trace, alone_path
     from offboard.robot_client.simulated.answers import Answers
-    from offboard.robot_client.simulated.measure_alone import measure_alone
+    from offboard.robot_client.simulated.references import measure_alone
     from offboard.robot_client.simulated.work import make_work
 
     answers = Answers(config.answers) if config.answers else None
@@ -212,7 +213,7 @@ def _interrupt(*_: object) -> NoReturn:
 
 COMMANDS = {
     "drive": Command("drive a simulated robot on a map", _drive),
-    "call": Command("call a task of yours with numbers", _call),
+    "call": Command("call a task of yours, with numbers or inputs", _call),
     "check": Command("check whether this robot can use a server", _check),
     "keys": Command("make the keys of this robot", _make_keys),
 }

@@ -6,9 +6,11 @@ Run as a program, this is a planning server that gives wrong answers, or leaks m
 import os
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from offboard.common.tasks import Kind, kinds, load_modules
 from offboard.loadgen.scenario.event_timeline import Event
@@ -27,6 +29,11 @@ def dead_robot(scenario: Scenario) -> Scenario:
     return replace(scenario, events=(*scenario.events, death))
 
 
+def always_cloud(scenario: Scenario) -> Scenario:
+    """The scenario with a robot that uses the answers of the server, even if it is the slower site."""
+    return scenario.changed(policy="cloud")
+
+
 def unchanged(scenario: Scenario) -> Scenario:
     return scenario
 
@@ -41,16 +48,20 @@ def bed_with(cloud: str | None) -> Callable[[Path, Mapping[str, Setup]], LocalTe
 
 BREAKS: dict[str, tuple[Callable[[Scenario], Scenario], str | None]] = {
     "dead-robot": (dead_robot, None),
-    "lying-cloud": (unchanged, "lie"),
+    "lying-cloud": (always_cloud, "lie"),
     "leaky-cloud": (unchanged, "leak"),
 }
 
 
 def lie(answer: Any) -> Any:
-    """A wrong answer of the right type."""
+    """A wrong answer of the right type: reversed bytes and arrays, or a list without its first item."""
     if isinstance(answer, bytes):
         return answer[::-1]
-    return replace(answer, cells=answer.cells[::-1].copy(), metres=answer.metres[::-1].copy())
+    if isinstance(answer, list):
+        return answer[1:]
+    values = {field.name: getattr(answer, field.name) for field in fields(answer)}
+    arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+    return replace(answer, **{name: value[::-1].copy() for name, value in arrays.items()})
 
 
 def leak(answer: Any) -> Any:
@@ -72,5 +83,6 @@ if __name__ == "__main__":
     load_modules(modules.split(","))
     for one in kinds():
         _break(one, {"lie": lie, "leak": leak}[how])
-    sys.argv[1:] = flags
+    # Threads use the broken tasks of this process; worker processes would load the right ones.
+    sys.argv[1:] = [flag for flag in flags if not flag.startswith("--executor=")]
     sys.exit(main())

@@ -15,6 +15,11 @@ def echo(value: object = None) -> object:
     return value
 
 
+@task("swallow", size=lambda _: 0.0)
+def swallow(_: object) -> None:
+    """Takes anything and returns nothing."""
+
+
 @task("nap", size=lambda seconds: seconds)
 def nap(seconds: float) -> float:
     time.sleep(seconds)

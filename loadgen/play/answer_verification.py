@@ -1,6 +1,7 @@
-"""Verifies the answers of a run: repeats each task and checks each path cell by cell against map and scan.
+"""Verifies the answers of a run: repeats each task without Offboard, and compares the answers.
 
-The tasks are made again from the seed. Only the answers are taken from the run.
+A path is checked cell by cell against map and scan. The tasks are made again from the seed, so that only the
+answers are taken from the run.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.common.errors import OffloadError, describe
 from offboard.common.planning.grid_kernels import covered
 from offboard.common.planning.maps import GridMap, passable
 from offboard.common.planning.planner import Plan, scan_hits
@@ -18,13 +20,14 @@ from offboard.common.tasks import kind_of
 from offboard.loadgen.scenario.outcome import Answered
 from offboard.loadgen.scenario.scenario import Workload
 from offboard.robot_client.simulated import answers
+from offboard.robot_client.simulated.calls import Calls
 from offboard.robot_client.simulated.work import Work, make_work
 
 COST_SHARE = 1e-6  # largest relative difference of two sums of the same steps
 
 
 def verified(answered: Sequence[Answered], workload: Workload, seed: int) -> list[Answered]:
-    """The same tasks with `wrong` filled in; unchanged if the tasks cannot be made again.
+    """The same tasks with `wrong` and `unverified` filled in; unchanged if the tasks cannot be made again.
 
     That is so if the next task depends on the previous answer (a map without `jump`).
     """
@@ -36,17 +39,38 @@ def verified(answered: Sequence[Answered], workload: Workload, seed: int) -> lis
         while at < one.i:
             work.advance(None)
             at += 1
-        found.append(replace(one, wrong=None if one.error is not None else _wrong(work, states, one.answer)))
+        found.append(one if one.error is not None else _judged(one, work, states))
     return found
 
 
-def _wrong(work: Work, states: TaskStates, answer: Mapping[str, Any]) -> str | None:
+def _judged(one: Answered, work: Work, states: TaskStates) -> Answered:
     request = work.request()
-    expected = states.call(kind_of(work.function), request)
+    try:
+        expected = states.call(kind_of(work.function), request)
+    except Exception as error:
+        raise OffloadError(f"task {one.i} fails without Offboard: {describe(error)}") from error
     if isinstance(expected, Plan):
-        return wrong_plan(answer, expected, request)
+        return replace(one, wrong=wrong_plan(one.answer, expected, request))
     described = work.describe(expected)
-    return None if answer == described else f"{answer}, but {described} was expected"
+    if one.answer["sha256"] == described["sha256"]:
+        return one
+    if isinstance(work, Calls) and work.same is not None:
+        return _compared(one, work, described)
+    return replace(one, wrong=f"{one.answer}, but {described} was expected")
+
+
+def _compared(one: Answered, work: Calls, expected: dict[str, Any]) -> Answered:
+    """Ask the module of the task whether two answers with different bytes are the same."""
+    if "frames" not in one.answer or "frames" not in expected:
+        too_large = f"its bytes differ, and an answer over {answers.WHOLE_BYTES_MAX} bytes is not kept"
+        return replace(one, unverified=too_large)
+    found, wanted = work.restore(one.answer), work.restore(expected)
+    assert work.same is not None
+    try:
+        same = work.same(found, wanted)
+    except Exception as error:  # noqa: BLE001 - a wrong answer may be of a type that `same` does not expect
+        return replace(one, wrong=f"{found!r:.200} cannot be compared: {describe(error)}")
+    return one if same else replace(one, wrong=f"{found!r:.200}, but {wanted!r:.200} was expected")
 
 
 def wrong_plan(answer: Mapping[str, Any], expected: Plan, request: Sequence[Any]) -> str | None:

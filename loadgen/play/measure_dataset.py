@@ -86,7 +86,8 @@ def _conditions(scenario: Scenario, testbed: str) -> str:
 
 def _asked(workload: Workload) -> str:
     if workload.map is None:
-        return f"task {workload.task}, sizes {','.join(workload.sizes)}"
+        given = f"inputs {workload.inputs}" if workload.inputs else f"sizes {','.join(workload.sizes)}"
+        return f"task {workload.task}, {given}"
     cells = "" if workload.resolution is None else f" at {workload.resolution:g} m"
     return f"{workload.map.name}{cells}"
 

@@ -40,7 +40,7 @@ def _robot_flags(scenario: Scenario, files: RobotFiles, *, first: bool) -> Mappi
     """Flags of `robot-client drive` or `call`. Only the first robot runs `alone` and `reference`."""
     workload, robot = scenario.workload, scenario.robot
     flags = {
-        **(_map_flags(workload) if workload.map else {"task": workload.task}),
+        **(_map_flags(workload) if workload.map else {"task": workload.task, "inputs": workload.inputs}),
         "sizes": _sizes(workload.sizes),
         "tasks": workload.tasks,
         "arrivals": workload.arrivals,

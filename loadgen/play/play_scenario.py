@@ -4,7 +4,7 @@
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -31,6 +31,7 @@ from offboard.loadgen.table.table_two import table_text
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.loadgen.testbed.testbed import Setup, Testbed
 from offboard.robot_client.records.trace import alone_path, reference_path
+from offboard.robot_client.simulated.work import make_work
 
 DEMO_WINDOWS = ("5", "10", "20", "30", "40", "50")
 
@@ -84,6 +85,8 @@ def play(scenario: Scenario, out: Path, testbed: str = "local", *, quiet: bool =
     Unless `quiet`, progress lines and the output of the first robot go to stdout.
     """
     say = _say_nothing if quiet else _say
+    if scenario.workload.inputs is not None:
+        make_work(scenario.workload.robot(scenario.seed))  # so that a missing library is named at once
     started_at, workload = datetime.now(UTC), scenario.workload
     played_from = digests(scenario)  # taken now, because the parts load the software now
     with TESTBEDS[testbed](out, setups(scenario, out, shown=not quiet)) as bed:
@@ -99,6 +102,8 @@ def play(scenario: Scenario, out: Path, testbed: str = "local", *, quiet: bool =
     played = replace(judge(scenario, out, exit_codes), stolen_percent=stolen_percent)
     about = {"testbed": testbed, "started_at": started_at.isoformat(timespec="seconds"), **played_from}
     write_summary(out, played, about)
+    for line in _findings(played.outcome):
+        say(line)
     for verdict in played.verdicts:
         say(str(verdict))
     if stolen_percent is not None and stolen_percent >= NOTED_PERCENT:
@@ -168,6 +173,18 @@ def figures(outcome: Outcome, scenario: Scenario) -> dict[str, float | None]:
         for name, figure in FIGURES.items()
         if figure.needs is None or known[figure.needs]
     }
+
+
+def _findings(outcome: Outcome) -> Iterator[str]:
+    """What people should know about a run even without a check."""
+    overhead_ms, percent = (FIGURES[name].compute(outcome) for name in ("overhead_ms", "overhead_percent"))
+    if overhead_ms is not None and percent is not None:
+        share = f"{percent:.2g} % of the mean time of a task"
+        yield f"overhead of Offboard itself: {overhead_ms:.2f} ms per task (median), {share}"
+    unverified = [one for one in outcome.answered if one.unverified is not None]
+    if unverified:
+        first = unverified[0]
+        yield f"warning: {len(unverified)} answers are not verified; task {first.i}: {first.unverified}"
 
 
 def _say(text: str) -> None:

@@ -54,9 +54,10 @@ def _sources(scenario: Scenario) -> Iterator[Path]:
         assert spec is not None, f"{name} is installed with us"
         for folder in spec.submodule_search_locations or ():
             yield from sorted(Path(folder).rglob("*.py"))
-    if scenario.workload.task is not None:
+    named = (scenario.workload.task, scenario.workload.inputs)
+    for module in dict.fromkeys(name.partition(":")[0] for name in named if name is not None):
         with contextlib.suppress(ModuleNotFoundError):  # the parts report it when they start
-            spec = find_spec(scenario.workload.task.partition(":")[0])
+            spec = find_spec(module)
             if spec is not None and spec.origin is not None:
                 yield Path(spec.origin)
 

@@ -16,8 +16,10 @@ class Answered:
 
     `chosen` is the site that the policy chose, `sites` are all sites that the task ran on.
     `wrong` says why the answer is wrong; None if it is right or was not verified.
+    `unverified` says why an answer whose bytes are not the expected ones could not be compared further.
     `intervals` are the prediction intervals of its executions.
     `server_s` is the run time that the cloud server reported, without link and queue.
+    `overhead_s` is what Offboard itself added to the time of the task; None: unknown.
     """
 
     i: int
@@ -32,6 +34,8 @@ class Answered:
     wrong: str | None = None
     intervals: tuple[Interval, ...] = ()
     server_s: float | None = None
+    unverified: str | None = None
+    overhead_s: float | None = None
 
     @property
     def response_s(self) -> float:

@@ -5,7 +5,7 @@ Which limits they must keep is up to `pass_fail_check`.
 
 import statistics
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -36,6 +36,10 @@ def _lost(run: Outcome) -> float:
 
 def _wrong(run: Outcome) -> float:
     return sum(one.wrong is not None for one in run.answered)
+
+
+def _unverified(run: Outcome) -> float:
+    return sum(one.unverified is not None for one in run.answered)
 
 
 def _failed(run: Outcome) -> float:
@@ -90,6 +94,17 @@ def _regret_ms(run: Outcome) -> float | None:
     return 1e3 * sum(regrets) / len(regrets) if regrets else None
 
 
+def _overhead_ms(run: Outcome) -> float | None:
+    known = [one.overhead_s for one in run.answered if one.overhead_s is not None]
+    return 1e3 * statistics.median(known) if known else None
+
+
+def _overhead_percent(run: Outcome) -> float | None:
+    known = [one for one in run.answered if one.overhead_s is not None]
+    overhead_ms, mean_ms = _overhead_ms(run), _mean_ms(replace(run, answered=known))
+    return 100 * overhead_ms / mean_ms if overhead_ms is not None and mean_ms else None
+
+
 def _growth(of: Callable[[Reading], float]) -> Callable[[Outcome], float | None]:
     """Growth in percent of the part that grew most, from the first to the last third of its readings.
 
@@ -113,6 +128,9 @@ def _growth(of: Callable[[Reading], float]) -> Callable[[Outcome], float | None]
 FIGURES: dict[str, Figure] = {
     "lost": Figure("tasks", "tasks that were never answered", _lost),
     "wrong": Figure("tasks", "tasks with a wrong answer", _wrong, "jump"),
+    "unverified": Figure(
+        "tasks", "answers with unexpected bytes that are too large to be compared", _unverified, "jump"
+    ),
     "failed": Figure("tasks", "tasks that ended with an error", _failed),
     "mean_ms": Figure("ms", "mean time from when a task is due to its answer", _mean_ms),
     "p95_ms": Figure("ms", "95 % of the tasks are answered within this time", _quantile_ms(95)),
@@ -135,6 +153,12 @@ FIGURES: dict[str, Figure] = {
         "reference",
     ),
     "regret_ms": Figure("ms", "mean time that the faster site would have saved", _regret_ms, "reference"),
+    "overhead_ms": Figure(
+        "ms", "median time that Offboard itself added to a task that ran on one site", _overhead_ms
+    ),
+    "overhead_percent": Figure(
+        "%", "overhead_ms as a share of the mean time of these tasks", _overhead_percent
+    ),
     "memory_growth_percent": Figure(
         "%", "memory growth of the part that grew most", _growth(lambda one: one.memory_bytes)
     ),

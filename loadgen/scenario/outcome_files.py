@@ -4,6 +4,7 @@ The robot writes these files; what their lines mean is in `outcome`.
 """
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from offboard.common.errors import DataError
 from offboard.loadgen.scenario.interval_coverage import intervals_of, late_seconds
 from offboard.loadgen.scenario.outcome import Answered, Reading, Reference
 from offboard.robot_client.records import trace
-from offboard.robot_client.sites.runner import CLOUD
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 
 def read_answered(answers: Path, records: Path, robot: str) -> list[Answered]:
@@ -37,9 +38,25 @@ def read_answered(answers: Path, records: Path, robot: str) -> list[Answered]:
                 server_s=next(
                     (one["run_s"] for one in executions if one["site"] == CLOUD and one["ok"]), None
                 ),
+                overhead_s=overhead_s(record) if record else None,
             )
         )
     return found
+
+
+def overhead_s(record: Mapping[str, Any]) -> float | None:
+    """What Offboard itself added to the time of a task that ran on one site: wait minus execution.
+
+    An onboard execution counts without the time to hand it to a worker and back. None if a second site ran
+    too: then the wait contains what was lost on the first one, or the delay of a hedge.
+    """
+    executions = record["executions"]
+    if len(executions) != 1 or not executions[0]["ok"]:
+        return None
+    (one,) = executions
+    if one["site"] != ONBOARD:
+        return float(record["waited_s"] - one["seconds"])
+    return float(record["waited_s"] - one["queue_s"] - one["run_s"])
 
 
 def read_references(path: Path) -> list[Reference]:

@@ -33,7 +33,12 @@ class Workload:
     """
 
     map: Path | None = setting(None, "map.yaml or MovingAI .map to plan on")
-    task: str | None = setting(None, "MODULE:FUNCTION to call instead; its argument is its input size")
+    task: str | None = setting(
+        None, "MODULE:FUNCTION to call instead, with one number of sizes or with the arguments of inputs"
+    )
+    inputs: str | None = setting(
+        None, "MODULE:FUNCTION that takes the seed and returns the arguments of each call of the task"
+    )
     resolution: float | None = setting(
         None, "cell size of the planning grid, in metres; default: that of the map", minimum=0.001
     )
@@ -63,6 +68,8 @@ class Workload:
         check(self)
         if (self.map is None) == (self.task is None):
             raise ConfigError("workload.map: give either map or task")
+        if self.inputs is not None and self.task is None:
+            raise ConfigError(f"workload.inputs: {self.inputs!r} needs workload.task")
         if self.measure > self.tasks:
             raise ConfigError(f"workload.measure: {self.measure} is above workload.tasks {self.tasks}")
         if self.alone > self.tasks:

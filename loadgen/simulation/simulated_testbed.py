@@ -159,8 +159,10 @@ class SimulatedTestbed:
 
 
 def check_simulated(scenario: Scenario) -> None:
-    """Raise ConfigError if the scenario has an event or a link condition that cannot be simulated."""
+    """Raise ConfigError if the scenario has inputs, an event or a link condition that cannot be simulated."""
     prefix = f"scenario {scenario.name} cannot be simulated"
+    if scenario.workload.inputs is not None:
+        raise ConfigError(f"{prefix}: the costs of task {scenario.workload.task} are not known")
     link = LinkFlags(**scenario.link).link
     _check_link(prefix, link)
     for event in scenario.timeline():

@@ -3,6 +3,7 @@
 What is asked, and when, is decided in `run`.
 """
 
+import base64
 import hashlib
 import json
 import time
@@ -14,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.common.errors import DataError
-from offboard.common.wire.values import encode
+from offboard.common.errors import DataError, ProtocolError
+from offboard.common.wire.values import decode, encode
 from offboard.robot_client.records import lines
 from offboard.robot_client.records.lines import VERSION, Lines
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:  # importing the planner compiles it, which a robot without a 
     from offboard.common.planning.planner import Plan
 
 BEGIN_S = 0.25
+WHOLE_BYTES_MAX = 16 * 1024  # of an answer that the file holds whole
 # (row, col) of each step. The index of a step is its digit in the file: eighths of a turn, from the direction
 # of the row (x of the map) towards higher rows (y of the map).
 STEPS = ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1))
@@ -106,12 +108,26 @@ def of_plan(plan: "Plan") -> dict[str, Any]:
     }
 
 
-def of_value(value: Any, types: Sequence[type]) -> dict[str, Any]:
-    """Any other result as a line holds it: the SHA-256 of its bytes on the wire, arrays included."""
-    digest = hashlib.sha256()
-    for frame in encode(value, types).frames:
+def of_value(value: Any, types: Sequence[type], *, whole: bool = False) -> dict[str, Any]:
+    """Any other result as a line holds it: the SHA-256 of its bytes on the wire, arrays included.
+
+    With `whole` it also holds these bytes, in Base64, unless they are over WHOLE_BYTES_MAX.
+    """
+    digest, frames = hashlib.sha256(), encode(value, types).frames
+    for frame in frames:
         digest.update(frame)
-    return {"sha256": digest.hexdigest()}
+    found: dict[str, Any] = {"sha256": digest.hexdigest()}
+    if whole and sum(memoryview(frame).nbytes for frame in frames) <= WHOLE_BYTES_MAX:
+        found["frames"] = [base64.b64encode(frame).decode() for frame in frames]
+    return found
+
+
+def value_of(answer: Mapping[str, Any], types: Sequence[type]) -> Any:
+    """The result that `of_value` kept whole; a DataError if it cannot be restored."""
+    try:
+        return decode([base64.b64decode(text) for text in answer["frames"]], types, {})
+    except (ProtocolError, ValueError, TypeError) as error:
+        raise DataError(f"answer {answer['sha256']}: its frames cannot be read: {error}") from error
 
 
 def cells_of(answer: Mapping[str, Any]) -> NDArray[np.int32]:

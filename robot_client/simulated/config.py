@@ -100,7 +100,7 @@ class TaskSettings:
 
     task: str = setting(
         REQUIRED,
-        "a @task function of one whole number, which is taken from --sizes",
+        "the @task function to call, with one whole number of --sizes or with the arguments of --inputs",
         group=CALLS,
         metavar="MODULE:FUNCTION",
     )
@@ -111,13 +111,23 @@ class TaskSettings:
         metavar="SPEC",
     )
 
+    inputs: str | None = setting(
+        None,
+        "function that takes the seed and returns an iterable of calls; each is a tuple of arguments, "
+        "or the only argument",
+        group=CALLS,
+        metavar="MODULE:FUNCTION",
+    )
+
 
 @dataclass(frozen=True, kw_only=True)
 class CallConfig(RobotConfig, TaskSettings):
-    """The settings of `robot-client call`: any task, called with numbers."""
+    """The settings of `robot-client call`: any task, called with numbers or with inputs."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.sizes:
-            raise ConfigError(f"--task: {self.task!r} needs --sizes")
+        if not self.sizes and self.inputs is None:
+            raise ConfigError(f"--task: {self.task!r} needs --sizes or --inputs")
+        if self.sizes and self.inputs is not None:
+            raise ConfigError(f"--inputs: {self.inputs!r} cannot be combined with --sizes")
         parse_sizes(self.sizes)

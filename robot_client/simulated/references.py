@@ -1,19 +1,27 @@
-"""References: a task of the run is run again on each site alone, to know how long the better site takes.
+"""What a task takes on each site alone: references during a run, and the tasks of --alone after it.
 
-They have their own offloader, so that they and the run learn nothing from each other.
+Both have their own offloader, so that they and the run learn nothing from each other.
 """
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Any
 
 from offboard.common.errors import TaskError
 from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import BOTH
 from offboard.robot_client.records import lines
 from offboard.robot_client.records.lines import VERSION, Lines
 from offboard.robot_client.records.trace import Record
+from offboard.robot_client.simulated.config import RobotConfig
+from offboard.robot_client.simulated.summary import describe, show_progress
+from offboard.robot_client.simulated.work import Work
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
+
+WAYS = (ONBOARD, CLOUD, BOTH)
 
 _FIELDS = ("i", "waited_s", "used", "chosen", "both", "sites")
 
@@ -73,6 +81,27 @@ class References(Lines):
         return None
 
 
+def measure_alone(config: RobotConfig, work: Work, offload: Offloader, say: Callable[[str], None]) -> None:
+    """Run `config.alone` further tasks in all WAYS, one way after the other, in an order that changes.
+
+    The times say how much the two executions of one task disturb each other; `loadgen table` reads them.
+    The only sites of `offload` are onboard and cloud.
+    """
+    whole = 0
+    for number, order in enumerate(orders(config.alone, config.seed, WAYS)):
+        request, ran = work.request(), 0
+        for n, way in enumerate(order, 1):
+            answer = offload(work.function, *request, where=way)
+            record = offload.last
+            assert record is not None
+            ran += _ran(record, way)
+            show_progress(number * len(WAYS) + n, config.alone * len(WAYS), partial(describe, record))
+        work.advance(answer)
+        whole += ran == len(WAYS)
+    missing = f"; the {CLOUD} did not answer for the others" if whole < config.alone else ""
+    say(f"run on each site alone and on both at once: {whole} of {config.alone} {work.noun}{missing}")
+
+
 def read(path: Path) -> Iterator[dict[str, Any]]:
     """The fields of each line, as `trace.read` returns them."""
     return lines.read(path, _FIELDS)
@@ -89,3 +118,9 @@ def orders(count: int, seed: int, ways: Sequence[str]) -> list[tuple[str, ...]]:
         order = random.sample(ways, len(ways))
         found += [(*order[n:], *order[:n]) for n in range(len(ways))]
     return found[:count]
+
+
+def _ran(record: Record, way: str) -> bool:
+    """Whether the task ran well on the sites of `way`, and on no other."""
+    sites = [ONBOARD, CLOUD] if way == BOTH else [way]
+    return sorted(one.site for one in record.executions if one.ok) == sorted(sites)

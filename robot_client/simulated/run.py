@@ -29,6 +29,7 @@ from offboard.robot_client.simulated.workload import CLOSED, due_instants
 
 MADE_MAX = 32  # tasks that are made ahead and wait for their instant
 MADE_FIRST_MAX = 1000  # tasks that are made before the first one starts, if none depends on an answer
+LARGE_MADE_MAX = 4  # tasks that are made ahead if their arguments may be megabytes each
 
 T = TypeVar("T")
 
@@ -110,11 +111,11 @@ class Run:
         """Start each task when the previous one has its answer.
 
         Tasks that do not depend on answers are made before the first one starts: simulating the LiDAR must
-        not take the robot's CPU during the run.
+        not take the robot's CPU during the run. Large tasks are made one by one, between two tasks.
         """
         if self._work.independent:
             requests = self._requests()
-            first = deque(itertools.islice(requests, MADE_FIRST_MAX))
+            first = deque(itertools.islice(requests, 1 if self._work.large else MADE_FIRST_MAX))
             self._begin()
             while first:
                 self._ask(*first.popleft())
@@ -141,7 +142,8 @@ class Run:
             slots.release()
 
         try:
-            with contextlib.closing(made_ahead(self._due_tasks())) as due_tasks:
+            most = LARGE_MADE_MAX if self._work.large else MADE_MAX
+            with contextlib.closing(made_ahead(self._due_tasks(), most)) as due_tasks:
                 for number, request, due_s in due_tasks:
                     self._begin()
                     time.sleep(max(0.0, due_s - self._now_s()))
@@ -232,11 +234,11 @@ class Run:
             )
 
 
-def made_ahead(tasks: Iterator[T]) -> Generator[T]:
-    """The same tasks in the same order, made in another thread, up to MADE_MAX of them ahead."""
+def made_ahead(tasks: Iterator[T], most: int = MADE_MAX) -> Generator[T]:
+    """The same tasks in the same order, made in another thread, up to `most` of them ahead."""
     maker = ThreadPoolExecutor(1, thread_name_prefix="maker")
     try:
-        made = deque(maker.submit(next, tasks, None) for _ in range(MADE_MAX))
+        made = deque(maker.submit(next, tasks, None) for _ in range(most))
         wait(made)
         while (task := made.popleft().result()) is not None:
             made.append(maker.submit(next, tasks, None))

@@ -21,7 +21,11 @@ class ServerSettings:
         metavar="tcp://HOST:PORT",
     )
     site: tuple[str, ...] = setting(
-        (), "a further server, with a name; repeat the flag for more", group=SERVERS, metavar="NAME=ENDPOINT"
+        (),
+        "a further server, with a name; repeat the flag for more",
+        group=SERVERS,
+        rare=True,
+        metavar="NAME=ENDPOINT",
     )
     keys: Path | None = setting(
         None,

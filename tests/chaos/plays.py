@@ -2,7 +2,12 @@
 
 import os
 
+import pytest
+
+from offboard.common.errors import ConfigError
+from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario, shipped
+from offboard.robot_client.simulated.work import make_work
 
 ALL = os.environ.get("CHAOS") == "1"
 SCENARIOS = [name for name in shipped() if read_scenario(find_scenario(name)).checks]
@@ -18,3 +23,15 @@ IN_CONTAINERS = SHORT if ALL else ["cloud-busy"]
 ON_LOOPBACK = SHORT if ALL else []  # WRONG already plays some there
 SOAK_TASKS = 400  # 20 seconds
 LEAK_TASKS = 600
+
+
+def skip_if_unplayable(scenario: Scenario, testbed: str) -> None:
+    """Skip a scenario with inputs if the library of its task is missing, here or in the images."""
+    if scenario.workload.inputs is None:
+        return
+    if testbed == "docker":
+        pytest.skip(f"{scenario.name}: the images do not hold the library of its task")
+    try:
+        make_work(scenario.workload.robot(scenario.seed))
+    except ConfigError as error:
+        pytest.skip(f"{scenario.name}: {error}")

@@ -179,3 +179,51 @@ def test_a_task_is_called_with_its_sizes(testbed: Callable[..., LocalTestbed], t
         found[policy] = [(line["due_s"], line["answer"]) for _, line in sorted(lines.items())]
     assert found[ONBOARD] == found[CLOUD]
     assert len({answer["sha256"] for _, answer in found[CLOUD] if answer}) == 2
+
+
+@pytest.mark.parametrize("arrivals", [(), POISSON], ids=["closed", "open"])
+def test_a_task_is_called_with_inputs(
+    testbed: Callable[..., LocalTestbed], tmp_path: Path, arrivals: tuple[str, ...]
+) -> None:
+    """Frames of a seed have the same answers on both sites, and another seed has others."""
+    bed = testbed({"tasks": "tests.frames"})
+    flags = ["call", "--task", "tests.frames:copied", "--inputs", "tests.frames:frames", "--tasks", 12]
+    found = {}
+    for policy, seed in ((ONBOARD, 1), (CLOUD, 1), (CLOUD, 2)):
+        path, kept = tmp_path / f"{policy}{seed}.jsonl", tmp_path / f"{policy}{seed}.trace.jsonl"
+        to = ["--cloud", bed.endpoint, "--policy", policy, "--seed", seed, "--answers", path]
+        assert "12 tasks answered\n" in robot(*flags, *arrivals, *to, "--trace", kept)
+        found[policy, seed] = by_number(path)
+        records = list(trace.read(kept))
+        assert {record["executions"][0]["site"] for record in records} == {policy}
+        assert {record["size"] for record in records} == {480 * 640}
+    assert found[ONBOARD, 1] == found[CLOUD, 1] != found[CLOUD, 2]
+
+
+def test_inputs_can_be_measured_and_referenced(testbed: Callable[..., LocalTestbed], tmp_path: Path) -> None:
+    """--measure, --reference and --alone work with inputs as with sizes."""
+    bed = testbed({"tasks": "tests.frames"})
+    kept = tmp_path / "trace.jsonl"
+    flags = ["--task", "tests.frames:brightness", "--inputs", "tests.frames:frames", "--tasks", 8]
+    measuring = ["--measure", 3, "--reference", 4, "--alone", 2]
+    said = robot("call", *flags, *measuring, "--cloud", bed.endpoint, "--trace", kept)
+    assert "8 tasks answered" in said
+    assert "run on each site alone and on both at once: 2 of 2 tasks" in said
+    assert [line["i"] for line in references.read(trace.reference_path(kept))] == [3, 7]
+
+
+@pytest.mark.parametrize(
+    ("inputs", "code", "said"),
+    [
+        ("broken", 1, "--inputs: 'tests.frames:broken' failed at input 2: OSError: no camera"),
+        ("with_gain", 2, "--inputs: 'tests.frames:with_gain' gave 3 inputs, but --tasks and --alone need 5"),
+    ],
+)
+def test_inputs_that_end_early_end_the_run(inputs: str, code: int, said: str) -> None:
+    """One line says what happened; the tasks before it were answered."""
+    flags = ["--task", "tests.frames:brightness", "--inputs", f"tests.frames:{inputs}", "--tasks", 5]
+    done = subprocess.run(
+        command("call", *flags), capture_output=True, text=True, timeout=WAIT_S, cwd=ROOT, check=False
+    )
+    assert done.returncode == code, done.stderr
+    assert done.stderr == f"robot-client call: {said}\n"

@@ -1,5 +1,6 @@
 """Verifying the answers of a run: right answers pass, and for a wrong one it says what is wrong."""
 
+import itertools
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -8,17 +9,21 @@ from typing import Any
 import numpy as np
 import pytest
 
+from offboard.common.errors import OffloadError
 from offboard.common.planning.planner import plan_path
 from offboard.loadgen.play.answer_verification import verified, wrong_plan
 from offboard.loadgen.scenario.outcome import Answered
 from offboard.loadgen.scenario.scenario import Workload
 from offboard.robot_client.simulated import answers
 from offboard.robot_client.simulated.work import make_work
+from tests import frames
 
 MAP = Path(__file__).parents[1] / "samples" / "32room_000-crop.map"
 SEED = 3
 PLANS = Workload(map=MAP, tasks=8, jump=True, obstacles=4, radius_m=0.0)
 CALLS = Workload(task="offboard.loadgen.scenario.hash_tasks:hash_rounds", sizes=("uniform:10:1000",), tasks=8)
+INPUTS = Workload(task="tests.frames:brightness", inputs="tests.frames:frames", tasks=8)
+LARGE = replace(INPUTS, task="tests.frames:copied")
 
 
 def answered_rightly(workload: Workload) -> list[Answered]:
@@ -32,7 +37,7 @@ def answered_rightly(workload: Workload) -> list[Answered]:
     return found
 
 
-@pytest.mark.parametrize("workload", [PLANS, CALLS], ids=["plans", "calls"])
+@pytest.mark.parametrize("workload", [PLANS, CALLS, INPUTS], ids=["plans", "calls", "inputs"])
 def test_right_answers_pass_in_any_order(workload: Workload) -> None:
     """Answers may be missing, as after a crash, and a failed task has no answer to be wrong."""
     found = answered_rightly(workload)
@@ -41,12 +46,50 @@ def test_right_answers_pass_in_any_order(workload: Workload) -> None:
     assert [(one.i, one.wrong) for one in judged] == [(0, None), (2, None), (5, None), (7, None)]
 
 
-@pytest.mark.parametrize("workload", [PLANS, CALLS], ids=["plans", "calls"])
+@pytest.mark.parametrize("workload", [PLANS, CALLS, INPUTS], ids=["plans", "calls", "inputs"])
 def test_the_answer_of_another_task_is_wrong(workload: Workload) -> None:
     """An answer that belongs to another task is found to be wrong."""
     found = answered_rightly(workload)
     judged = verified([replace(found[3], answer=found[4].answer)], workload, SEED)
     assert judged[0].wrong is not None
+
+
+@pytest.mark.parametrize(
+    ("mean", "wrong"),
+    [
+        (lambda right: right + 0.9 * frames.BRIGHTER, None),
+        (lambda right: right + 1.1 * frames.BRIGHTER, "{'mean': .*}, but {'mean': .*} was expected"),
+        (lambda _: "bright", "{'mean': 'bright'} cannot be compared: TypeError: "),
+    ],
+)
+def test_answers_may_differ_within_the_tolerance_of_their_task(mean: Any, wrong: str | None) -> None:
+    """`same` of the module of the task decides about an answer with other bytes."""
+    right = answered_rightly(INPUTS)[3]
+    (frame,) = list(itertools.islice(frames.frames(SEED), 4))[3:]
+    answer = answers.of_value({"mean": mean(frames.brightness(frame)["mean"])}, (), whole=True)
+    (judged,) = verified([replace(right, answer=answer)], INPUTS, SEED)
+    assert judged.unverified is None
+    assert (judged.wrong is None) == (wrong is None)
+    assert wrong is None or re.match(wrong, judged.wrong or "")
+
+
+def test_an_answer_that_is_too_large_to_compare_is_not_verified() -> None:
+    """An answer over 16 KiB with the expected digest is right; with another one it is not verified."""
+    found = answered_rightly(LARGE)
+    judged = verified([found[1], replace(found[2], answer=found[3].answer)], LARGE, SEED)
+    assert [one.wrong for one in judged] == [None, None]
+    why = "its bytes differ, and an answer over 16384 bytes is not kept"
+    assert [one.unverified for one in judged] == [None, why]
+
+
+def test_a_task_that_fails_without_offboard_is_named() -> None:
+    """An answer cannot be verified if the function raises in the bench process."""
+    found = answered_rightly(CALLS)[:1]
+    wrong = replace(CALLS, sizes=("constant:1e9",))
+    with pytest.raises(
+        OffloadError, match="task 0 fails without Offboard: ValueError: 1000000000 rounds are"
+    ):
+        verified(found, wrong, SEED)
 
 
 def test_tasks_that_cannot_be_made_again_are_not_verified() -> None:

@@ -14,8 +14,7 @@ from offboard.common.tasks import Task
 from offboard.robot_client.offloader import BOTH
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.simulated.config import DriveConfig
-from offboard.robot_client.simulated.measure_alone import WAYS, measure_alone
-from offboard.robot_client.simulated.references import orders
+from offboard.robot_client.simulated.references import WAYS, measure_alone, orders
 from offboard.robot_client.simulated.robot import SimulatedRobot
 from offboard.robot_client.simulated.work import Plans
 from offboard.robot_client.sites.onboard import OnboardRunner

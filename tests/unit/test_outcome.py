@@ -10,6 +10,7 @@ from offboard.loadgen.compare.compare_settings import CompareConfig
 from offboard.loadgen.compare.comparison_table import comparison_table
 from offboard.loadgen.scenario.outcome import Answered, Outcome, Reading, Reference
 from offboard.loadgen.scenario.outcome_figures import FIGURES
+from offboard.loadgen.scenario.outcome_files import overhead_s
 from offboard.loadgen.scenario.pass_fail_check import Check
 from offboard.loadgen.scenario.scenario import Scenario, Workload
 
@@ -32,6 +33,8 @@ def run() -> Outcome:
             sites=("onboard", "cloud") if i < 2 else ("cloud",),
             wrong="too long" if i == 3 else None,
             error="TaskFailed: no" if i == 4 else None,
+            unverified="too large" if i == 5 else None,
+            overhead_s=None if i < 2 else 0.001 * i,
         )
         for i in range(9)
     ]
@@ -49,6 +52,7 @@ def run() -> Outcome:
     [
         ("lost", 1),
         ("wrong", 1),
+        ("unverified", 1),
         ("failed", 1),
         ("mean_ms", 500),
         ("p95_ms", 900),
@@ -58,6 +62,8 @@ def run() -> Outcome:
         ("twice_percent", 100 * 2 / 9),
         ("accuracy_percent", 50),  # of tasks 3 and 5; task 7 has only one time, task 8 ran on both sites
         ("time_over_oracle", (0.1 + 0.3 + (0.5 + 0.1) + 0.1) / (0.1 + 0.1 + 0.1 + 0.1)),
+        ("overhead_ms", 5),  # the median of tasks 2 to 8, which take 0.3 to 0.9 s
+        ("overhead_percent", 100 * 0.005 / 0.6),
         ("regret_ms", 1e3 * (0.0 + 0.2 + 0.5 + 0.0) / 4),
     ],
 )
@@ -83,7 +89,17 @@ def test_the_tasks_of_other_robots_do_not_count(run: Outcome) -> None:
     assert both.of(("robot", "robot-2")) == both
 
 
-@pytest.mark.parametrize("figure", ["mean_ms", "cloud_percent", "time_over_oracle", "memory_growth_percent"])
+@pytest.mark.parametrize(
+    "figure",
+    [
+        "mean_ms",
+        "overhead_ms",
+        "overhead_percent",
+        "cloud_percent",
+        "time_over_oracle",
+        "memory_growth_percent",
+    ],
+)
 def test_a_figure_without_data_is_undefined(figure: str) -> None:
     """Without tasks, references or readings a figure is undefined, and a check of it fails."""
     nothing = Outcome({"robot": 0}, [])
@@ -91,6 +107,28 @@ def test_a_figure_without_data_is_undefined(figure: str) -> None:
     verdict = Check(figure=figure, at_most=1e9).judge(nothing)
     assert not verdict.holds
     assert str(verdict).endswith("undefined for these tasks")
+
+
+def execution(site: str, seconds: float, **more: object) -> dict[str, object]:
+    return {"site": site, "seconds": seconds, "ok": True, "queue_s": 0.01, "run_s": 0.08} | more
+
+
+@pytest.mark.parametrize(
+    ("executions", "expected_s"),
+    [
+        ([execution("cloud", 0.095)], 0.1 - 0.095),
+        ([execution("onboard", 0.095)], 0.1 - 0.01 - 0.08),
+        ([execution("cloud", 0.095, ok=False)], None),
+        ([execution("cloud", 0.05, ok=False), execution("onboard", 0.045)], None),
+        ([], None),
+    ],
+)
+def test_the_overhead_is_what_a_task_waited_beyond_its_execution(
+    executions: list[dict[str, object]], expected_s: float | None
+) -> None:
+    """Only tasks that ran on one site have one; onboard it includes the way to the worker and back."""
+    found = overhead_s({"waited_s": 0.1, "executions": executions})
+    assert found == (None if expected_s is None else pytest.approx(expected_s))
 
 
 def test_growth_is_the_growth_of_the_part_that_grew_most() -> None:

@@ -11,10 +11,10 @@ from offboard.common.errors import CloudTimeout
 from offboard.common.tasks import Task
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.simulated import references as references_file
+from offboard.robot_client.simulated.calls import Calls
 from offboard.robot_client.simulated.config import CallConfig
 from offboard.robot_client.simulated.references import References, orders
 from offboard.robot_client.simulated.run import OwnRecord, Run
-from offboard.robot_client.simulated.work import Calls
 from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.fakes import ScriptedRunner
@@ -46,7 +46,7 @@ def referenced(
         offloader(cloud, OnboardRunner()) as again,
     ):  # fmt: skip
         references = References(path, again, [ONBOARD, CLOUD], every=every, tasks=tasks, seed=5)
-        work = Calls(scripted, map(float, itertools.count()))
+        work = Calls(scripted, zip(itertools.count()))
         Run(config, work, offload, own=own, say=lambda _: None, references=references).run()
         references.close()
     return list(references_file.read(path)), records

@@ -16,9 +16,9 @@ from offboard.robot_client.records.trace import Record
 from offboard.robot_client.simulated import answers as answers_file
 from offboard.robot_client.simulated import run as run_module
 from offboard.robot_client.simulated.answers import Answers
+from offboard.robot_client.simulated.calls import Calls
 from offboard.robot_client.simulated.config import CallConfig
 from offboard.robot_client.simulated.run import MADE_MAX, OwnRecord, Run, made_ahead
-from offboard.robot_client.simulated.work import Calls
 from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import CLOUD, Execution
 from tests.fakes import ScriptedRunner
@@ -43,7 +43,7 @@ def answered(folder: Path, *, workers: int = 16, **settings: Any) -> tuple[list[
     )
     answers, own, said = Answers(folder / "answers.jsonl"), OwnRecord(), list[str]()
     with offloader(OnboardRunner(workers), observers=[own]) as offload:
-        work = Calls(scripted, map(float, itertools.count()))
+        work = Calls(scripted, zip(itertools.count()))
         try:
             Run(config, work, offload, own=own, say=said.append, answers=answers).run()
         finally:
@@ -67,10 +67,10 @@ def test_tasks_that_depend_on_no_answer_are_made_before_the_first(monkeypatch: p
     monkeypatch.setattr(run_module, "MADE_FIRST_MAX", 3)
     made: list[int] = []
 
-    def wanted() -> Iterator[float]:
+    def wanted() -> Iterator[tuple[int]]:
         for number in itertools.count():
             made.append(number)
-            yield float(number)
+            yield (number,)
 
     seen: list[int] = []
     script.act = lambda _: seen.append(len(made))
@@ -123,7 +123,7 @@ def test_each_answer_has_the_id_of_its_record(tmp_path: Path) -> None:
     )
     answers, own = Answers(tmp_path / "answers.jsonl"), OwnRecord()
     with offloader(OnboardRunner(8), observers=[own, records.append]) as offload:
-        work = Calls(scripted, map(float, itertools.count()))
+        work = Calls(scripted, zip(itertools.count()))
         Run(config, work, offload, own=own, say=quiet, answers=answers).run()
     answers.close()
     sizes = {record.id: record.size for record in records}
@@ -175,7 +175,7 @@ def test_without_an_answers_file_a_failure_ends_the_run(settings: dict[str, Any]
     config = CallConfig(task="m:f", sizes=("constant:0",), tasks=10_000, in_flight=2, **settings)
     own = OwnRecord()
     with offloader(OnboardRunner(), observers=[own]) as offload:
-        work = Calls(scripted, map(float, itertools.count()))
+        work = Calls(scripted, zip(itertools.count()))
         with pytest.raises(TaskFailed, match="three"):
             Run(config, work, offload, own=own, say=quiet).run()
     assert len(script.asked) < 100
@@ -233,7 +233,7 @@ def test_an_interrupted_run_writes_no_answer_for_given_up_tasks(tmp_path: Path) 
     )
     answers, own = Answers(path), OwnRecord()
     with offloader(Onboard(), observers=[own]) as offload:
-        work = Calls(scripted, map(float, itertools.count()))
+        work = Calls(scripted, zip(itertools.count()))
         run = Run(config, work, offload, own=own, say=quiet, answers=answers)
         with pytest.raises(KeyboardInterrupt):
             run.run()
@@ -265,7 +265,7 @@ def test_warming_changes_no_task_of_the_run() -> None:
     config = CallConfig(task="m:f", sizes=("constant:0",), tasks=3)
     own = OwnRecord()
     with offloader(cloud, OnboardRunner()) as unseen, offloader(OnboardRunner(), observers=[own]) as offload:
-        work = Calls(scripted, map(float, itertools.count()))
+        work = Calls(scripted, zip(itertools.count()))
         run = Run(config, work, offload, own=own, say=quiet)
         run.warm(unseen)
         assert [one.args for one in cloud.tasks] == [(0,)]

@@ -37,11 +37,13 @@ timeout = 0.5
 delay_ms = 15
 bandwidth_mbps = 8
 """
+WORKLOADS = {name: read_scenario(find_scenario(name)).workload for name in shipped()}
 CLOSED = [
     name
-    for name in shipped()
+    for name, workload in WORKLOADS.items()
     if name not in ("demo", "paper", "congested")
-    and read_scenario(find_scenario(name)).workload.arrivals == "closed"
+    and workload.arrivals == "closed"
+    and workload.inputs is None
 ]
 
 
@@ -179,7 +181,7 @@ def test_measured_tasks_run_on_both_sites(read: Callable[..., Scenario]) -> None
 
 
 @pytest.mark.timeout(60)  # the real planner plans every task once
-def test_all_shipped_scenarios_can_be_simulated() -> None:
+def test_all_shipped_scenarios_without_inputs_can_be_simulated() -> None:
     """With closed arrivals no task is lost, and no policy is much faster than the oracle."""
     strategies = {name: {"policy": name} for name in ("paper", "hedge:probe:greedy")}
     with SimulationPool(1) as batch:
@@ -225,6 +227,14 @@ def test_what_cannot_be_simulated_is_refused(read: Callable[..., Scenario], text
     """The error names the event or the link condition that needs real processes or connections."""
     with pytest.raises(ConfigError, match=f"^scenario small cannot be simulated: {said}"):
         check_simulated(read(text))
+
+
+def test_inputs_are_not_simulated(read: Callable[..., Scenario]) -> None:
+    """A scenario with inputs is refused before its modules are loaded."""
+    workload = replace(read().workload, task="no_module:f", sizes=(), inputs="no_module:inputs")
+    said = "^scenario small cannot be simulated: the costs of task no_module:f are not known"
+    with pytest.raises(ConfigError, match=said):
+        check_simulated(replace(read(), workload=workload))
 
 
 def test_a_task_of_unknown_cost_is_refused(read: Callable[..., Scenario]) -> None:

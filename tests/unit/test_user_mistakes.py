@@ -20,6 +20,22 @@ FILES = {
     "open.toml": 'name = "open"\n[workload]\nmap = "open.map"\n',
     "alone.toml": 'name = "alone"\n[workload]\nmap = "open.map"\ntasks = 3\nalone = 4\n',
     "no-map.toml": 'name = "odd"\n[workload]\nmap = "none.yaml"\n',
+    "camera.py": """from offboard.common.tasks import task
+
+
+@task("bright", size=lambda frame: frame.size)
+def bright(frame):
+    return float(frame.mean())
+
+
+def few(seed):
+    yield "a frame"
+
+
+def nothing(seed):
+    return None
+""",
+    "inputs.toml": 'name = "odd"\n[workload]\nmap = "open.map"\ninputs = "camera:few"\n',
     "odd.toml": 'name = "odd"\n[workload]\nmap = "m.yaml"\ntaks = 3\n',
 }
 
@@ -84,6 +100,28 @@ FILES = {
             ["robot_client", "drive", "--map", "m.yaml", "--tasks", "3", "--alone", "4"],
             "--alone: 4 is above --tasks 3",
         ),
+        (
+            ["robot_client", "call", "--task", "camera:bright", "--sizes", "constant:1"],
+            "--sizes: 'constant:1': the size function of task bright does not take the first argument: "
+            "AttributeError: 'int' object has no attribute 'size'; use --inputs",
+        ),
+        (
+            ["robot_client", "call", "--task", "camera:bright", "--inputs", "camera:few"],
+            "--inputs: 'camera:few': the size function of task bright does not take the first argument: ",
+        ),
+        (
+            ["robot_client", "call", "--task", "camera:bright", "--inputs", "camera:none"],
+            "camera has no function 'none'",
+        ),
+        (
+            ["robot_client", "call", "--task", "camera:bright", "--inputs", "m:f"],
+            "--inputs: 'm:f' is not MODULE:FUNCTION",
+        ),
+        (
+            ["robot_client", "call", "--task", "camera:bright", "--inputs", "camera:nothing"],
+            "returned NoneType, which is not",
+        ),
+        (["loadgen", "run", "inputs.toml"], "inputs.toml: workload.inputs: 'camera:few' needs workload.task"),
         (["loadgen", "run", "alone.toml"], "alone.toml: workload.alone: 4 is above workload.tasks 3"),
         (["cloud_server", "--listen", "localhost"], "--listen: 'localhost'"),
         (["cloud_server", "--tasks", "no.such.module"], "'no.such.module' cannot be imported"),
@@ -96,7 +134,7 @@ FILES = {
         (["loadgen", "run", "no-map.toml"], "no-map.toml: workload.map: "),
         (["cloud_server", "--tasks", "json"], "--tasks: json registers no task"),
         (["cloud_server", "--config", "."], ".: Is a directory"),
-        (["loadgen", "run", "none"], "scenario 'none' is neither a file nor one of bandwidth, burst"),
+        (["loadgen", "run", "none"], "scenario 'none' is neither a file nor one of apriltags-bandwidth, "),
         (["loadgen", "run", "text-link.toml"], "text-link.toml: link.delay_ms: 'slow' is not a number"),
         (["loadgen", "run", "open.toml", "--out", "words.txt"], "--out: words.txt cannot be written to"),
         (["loadgen", "wan", "--delay-ms", "-1"], "--delay-ms: -1"),
