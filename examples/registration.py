@@ -24,7 +24,7 @@ Known = tuple[small_gicp.PointCloud, small_gicp.KdTree]  # the map
 
 MAP_POINTS = 200_000
 MAP_HALF_M = 30.0  # the map is a square of 60 m
-RANGE_M = 20.0  # of the lidar
+RANGE_M = (5.0, 25.0)  # how far the lidar sees: in a narrow place, many points share a voxel
 STEP_M = 0.002
 VOXEL_M = 0.1
 POINTS = (5_000, 138_000)  # the fewest and the most points of a scan
@@ -57,13 +57,13 @@ def load_map() -> Known:
 
 
 def work(match: Match) -> float:
-    """Each iteration looks up each point in the tree. The guess decides how many iterations there are."""
+    """Each iteration looks up each point in the tree. Range and guess decide how many look-ups there are."""
     return (match.iterations + 1) * match.points
 
 
 @task("register_scan", setup=load_map, size=lambda scan, _: len(scan), work=work, types=(Match,))
 def register_scan(known: Known, scan: Array, guess: Array) -> Match:
-    """The pose from which `scan` (steps of STEP_M, 3 columns) was taken; `guess` is a 4 x 4 pose near it."""
+    """The pose from which `scan` was taken (3 columns, in steps of 2 mm); `guess` is a pose near it."""
     cloud, tree = known
     source, _ = small_gicp.preprocess_points(scan * STEP_M, VOXEL_M, num_threads=1)
     found = small_gicp.align(cloud, source, tree, guess, max_correspondence_distance=2.0, num_threads=1)
@@ -71,7 +71,7 @@ def register_scan(known: Known, scan: Array, guess: Array) -> Match:
 
 
 def inputs(seed: int, points: tuple[int, int] = POINTS) -> Iterator[tuple[Array, Array]]:
-    """Scans and guesses without end. Number of points and error of the guess are independent of each other."""
+    """Scans and guesses without end. Points, range and error of the guess are drawn independently."""
     rng = np.random.default_rng(seed)
     while True:
         count = int(np.exp(rng.uniform(*np.log(points))))
@@ -79,7 +79,7 @@ def inputs(seed: int, points: tuple[int, int] = POINTS) -> Iterator[tuple[Array,
         off_m = np.exp(rng.uniform(*np.log(GUESS_OFF_M)))
         angle = rng.uniform(-np.pi, np.pi)
         guess = pose @ pose_at(off_m * np.cos(angle), off_m * np.sin(angle), 0.05 * off_m)
-        yield draw_scan(count, pose, rng), guess
+        yield draw_scan(count, rng.uniform(*RANGE_M), pose, rng), guess
 
 
 def same(a: Match, b: Match) -> bool:
@@ -93,9 +93,9 @@ def pose_at(x: float, y: float, yaw: float) -> Array:
     return np.array([[cos, -sin, 0, x], [sin, cos, 0, y], [0, 0, 1, 0], [0, 0, 0, 1]], float)
 
 
-def draw_scan(count: int, pose: Array, rng: np.random.Generator) -> Array:
-    """Ground within RANGE_M of a pose, as the lidar there sees it, with 1 cm of noise."""
-    angle, distance = rng.uniform(-np.pi, np.pi, count), RANGE_M * np.sqrt(rng.uniform(0, 1, count))
+def draw_scan(count: int, range_m: float, pose: Array, rng: np.random.Generator) -> Array:
+    """Ground within a range of a pose, as the lidar there sees it, with 1 cm of noise."""
+    angle, distance = rng.uniform(-np.pi, np.pi, count), range_m * np.sqrt(rng.uniform(0, 1, count))
     places = np.column_stack((distance * np.cos(angle), distance * np.sin(angle))) + pose[:2, 3]
     seen = ground(places) + rng.normal(0, 0.01, (count, 3))
     return np.rint((seen - pose[:3, 3]) @ pose[:3, :3] / STEP_M).astype(np.int16)

@@ -36,7 +36,9 @@ ENGINE = {
 def load_networks() -> RapidOCR:
     """Both networks, with one thread each. The wheel of rapidocr contains them."""
     cv2.setNumThreads(1)
-    return RapidOCR(params=ENGINE)
+    networks = RapidOCR(params=ENGINE)
+    networks(next(inputs(seed=0))[0])  # they are loaded by the first call
+    return networks
 
 
 def pixels(frame: Array) -> int:
