@@ -25,7 +25,8 @@ Array = np.ndarray[Any, Any]
 
 JOINTS = 7
 FINGERS_M = (0.04, 0.04)  # an open hand
-PLANNING_S_MAX = 5.0
+CLEARANCE_M = 0.03  # of starts and goals; there is hardly a way out of a tighter place
+PLANNING_S_MAX = 30.0  # long enough that no clock decides what the answer is
 
 rrt.print = lambda *_: None  # the planner reports to stdout, which belongs to the program that calls it
 
@@ -35,22 +36,32 @@ class Motion:
     """Waypoints of the joints, in radians, one in each row; no row if no path was found in time."""
 
     waypoints: Array
-    nodes: int  # of both trees: what the search took
+    samples: int  # that the search drew and tried to reach
 
 
-def load_planner() -> rrt.RRTPlanner:
+class Planner(rrt.RRTPlanner):
+    """Counts the samples: each costs collision checks, whether or not a tree can grow towards it."""
+
+    samples = 0
+
+    def extend_or_connect(self, *step: Any) -> Any:
+        self.samples += 1
+        return super().extend_or_connect(*step)
+
+
+def load_planner() -> Planner:
     """The arm, its meshes and the obstacles around it. The wheel of pyroboplan contains them."""
     model, collisions, visuals = panda.load_models()
     panda.add_self_collisions(model, collisions)
     panda.add_object_collisions(model, collisions, visuals)
     options = rrt.RRTPlannerOptions(
-        max_step_size=0.03,
-        max_connection_dist=1.0,
+        max_step_size=0.04,
+        max_connection_dist=2.0,
         bidirectional_rrt=True,
         goal_biasing_probability=0.15,
         max_planning_time=PLANNING_S_MAX,
     )
-    return rrt.RRTPlanner(model, collisions, options=options)
+    return Planner(model, collisions, options=options)
 
 
 def distance(start: Array, goal: Array, seed: int) -> float:
@@ -59,13 +70,13 @@ def distance(start: Array, goal: Array, seed: int) -> float:
     return float(np.linalg.norm(goal - start))
 
 
-@task("plan_motion", setup=load_planner, size=distance, work=lambda motion: motion.nodes, types=(Motion,))
-def plan_motion(planner: rrt.RRTPlanner, start: Array, goal: Array, seed: int) -> Motion:
+@task("plan_motion", setup=load_planner, size=distance, work=lambda motion: motion.samples, types=(Motion,))
+def plan_motion(planner: Planner, start: Array, goal: Array, seed: int) -> Motion:
     """A path of the joints from start to goal that touches nothing; the seed draws the samples."""
-    planner.options.rng_seed = seed
+    planner.options.rng_seed, planner.samples = seed, 0
     path = planner.plan(with_hand(start), with_hand(goal)) or []
-    nodes = len(planner.start_tree.nodes) + len(planner.goal_tree.nodes)
-    return Motion(np.array([q[:JOINTS] for q in path]).reshape(-1, JOINTS), nodes)
+    waypoints = np.array([q[:JOINTS] for q in path]).reshape(-1, JOINTS)
+    return Motion(waypoints, max(planner.samples, 1))
 
 
 def inputs(seed: int) -> Iterator[tuple[Array, Array, int]]:
@@ -91,12 +102,15 @@ def with_hand(joints: Array) -> Array:
     return np.concatenate((joints, FINGERS_M))
 
 
-def free_joints(planner: rrt.RRTPlanner, rng: np.random.Generator) -> Array:
-    """Random joints at which the arm touches neither itself nor an obstacle."""
+def free_joints(planner: Planner, rng: np.random.Generator) -> Array:
+    """Random joints at which the arm keeps CLEARANCE_M from itself and from every obstacle."""
     low, high = planner.model.lowerPositionLimit[:JOINTS], planner.model.upperPositionLimit[:JOINTS]
     while True:
         joints = rng.uniform(low, high)
-        if not check_collisions_at_state(planner.model, planner.collision_model, with_hand(joints)):
+        state = with_hand(joints)
+        if not check_collisions_at_state(
+            planner.model, planner.collision_model, state, distance_padding=CLEARANCE_M
+        ):
             return joints
 
 
@@ -108,7 +122,7 @@ def main() -> None:
             motion = offload(plan_motion, start, goal, seed)
             last = offload.last
             print(
-                f"{len(motion.waypoints)} waypoints, {motion.nodes} nodes from {last.used} after "
+                f"{len(motion.waypoints)} waypoints, {motion.samples} samples on {last.used}, "
                 f"{last.waited_s * 1e3:.0f} ms ({last.decision.reason})"
             )
 

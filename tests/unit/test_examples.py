@@ -21,7 +21,7 @@ APPLICATIONS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "apriltags": ("apriltags", "pupil_apriltags", {"shapes": ((480, 640),)}),
     "registration": ("registration", "small_gicp", {"points": (2_000, 4_000)}),
     "signs": ("signs", "rapidocr", {"shape": (240, 320)}),
-    "pose_graph": ("pose-graph", "gtsam", {"poses": (100, 250), "calls": CALLS}),
+    "pose_graph": ("pose-graph", "gtsam", {"poses": (100, 250), "calls": 3}),
     "arm": ("arm", "pyroboplan", {}),
 }
 
