@@ -34,7 +34,7 @@ def server(tasks: str, executor: str) -> Iterator[str]:
 
 @pytest.mark.parametrize("name", APPLICATIONS)
 def test_an_example_says_where_each_call_ran(name: str) -> None:
-    """Every call is answered, and its line names the site and the reason. The process ends without a crash."""
+    """Every call is answered, its line names site and reason, and the process ends without a crash."""
     library, executor = APPLICATIONS[name]
     pytest.importorskip(library, reason=f"needs the extra '{name}': pip install 'offboard[{name}]'")
     with server(f"examples.{name}", executor) as endpoint:
