@@ -22,7 +22,7 @@ except ImportError as error:
 
 Array = np.ndarray[Any, Any]
 
-SHAPE = (540, 960)  # rows, columns: 1.6 MB
+SHAPE = (608, 1080)  # rows, columns: 2 MB
 SIGNS_MAX = 16
 SCORE_TOLERANCE = 0.02
 PLACES = ("EXIT", "LAB", "STOP", "LIFT", "DOCK 7", "ROOM 12", "HALL B", "NO ENTRY", "LOADING BAY", "GATE 21")
