@@ -10,6 +10,7 @@ EXTRAS = {
     "bench": ["bench"],
     "dev": ["dev"],
     "peers": ["peers"],
+    "examples": ["examples", "bench"],
 }
 
 OPTIONS = (
