@@ -20,9 +20,9 @@ from offboard.loadgen.testbed.cpu_quota import CPUS_MAX, CPUS_MIN
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.simulated.config import CallConfig, DriveConfig, RobotConfig
+from offboard.robot_client.simulated.workload import ARRIVALS
 
 ROBOTS_MAX = 64
-ARRIVALS = ("closed", "constant", "poisson", "bursts")
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,13 @@ from typing import Any
 import pytest
 
 from offboard.cloud_server.config import ServerConfig
+from offboard.cloud_server.executors import EXECUTORS
 from offboard.common.command_line import load
 from offboard.loadgen.play.part_setups import setups
 from offboard.loadgen.play.run_files import LineCounter, RobotFiles, clear_folder
 from offboard.loadgen.relay.link.link_settings import as_flags
 from offboard.loadgen.relay.wan import WanConfig
-from offboard.loadgen.scenario.scenario import Scenario, Workload
+from offboard.loadgen.scenario.scenario import CloudPart, Scenario, Workload
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario, shipped
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN
 from offboard.robot_client.records.trace import alone_path, reference_path
@@ -104,3 +105,12 @@ def test_only_whole_lines_are_counted(tmp_path: Path) -> None:
         assert lines.count() == 2
         file.write("ee\n")
         assert lines.count() == 3
+
+
+def test_server_and_scenario_know_the_same_executors() -> None:
+    """Every registered executor can be chosen for a server and in a scenario, and no other name."""
+    for name in EXECUTORS:
+        assert ServerConfig(executor=name).executor == CloudPart(executor=name).executor == name
+    for config in (ServerConfig, CloudPart):
+        with pytest.raises(ConfigError, match=f"is not one of {', '.join(EXECUTORS)}"):
+            config(executor="ray")
