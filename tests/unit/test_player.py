@@ -10,6 +10,7 @@ import pytest
 from offboard.cloud_server.config import ServerConfig
 from offboard.cloud_server.executors import EXECUTORS
 from offboard.common.command_line import load
+from offboard.common.errors import ConfigError
 from offboard.loadgen.play.part_setups import setups
 from offboard.loadgen.play.run_files import LineCounter, RobotFiles, clear_folder
 from offboard.loadgen.relay.link.link_settings import as_flags
