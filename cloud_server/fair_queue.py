@@ -34,9 +34,10 @@ class Work:
 class FairQueue:
     """At most `queue_max` requests. It is fair between robots; each robot is served first come, first served.
 
-    The next request is that of the robot that has had the least worker time. Time without requests counts as
-    served, and a running request counts with the usual run time until it ends (start-time fair queueing,
-    Goyal, Vin and Cheng 1996). If the queue is full, the longest line loses its newest request.
+    The next request is that of the robot that has had the least worker time. A robot gets no credit for a
+    pause: when it returns, it starts with the worker time of the robot that was chosen last. While a request
+    runs, its robot is charged the usual run time (start-time fair queueing, Goyal, Vin and Cheng 1996). If
+    the queue is full, the longest line loses its newest request.
     """
 
     def __init__(self, queue_max: int) -> None:

@@ -1,6 +1,6 @@
 """`loadgen wan`: its settings, and the relay and the HTTP servers that it runs.
 
-The relay is in `tcp.relay`, its HTTP side in `http_control`.
+The relay is in `tcp.relay`, its HTTP control API in `control_api`.
 """
 
 import asyncio

@@ -1,7 +1,7 @@
 """What executions teach the memories, and when: surprises at once, expected times a few tasks later.
 
-A robot with a tenth of a CPU waits ten times as long as it computes between an answer and its next request.
-Therefore it learns the times that it expected while the next task is under way.
+With a tenth of a CPU, every computation between an answer and the next request takes ten times as long.
+Therefore expected times are learnt while the next task is under way.
 What is learnt of one site is in `site`.
 """
 

@@ -56,10 +56,11 @@ class Observation:
 class SiteMemory:
     """The memory of one kind on one site.
 
-    Times under load (LOADED) are learnt apart from other times, in `UnderLoad`. A loaded robot is slow to
-    run, to send and to receive, by more than a factor on its load can say, and it is as fast as before when
-    the load is over. Its round trips then measure the robot, so the last round trip without load is used
-    instead. The time that a loaded server takes beyond the round trip is learnt apart too.
+    Times under load (LOADED) are learnt apart from other times, in `UnderLoad`. On a loaded robot, running,
+    sending and receiving all slow down, by more than one gain on the load can describe. When the load ends,
+    the robot is as fast as before. Under load a round trip measures the robot and not the link, so the last
+    round trip without load is used instead. The time that a loaded server takes beyond the round trip is
+    learnt apart too.
     """
 
     def __init__(

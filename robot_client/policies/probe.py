@@ -20,10 +20,10 @@ class WithProbes:
     A probe makes no caller wait: the first answer is used, and both times are learnt. A silent site is not
     probed, because its first answered heartbeat says more.
 
-    A run onboard takes CPU time from the other tasks of the robot. Therefore onboard is probed less often the
-    slower it should be than the chosen site, by the square of the ratio: a slow run takes longer, and is less
-    likely to show that onboard is better. But a task that is much smaller than all that onboard has run is
-    probed there at once: it ends soon, and its time cannot be predicted yet.
+    A run onboard takes CPU time from the other tasks of the robot. Therefore the number of tasks between two
+    probes of onboard grows with the square of (onboard prediction / prediction of the chosen site): a slow
+    run takes longer, and is less likely to show that onboard is better. But a task that is much smaller than
+    all that onboard has run is probed there at once: it ends soon, and its time cannot be predicted yet.
     """
 
     def __init__(self, inner: Policy) -> None:

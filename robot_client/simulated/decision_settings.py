@@ -34,7 +34,8 @@ class DecisionSettings:
     )
     predictor: str | None = setting(
         None,
-        f"how times are predicted, instead of the way that the policy prefers: {predictors.HELP}",
+        f"predictor to use instead of the one that the policy is meant for: {predictors.HELP}; "
+        "work:NAME learns seconds per unit of work",
         group=DECISIONS,
         rare=True,
         metavar="NAME",

@@ -37,7 +37,8 @@ class Heartbeat:
     """Times the heartbeats of one connection, and measures it.
 
     every_s: usual pause; 0: no heartbeat is sent, and nothing is measured.
-    own_cpu: knows when a task ran onboard, which delays what the robot hears.
+    own_cpu: tells whether a task ran onboard since a given time. During such a run the robot reads answers
+        late, so measured round trips are too long.
     """
 
     def __init__(self, every_s: float, seed: int = 0, own_cpu: OwnCpu | None = None) -> None:
