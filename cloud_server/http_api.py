@@ -166,4 +166,4 @@ def _listen(address: tuple[str, int]) -> socket.socket:
     except OSError as error:
         host, port = address
         reason = (error.strerror or str(error)).partition(" (")[0]  # without the address that Python adds
-        raise ConfigError(f"--http: {host}:{port} cannot be bound: {reason}") from error
+        raise ConfigError(f"--http: {host}:{port} cannot be bound: {reason}; choose another port") from error

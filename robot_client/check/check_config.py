@@ -17,7 +17,7 @@ class CheckConfig:
     )
     tasks: tuple[str, ...] = setting(
         (),
-        "modules whose tasks must be the same on the server (default: the planner, if it is installed)",
+        "modules whose tasks must be the same on the server (default: the planner, if both sides have it)",
         metavar="MODULE,MODULE",
     )
     timeout_s: float = setting(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from offboard.common import VERSION as SOFTWARE
 from offboard.common.empty_task import EMPTY
+from offboard.common.security.exposure import on_loopback
 from offboard.common.security.keys import ROBOT, SERVER, robot_keys
 from offboard.common.tasks import kinds
 from offboard.common.wire import messages as wire
@@ -34,7 +35,7 @@ class Check:
         self._address = Address.of(endpoint)
         self._folder = keys
         self._keys = None if keys is None else robot_keys(keys, CLOUD)
-        self._kinds = load_kinds(modules)
+        self._kinds, self._chosen = load_kinds(modules), bool(modules)
         self._timeout_s = timeout_s
         self._ip = ""
         self._listener = Listener.OTHER
@@ -93,7 +94,7 @@ class Check:
         except ConnectionRefusedError as error:
             raise StepFailed(
                 f"nothing listens on port {port} of {self._ip}",
-                f"start the server with --listen tcp://*:{port}, or correct the port",
+                f"start the server with {_listen_flags(self._ip, port)}, or correct the port",
             ) from error
         except OSError as error:
             raise StepFailed(
@@ -172,7 +173,7 @@ class Check:
 
     def _compare_tasks(self) -> str:
         assert self._server is not None
-        return compare(self._kinds, self._server.tasks)
+        return compare(self._kinds, self._server.tasks, chosen=self._chosen)
 
     def _ping(self) -> str:
         assert self._session is not None
@@ -211,3 +212,10 @@ class Check:
         return (
             f"ran; it waited {1e3 * reply.queue_s:.1f} ms and took {1e3 * reply.run_s:.1f} ms on the server"
         )
+
+
+def _listen_flags(ip: str, port: int) -> str:
+    """The flags of a server that this robot can reach; beyond loopback a server needs keys."""
+    if on_loopback(ip):
+        return f"--listen tcp://{ip}:{port}"
+    return f"--listen 'tcp://*:{port}' --keys keys"

@@ -24,15 +24,20 @@ def load_kinds(modules: Sequence[str]) -> tuple[Kind, ...]:
     return found
 
 
-def compare(tasks: Sequence[Kind], there: Mapping[str, str]) -> str:
-    """What is the same on both sides; `there` holds the source hash of each task of the server."""
+def compare(tasks: Sequence[Kind], there: Mapping[str, str], *, chosen: bool) -> str:
+    """What is the same on both sides; `there` holds the source hash of each task of the server.
+
+    A missing task is a failure only if the user has `chosen` the tasks to compare.
+    """
+    known = ", ".join(sorted(there.keys() - {EMPTY})) or "none"
     for kind in tasks:
         module = kind.function.__module__
         if kind.name not in there:
-            known = ", ".join(sorted(there.keys() - {EMPTY})) or "none"
+            if not chosen:
+                return f"not compared; the server has {known}; name the modules of your tasks with --tasks"
             raise StepFailed(
                 f"the server has no task {kind.name}; it has {known}",
-                f"start the server with --tasks {module}, or name the modules of your tasks with --tasks",
+                f"start the server with --tasks {module}",
             )
         if not kind.source_hash == there[kind.name] != "":
             hashes = f"{_short(kind.source_hash)} here, {_short(there[kind.name])} on the server"
@@ -42,7 +47,7 @@ def compare(tasks: Sequence[Kind], there: Mapping[str, str]) -> str:
             )
     if not tasks:
         return "none to compare; name modules with --tasks"
-    return f"the same on both sides: {', '.join(kind.name for kind in tasks)}"
+    return f"the decorated functions are the same on both sides: {', '.join(kind.name for kind in tasks)}"
 
 
 def _registered_by(modules: Sequence[str]) -> tuple[Kind, ...]:

@@ -127,7 +127,10 @@ class SimulatedRobot:
         # C order, since drawing a few cells from another order first copies all of them.
         free = np.argwhere(largest_component(passable(grid, self.radius_m))).astype(np.int32, order="C")
         if len(free) < 2:
-            raise ConfigError(f"--radius: the map has no room for a robot of radius {self.radius_m:g} m")
+            problem = f"--radius: the map has no room for a robot of radius {self.radius_m:g} m"
+            if grid is not self.prior:
+                problem += " among the boxes of --obstacles; --obstacles 0 leaves them out"
+            raise ConfigError(problem)
         return free
 
     def _set_down(self) -> None:

@@ -197,3 +197,9 @@ def test_a_map_without_room_is_refused() -> None:
     """The ConfigError names the radius of a robot that fits nowhere."""
     with pytest.raises(ConfigError, match="no room for a robot"):
         SimulatedRobot(GridMap(np.full((9, 9), 100, np.int8), 0.1), seed=0)
+
+
+def test_boxes_that_leave_no_room_are_named() -> None:
+    """On a small free map the boxes take the room: the ConfigError names --obstacles."""
+    with pytest.raises(ConfigError, match="--obstacles 0 leaves them out"):
+        SimulatedRobot(GridMap(np.zeros((30, 30), np.int8), 0.03), seed=0, obstacles=40)

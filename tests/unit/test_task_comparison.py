@@ -16,12 +16,19 @@ def kind(name: str, source_hash: str) -> Kind:
 def test_equal_sources_pass() -> None:
     """The text names each task that is the same on both sides."""
     tasks = [kind("add", "a1"), kind("echo", "e1")]
-    assert compare(tasks, {"add": "a1", "echo": "e1", "more": "m"}) == "the same on both sides: add, echo"
+    said = compare(tasks, {"add": "a1", "echo": "e1", "more": "m"}, chosen=True)
+    assert said.endswith("the same on both sides: add, echo")
 
 
 def test_without_tasks_there_is_nothing_to_compare() -> None:
     """The text says how to name tasks."""
-    assert compare([], {"add": "a1"}) == "none to compare; name modules with --tasks"
+    assert compare([], {"add": "a1"}, chosen=False) == "none to compare; name modules with --tasks"
+
+
+def test_a_task_that_nobody_chose_may_be_missing() -> None:
+    """The planner is compared by default, but a server without it is not at fault."""
+    said = compare([kind("plan_path", "p")], {"echo": "e", EMPTY: "x"}, chosen=False)
+    assert said == "not compared; the server has echo; name the modules of your tasks with --tasks"
 
 
 @pytest.mark.parametrize(
@@ -40,7 +47,7 @@ def test_without_tasks_there_is_nothing_to_compare() -> None:
 def test_a_difference_fails_with_a_remedy(here: str, there: dict[str, str], said: str) -> None:
     """A task is missing, its source differs, or its source cannot be read."""
     with pytest.raises(StepFailed) as caught:
-        compare([kind("add", here)], there)
+        compare([kind("add", here)], there, chosen=True)
     assert said in str(caught.value)
     assert "; remedy: " in str(caught.value)
 
