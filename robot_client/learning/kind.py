@@ -50,7 +50,13 @@ class KindMemory:
 
     def site(self, name: str) -> SiteMemory:
         if name not in self.sites:
-            self.sites[name] = SiteMemory(name, self._make, self._objective, self._energy)
+            from offboard.robot_client.learning.parts_memory import PartsMemory
+            from offboard.robot_client.predictors.parts import Parts
+
+            if isinstance(self._make(), Parts):
+                self.sites[name] = PartsMemory(name, self._objective, self._energy)
+            else:
+                self.sites[name] = SiteMemory(name, self._make, self._objective, self._energy)
         return self.sites[name]
 
     def observations(self, site: str) -> int:

@@ -104,7 +104,7 @@ class Learner:
         memory = pending.memory.site(site)
         silent = not execution.ok and memory.conditional and self._conditions.held_up(site)
         outlook = pending.forecast.sites.get(site)
-        if memory.conditional and outlook is not None:
+        if memory.conditional and outlook is not None and not getattr(memory, "parts", False):
             outlook = self._conditions.in_hindsight(outlook, execution)
         second_here = decision.second is not None and decision.second.site == site
         memory.learn(
@@ -140,4 +140,5 @@ def _as_expected(pending: PendingTask, execution: Execution) -> bool:
         and outlook.failures == 0
         and outlook.age < TOGETHER
         and pending.memory.site(execution.site).conditional
+        and not getattr(pending.memory.site(execution.site), "parts", False)
     )

@@ -51,6 +51,10 @@ class Observation:
     bytes: float = 0.0
     cpu_s: float | None = None
     ahead: int = 1
+    run_s: float | None = None
+    queue_s: float | None = None
+    bound: bool = False
+    late: bool = False
 
 
 class SiteMemory:

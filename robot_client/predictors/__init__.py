@@ -42,6 +42,7 @@ _ENTRIES: dict[str, _Entry] = {
     "kalman": _Entry("adaptive", "Kalman"),
     "blind-average": _Entry("average", "blind_average", conditional=True),
     AVERAGE: _Entry("average", "Average", conditional=True),
+    "parts": _Entry("parts", "make_parts", conditional=True),
     "theil-sen": _Entry("robust", "TheilSen"),
     "huber": _Entry("robust", "Huber"),
     "random-forest": _Entry("random_forest", "RandomForest", slow=True),

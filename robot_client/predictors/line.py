@@ -1,0 +1,123 @@
+"""A robust line through the times of one part of a task, which follows a site that changes.
+
+It is a Kalman filter of an intercept and a slope, with three rules for times that a normal distribution does
+not have: an outlier counts only up to a limit, two outliers on the same side are a change, and what outliers
+take beyond the limit is predicted as a mean. What the line describes is up to `parts`.
+"""
+
+import math
+
+NOISE = 0.2  # standard deviation of the first times, as a share of the usual time
+PACE = 0.01  # by which a site becomes slower or faster from one task to the next
+SHAPE = 0.003  # the same for intercept and slope apart from each other
+AHEAD_MAX = 20  # tasks without news, after which the uncertainty grows no more: a site is probed by then
+ODD = 3.0  # standard deviations: a time farther from the line is an outlier
+RATE = 0.05  # of the running means, once there are enough times
+TAIL_MAX = 2.0  # usual times: a longer outlier counts as this much in the mean of the outliers
+RATE_AFTER = 4  # further times that the running means seem to have seen at the start
+VARIANCE_MIN = 1e-6  # so that nothing is divided by 0 where all times are equal
+
+
+class Line:
+    """`a + b x` seconds on top of `known` seconds, for an amount `x` whose usual value is near 1.
+
+    With `together`, `a` and `b` change by the same factor, because a site that slows down is slower for all
+    amounts. Otherwise they change independently, each in proportion to itself: the delay of a link and its
+    bandwidth have nothing to do with each other.
+    """
+
+    __slots__ = (
+        "_noise", "_paa", "_pab", "_pbb", "_side", "_tail", "_together", "_usual", "a", "b", "count",
+    )  # fmt: skip
+
+    def __init__(self, *, together: bool) -> None:
+        self._together = together
+        self.count = 0
+        self.a = self.b = 0.0
+        self._noise = NOISE * NOISE  # variance in units of the squared usual time
+        self._paa = self._pab = self._pbb = 0.0  # the covariance of a and b
+        self._usual = self._tail = 0.0
+        self._side = 0.0  # of the line on which the last time was an outlier; 0: it was none
+
+    @property
+    def tail(self) -> float:
+        """What outliers add to a time in the mean, as a share of it."""
+        return self._tail
+
+    @property
+    def deviation(self) -> float:
+        """The standard deviation of the times, as a share of them."""
+        return math.sqrt(self._noise)
+
+    def at(self, x: float) -> float:
+        """The seconds for this amount."""
+        seconds = self.a + self.b * x
+        return seconds if seconds > 0 else 0.0
+
+    def learn(self, x: float, y: float, known: float = 0.0, ahead: int = 1) -> None:
+        """An amount `x` took `y` seconds beyond `known`; the line had no news for `ahead` tasks."""
+        self.count += 1
+        if self.count == 1:
+            self._begin(x, y, known)
+            return
+        rate = max(RATE, 1.0 / (self.count + RATE_AFTER))
+        error = y - self.a - self.b * x
+        unit = 0.5 * (max(0.0, self.a + self.b * x + known) + self._usual) or 1.0
+        self._usual += rate * (min(y + known, ODD * self._usual) - self._usual)
+        self._loosen(PACE * PACE * min(ahead, AHEAD_MAX), known)
+        if self._together:
+            shape = (SHAPE * (self.a + self.b)) ** 2
+            self._paa += shape
+            self._pbb += shape
+        variance, reach = self._reach(x, unit)
+        side = math.copysign(1.0, error) if abs(error) > reach else 0.0
+        if side < 0 or (side != 0 and side == self._side):
+            error = min(error, unit)  # a change at most doubles the time, until the next one confirms it
+            self._loosen(min(1.0, (error / unit) ** 2), known)
+            variance, reach = self._reach(x, unit)
+        self._side = side
+        beyond = min(max(0.0, error - reach) / unit, TAIL_MAX)
+        self._tail += rate * (beyond - self._tail)
+        seen = max(0.0, min(error * error, 0.5 * reach * reach) - variance) / (unit * unit)
+        self._noise = max(VARIANCE_MIN, self._noise + rate * (seen - self._noise))
+        self._correct(x, max(-reach, min(reach, error)), unit)
+
+    def bound(self, x: float, y: float, known: float) -> None:
+        """The amount `x` takes at most `y` seconds beyond `known`."""
+        if not self.count:
+            self.learn(x, y, known)
+        elif self.a + self.b * x > y:
+            self.a = y - self.b * x
+            self._paa = max(self._paa, self._noise * (self.a + known) ** 2)
+
+    def _begin(self, x: float, y: float, known: float) -> None:
+        self._usual = unit = y + known or 1.0
+        self.b = 0.5 * y if x > 0 else 0.0
+        self.a = y - self.b * x
+        square = self.b * self.b
+        self._paa, self._pab, self._pbb = square * x * x + self._noise * unit * unit, -square * x, square
+
+    def _loosen(self, share: float, known: float) -> None:
+        """Intercept and slope may have changed by the root of this share."""
+        if self._together:
+            self._paa += share * self.a * self.a
+            self._pab += share * self.a * self.b
+            self._pbb += share * self.b * self.b
+        else:
+            self._paa += share * (max(0.0, self.a) + known) ** 2
+            self._pbb += share * self.b * self.b
+
+    def _reach(self, x: float, unit: float) -> tuple[float, float]:
+        """The variance of the line at `x`, and the distance from which a time is an outlier."""
+        variance = self._paa + 2.0 * x * self._pab + x * x * self._pbb
+        return variance, ODD * math.sqrt(max(0.0, variance) + self._noise * unit * unit)
+
+    def _correct(self, x: float, error: float, unit: float) -> None:
+        pa, pb = self._paa + x * self._pab, self._pab + x * self._pbb
+        whole = pa + x * pb + self._noise * unit * unit
+        ka, kb = pa / whole, pb / whole
+        self.a += ka * error
+        self.b += kb * error
+        self._paa -= ka * pa
+        self._pab -= ka * pb
+        self._pbb -= kb * pb
