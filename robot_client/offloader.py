@@ -303,7 +303,8 @@ class Offloader:
         amount = memory.amount(task.size)
         sites = [site for site in self._runners if site not in absent] if absent else self._runners
         forecast = self._forecaster.forecast(
-            memory, task.size, sites, amount=amount, timeout_s=timeout_s, now_s=now_s
+            memory, task.size, sites, amount=amount, timeout_s=timeout_s, now_s=now_s,
+            bytes_to_send=lambda site: self._runners[site].bytes_to_send(task),
         )
         if where is not None:
             check_where(where, task.kind, self._runners)

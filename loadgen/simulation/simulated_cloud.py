@@ -94,6 +94,9 @@ class SimulatedCloud:
             self._clock.at(pending.deadline_s, partial(self._expire, pending))
         return pending.future
 
+    def bytes_to_send(self, task: Task) -> int:
+        return self._costs.task(number_of(task)).bytes_out
+
     def cancel(self, task: Task) -> None:
         pending = self._pending.get(task.id)
         if pending is not None:

@@ -40,6 +40,9 @@ class SimulatedOnboard:
         self.own_cpu.begin()
         return future
 
+    def bytes_to_send(self, task: Task) -> int:  # noqa: ARG002 - nothing is sent
+        return 0
+
     def cancel(self, task: Task) -> None:
         """End the run, even if it has begun: the tasks of scenarios check often if they are cancelled."""
         run, future = self._runs.pop(task.id, (None, None))

@@ -3,7 +3,7 @@
 The times come from the memories; what is measured of the sites comes from `conditions`.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 from offboard.robot_client.learning.conditions import Conditions
 from offboard.robot_client.learning.kind import KindMemory
@@ -30,13 +30,15 @@ class Forecaster:
         amount: float | None,
         timeout_s: float,
         now_s: float,
+        bytes_to_send: Callable[[str], int],
     ) -> Forecast:
         """The forecast of one task on these sites, behind all runs that are under way."""
         outlooks = {}
         for site in sites:
             here, in_flight = memory.site(site), self._flights.count(site)
             condition = self._condition(site, in_flight, now_s) if here.conditional else UNMEASURED
-            outlooks[site] = here.outlook(amount, condition, in_flight=in_flight, timeout_s=timeout_s)
+            more = {"bytes_out": bytes_to_send(site)} if getattr(here, "parts", False) else {}
+            outlooks[site] = here.outlook(amount, condition, in_flight=in_flight, timeout_s=timeout_s, **more)
         return self._with_allowance(memory, size, outlooks)
 
     def forecast_in_batch(

@@ -27,11 +27,12 @@ class Line:
     """
 
     __slots__ = (
-        "_noise", "_paa", "_pab", "_pbb", "_side", "_tail", "_together", "_usual", "a", "b", "count",
+        "_noise", "_paa", "_pab", "_pbb", "_side", "_tail", "_together", "_usual", "a", "b", "count", "slope",
     )  # fmt: skip
 
-    def __init__(self, *, together: bool) -> None:
+    def __init__(self, *, together: bool, slope: float | None = None) -> None:
         self._together = together
+        self.slope = slope
         self.count = 0
         self.a = self.b = 0.0
         self._noise = NOISE * NOISE  # variance in units of the squared usual time
@@ -93,6 +94,8 @@ class Line:
     def _begin(self, x: float, y: float, known: float) -> None:
         self._usual = unit = y + known or 1.0
         self.b = 0.5 * y if x > 0 else 0.0
+        if self.slope is not None:
+            self.b = min(self.b, self.slope)
         self.a = y - self.b * x
         square = self.b * self.b
         self._paa, self._pab, self._pbb = square * x * x + self._noise * unit * unit, -square * x, square

@@ -12,6 +12,7 @@ from offboard.robot_client.predictors.base import Prediction
 from offboard.robot_client.predictors.line import RATE, Line
 from offboard.robot_client.sites.runner import Condition
 
+FIRST_RATE = 12.5e6
 SLOW_RATE = 0.3  # loads are rare and short, so the factor under load is learned from few tasks
 SLOW_AFTER = 6  # runs: only then a slow run under load says something about the load
 
@@ -127,7 +128,9 @@ class Parts:
     def _learn_network(
         self, moved: float, beyond_s: float, rtt_s: float, *, bound: bool, ahead: int
     ) -> None:
-        self._bytes = self._bytes or moved
+        if not self._bytes:
+            self._bytes = moved
+            self.network.slope = moved / FIRST_RATE
         x = moved / self._bytes if self._bytes else 0.0
         if bound:
             self.network.bound(x, beyond_s, rtt_s)

@@ -42,6 +42,10 @@ class BlobUploads:
         """Whether a message after the one of this number carried the blob."""
         return self._last_message.get(digest, 0) > message
 
+    def probably_carried(self, raw: memoryview) -> bool:
+        """Whether an argument like this one was sent before: its length and some of its bytes are equal."""
+        return _sample(raw) in self._samples
+
     def often_new(self, kind: str) -> bool:
         return self._new_in_a_row[kind] >= NEW_AFTER
 
@@ -67,9 +71,7 @@ class InlineRule:
         self._bytes = 0
 
     def __call__(self, raw: memoryview) -> bool:
-        # The step is odd, so that in numbers of 8 bytes each byte has its turn.
-        step = raw.nbytes // SAMPLE_BYTES | 1
-        sample = b"%d:%b" % (raw.nbytes, raw[::step].tobytes())
+        sample = _sample(raw)
         new = sample not in self._samples
         self._samples[sample] = None
         self._samples.move_to_end(sample)
@@ -83,3 +85,10 @@ class InlineRule:
     @property
     def used(self) -> bool:
         return self._bytes > 0
+
+
+def _sample(raw: memoryview) -> bytes:
+    """The length of an argument and a few of its bytes."""
+    # The step is odd, so that in numbers of 8 bytes each byte has its turn.
+    step = raw.nbytes // SAMPLE_BYTES | 1
+    return b"%d:%b" % (raw.nbytes, raw[::step].tobytes())

@@ -25,6 +25,7 @@ from offboard.common.errors import (
 from offboard.common.security.keys import RobotKeys
 from offboard.common.tasks import Kind, Task, kinds
 from offboard.common.wire import messages as wire
+from offboard.common.wire.payload import payload_bytes
 from offboard.robot_client.sites.blob_uploads import BlobUploads
 from offboard.robot_client.sites.cloud_socket import MESSAGE_BYTES_MAX, CloudSocket, SocketEvent
 from offboard.robot_client.sites.connection import Action, Connection, HandshakeFailure
@@ -133,6 +134,9 @@ class CloudRunner:
             if self._reader_wakes_s is not None and pending.deadline_s < self._reader_wakes_s:
                 self._socket.wake()
         return pending.future
+
+    def bytes_to_send(self, task: Task) -> int:
+        return payload_bytes(task.args, self._uploads.probably_carried)
 
     def cancel(self, task: Task) -> None:
         self._cancelled.append(task.id)

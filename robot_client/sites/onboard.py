@@ -104,6 +104,9 @@ class OnboardRunner:
             self._queue.put(run)
         return run.future
 
+    def bytes_to_send(self, task: Task) -> int:  # noqa: ARG002 - nothing is sent
+        return 0
+
     def cancel(self, task: Task) -> None:
         """Remove the task from the queue, or let its run stop early; past ABANDONED_MAX it is left alone."""
         with self._lock:

@@ -102,6 +102,9 @@ class Runner(Protocol):
         A remote runner gives the task up after `budget_s` seconds.
         """
 
+    def bytes_to_send(self, task: "Task") -> int:
+        """About how many bytes a run of this task would send now. Must not block."""
+
     def cancel(self, task: "Task") -> None:
         """The answer is no longer wanted. If the run can be stopped, its future ends now, censored."""
 
