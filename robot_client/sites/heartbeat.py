@@ -99,10 +99,10 @@ class Heartbeat:
             del self._sent[older]
         self._come_back(now_s)
         self._oldest_s = next(iter(self._sent.values()), float("inf"))
-        self._vary(now_s - sent_s)
         if sent_s < self._back_s:
             self.hurry(now_s)  # the silence delayed this answer, so it does not measure the link as it is now
         else:
+            self._vary(now_s - sent_s)
             self._measure(now_s - sent_s, busy=self._own_cpu.since(sent_s))
         self.hear(now_s, report)
 
@@ -151,7 +151,7 @@ class Heartbeat:
             self._back_s = now_s
 
     def _vary(self, round_trip_s: float) -> None:
-        """Learn from every round trip, delayed or not: a link that is always slow is not silent."""
+        """Learn how much round trips vary: a link that is always slow is not silent."""
         if not self._smooth_s:
             self._smooth_s, self._varies_s = round_trip_s, round_trip_s / 2
             return
