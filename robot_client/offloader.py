@@ -19,13 +19,12 @@ from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
 from offboard.common.errors import ConfigError, Overtaken
-from offboard.common.tasks import Kind, Task, kind_of
-from offboard.robot_client import policies, predictors
+from offboard.common.tasks import Task, kind_of
+from offboard.robot_client import policies
 from offboard.robot_client.execution.batch import Batch, Placed, arguments
 from offboard.robot_client.execution.choice import check_where, decided, pinned
 from offboard.robot_client.execution.crossing_check import CrossingCheck
 from offboard.robot_client.execution.race import Plan, Race, answer_of
-from offboard.robot_client.learning.conditions import Conditions
 from offboard.robot_client.learning.forecaster import Forecaster
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.learner import Learner, PendingTask
@@ -84,9 +83,8 @@ class Offloader:
         self._recording: Recording | None = None
         self._clock = clock or SystemClock()
         self._flights = Flights(self._runners)
-        conditions = Conditions(self._runners)
-        self._forecaster = Forecaster(conditions, self._flights, self._allowance)
-        self._learner = Learner(conditions, self._allowance)
+        self._forecaster = Forecaster(self._runners, self._flights, self._allowance)
+        self._learner = Learner(self._runners, self._allowance)
         self._late: deque[Late] = deque(maxlen=LATE_MAX)
         self._crossing = CrossingCheck()
         self._lock = threading.Lock()
@@ -128,8 +126,7 @@ class Offloader:
         rare = settings or Settings()
         chosen, memories = rare.make_policy(policy), rare.make_memories(policy, window)
         servers = ({CLOUD: endpoint} if endpoint else {}) | dict(sites or {})
-        beats = predictors.conditional(rare.predictor_for(policy))
-        heartbeat_s = heartbeat.EVERY_S if beats else 0.0
+        heartbeat_s = heartbeat.EVERY_S if rare.beats(policy) else 0.0
         with ExitStack() as opened:
             recording = Recording(trace=trace, metrics=metrics)
             opened.callback(recording.close)
@@ -193,7 +190,7 @@ class Offloader:
         batch = Batch(
             tasks,
             sites,
-            predict=partial(self._expect, kind, budget_s),
+            predict=partial(self._expect, budget_s),
             run=partial(self._answer, where, budget_s),
             clock=self._clock,
             timeout_s=budget_s,
@@ -215,8 +212,6 @@ class Offloader:
         """Close all runners, trace and metrics, and save what was learnt. Safe to call twice."""
         with self._lock:
             first, self._closed = not self._closed, True
-            if first:
-                self._learner.catch_up()
             last = self._memories.snapshot() if first else None
         for runner in self._runners.values():
             runner.close()
@@ -265,7 +260,6 @@ class Offloader:
         with self._lock:
             self._learn(pending, executions)
             if not self._closed and self._memories.due(self._clock.now_s()):
-                self._learner.catch_up()
                 self._memories.save_soon()
             late, regret = tuple(self._late), self._learner.regret.estimate()
             self._late.clear()
@@ -300,12 +294,8 @@ class Offloader:
         now_s = self._clock.now_s()
         self._allowance.begin(now_s)
         memory = self._memories.of(task.kind, self._runners)
-        amount = memory.amount(task.size)
         sites = [site for site in self._runners if site not in absent] if absent else self._runners
-        forecast = self._forecaster.forecast(
-            memory, task.size, sites, amount=amount, timeout_s=timeout_s, now_s=now_s,
-            bytes_to_send=lambda site: self._runners[site].bytes_to_send(task),
-        )
+        forecast = self._forecaster.forecast(memory, task, sites, timeout_s=timeout_s, now_s=now_s)
         if where is not None:
             check_where(where, task.kind, self._runners)
             decision = pinned(where, forecast)
@@ -316,7 +306,12 @@ class Offloader:
             if placed is None:
                 self._note_move(memory, decision)
         return PendingTask(
-            task=task, id=id, memory=memory, forecast=forecast, amount=amount, decision=decision
+            task=task,
+            id=id,
+            memory=memory,
+            forecast=forecast,
+            amount=memory.amount(task.size),
+            decision=decision,
         )
 
     def _note_move(self, memory: KindMemory, decision: Decision) -> None:
@@ -326,13 +321,13 @@ class Offloader:
             log.info("%s moves to %s: %s", memory.kind.name, decision.site, decision.reason)
         memory.last_site = decision.site
 
-    def _expect(self, kind: Kind, timeout_s: float, size: float, own: Mapping[str, int]) -> Forecast:
+    def _expect(self, timeout_s: float, task: Task, own: Mapping[str, int]) -> Forecast:
         """What a batch is placed by; `own` holds how many of its tasks each site has."""
-        absent = absent_sites(self._runners, kind) if len(own) > 1 else {}
+        absent = absent_sites(self._runners, task.kind) if len(own) > 1 else {}
         present = {site: count for site, count in own.items() if site not in absent}
         with self._lock:
-            memory = self._memories.of(kind, self._runners)
-            return self._forecaster.forecast_in_batch(memory, size, present, timeout_s=timeout_s)
+            memory = self._memories.of(task.kind, self._runners)
+            return self._forecaster.forecast_in_batch(memory, task, present, timeout_s=timeout_s)
 
     def _execute(
         self, pending: PendingTask, timeout_s: float, call: "Future[str] | None"
@@ -346,7 +341,6 @@ class Offloader:
             begun=partial(self._begun, pending),
             allowed=self._take_duplicate,
             late=partial(self._ended_late, pending),
-            idle=self._use_idle_time,
         )
         first: tuple[str, ...] = (decision.site,)
         if decision.both:
@@ -391,8 +385,3 @@ class Offloader:
             self._flights.end(site, pending.task.id)
             if execution.started and not self._closed:
                 self._learner.learn_late(pending, execution)
-
-    def _use_idle_time(self) -> None:
-        with self._lock:
-            if not self._closed:
-                self._learner.use_idle_time()

@@ -21,8 +21,8 @@ from offboard.robot_client.policies.objectives import Mean, Objective
 class Settings:
     """Rare options of an offloader; the defaults suit most robots.
 
-    `predictor`: how times are predicted, by name (None: the predictor that the policy is meant for). A name
-    that begins with `work:` predicts seconds per unit of work, for tasks that tell their work.
+    `predictor`: how times are predicted, by name (None: the predictor that the policy is meant for).
+    `heartbeats`: whether to ask each server twice a second if it is there (None: as the policy needs it).
     `objective`: what the policy makes small; see `policies.objectives`.
     `energy`: what computing, waiting and sending take from the battery, in watts and joules per byte.
     `duplicates`: second runs per task in the long run, from 0 to 1: probes, hedges, warm-up.
@@ -33,6 +33,7 @@ class Settings:
     """
 
     predictor: str | None = None
+    heartbeats: bool | None = None
     objective: Objective = Mean()
     energy: Energy = Energy()
     duplicates: float = DUPLICATES
@@ -54,18 +55,22 @@ class Settings:
         """The name of the predictor: the one in these settings, else the one that the policy is meant for."""
         return policies.predictor_of(policy) if self.predictor is None else self.predictor
 
+    def beats(self, policy: str) -> bool:
+        """Whether the servers are sent heartbeats."""
+        return policies.heartbeats(policy) if self.heartbeats is None else self.heartbeats
+
     def make_memories(self, policy: str, window: int) -> Memories:
         """What is known of each kind: nothing yet, or what the file `memory` holds.
 
         A wrong predictor or window is an error now, and not at the first task.
         """
         name = self.predictor_for(policy)
-        plain = name.removeprefix(predictors.WORK)
-        make = partial(predictors.make, plain, window, self.seed)
+        make = partial(predictors.make, name, window, self.seed)
         make()
         return Memories(
             make,
-            shared_work=name != plain,
+            measured=name == predictors.PARTS or self.beats(policy),
+            shared_work=name == predictors.PARTS,
             objective=self.objective,
             energy=self.energy,
             store=None if self.memory is None else Store(self.memory),

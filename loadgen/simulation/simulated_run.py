@@ -7,7 +7,6 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 from offboard.loadgen.scenario.event_timeline import Timeline
@@ -18,12 +17,11 @@ from offboard.loadgen.simulation.model.lockstep_clock import LockstepClock
 from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks
 from offboard.loadgen.simulation.simulated_testbed import SimulatedTestbed
 from offboard.loadgen.testbed.testbed import ROBOT
-from offboard.robot_client import policies, predictors
-from offboard.robot_client.learning.memories import Memories
+from offboard.robot_client import policies
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import BOTH
-from offboard.robot_client.policies.decision import Named
 from offboard.robot_client.records.trace import Record, as_dict
+from offboard.robot_client.settings import Settings
 from offboard.robot_client.simulated.run import OwnRecord
 from offboard.robot_client.simulated.workload import CLOSED, due_instants
 from offboard.robot_client.sites import heartbeat
@@ -84,18 +82,15 @@ class _Run:
         self._timeline = Timeline(scenario.timeline())
         self._in_flight = 0
         self._queue: deque[tuple[int, float]] = deque()  # tasks that are due, while too many are in flight
-        name = predictor_of(scenario)
-        plain = name.removeprefix(predictors.WORK)
-        heartbeat_s = heartbeat.EVERY_S if predictors.conditional(plain) else 0.0
+        robot = scenario.robot
+        settings = Settings(predictor=robot.predictor, seed=scenario.seed)
+        heartbeat_s = heartbeat.EVERY_S if settings.beats(robot.policy) else 0.0
         self._testbed = SimulatedTestbed(scenario, tasks, self._clock, heartbeat_s=heartbeat_s, noise=noise)
         self._own = OwnRecord()
-        robot = scenario.robot
         self.offload = Offloader(
             [self._testbed.cloud, self._testbed.onboard],
-            policy=Named(policies.make(robot.policy, scenario.seed), robot.policy),
-            memories=Memories(
-                partial(predictors.make, plain, robot.window, scenario.seed), shared_work=name != plain
-            ),
+            policy=settings.make_policy(robot.policy),
+            memories=settings.make_memories(robot.policy, robot.window),
             timeout_s=robot.timeout_s,
             observers=[self._own],
             clock=self._clock,

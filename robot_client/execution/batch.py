@@ -43,7 +43,7 @@ class Placed:
         return Decision(self.site, self.reason, NAME)
 
 
-Predict = Callable[[float, Mapping[str, int]], Forecast]
+Predict = Callable[[Task, Mapping[str, int]], Forecast]
 Run = Callable[[Task, Placed], tuple[Execution, Record]]
 
 
@@ -113,7 +113,7 @@ class Batch:
 
     def _look(self, number: int) -> Forecast:
         own = {site: len(queue.running) for site, queue in self._queues.items()}
-        return self._predict(self._tasks[number].size, own)
+        return self._predict(self._tasks[number], own)
 
     def _warm_up(self, site: str, count: int) -> tuple[int, str, str]:
         """Warm a site up with tasks of different sizes, so that its time is known for all of them."""

@@ -1,60 +1,61 @@
 """The step before a decision: what each site should take for a task.
 
-The times come from the memories; what is measured of the sites comes from `conditions`.
+The times come from the memories; what is measured of the sites comes from the runners in `sites`.
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 
-from offboard.robot_client.learning.conditions import Conditions
+from offboard.common.tasks import Task
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.runs_in_flight import Flights
 from offboard.robot_client.policies import Forecast, Outlook
 from offboard.robot_client.policies.allowance import Allowance
-from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition
+from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Runner
 
 
 class Forecaster:
     """Makes forecasts. Called under the offloader's lock."""
 
-    def __init__(self, conditions: Conditions, flights: Flights, allowance: Allowance) -> None:
-        self._conditions = conditions
+    def __init__(self, runners: Mapping[str, Runner], flights: Flights, allowance: Allowance) -> None:
+        self._runners = runners
         self._flights = flights
         self._allowance = allowance
 
     def forecast(
-        self,
-        memory: KindMemory,
-        size: float,
-        sites: Collection[str],
-        *,
-        amount: float | None,
-        timeout_s: float,
-        now_s: float,
-        bytes_to_send: Callable[[str], int],
+        self, memory: KindMemory, task: Task, sites: Collection[str], *, timeout_s: float, now_s: float
     ) -> Forecast:
         """The forecast of one task on these sites, behind all runs that are under way."""
-        outlooks = {}
+        amount, outlooks = memory.amount(task.size), {}
         for site in sites:
-            here, in_flight = memory.site(site), self._flights.count(site)
-            condition = self._condition(site, in_flight, now_s) if here.conditional else UNMEASURED
-            more = {"bytes_out": bytes_to_send(site)} if getattr(here, "parts", False) else {}
-            outlooks[site] = here.outlook(amount, condition, in_flight=in_flight, timeout_s=timeout_s, **more)
-        return self._with_allowance(memory, size, outlooks)
+            in_flight = self._flights.count(site)
+            condition = self._behind(site, in_flight, now_s) if memory.site(site).measured else UNMEASURED
+            outlooks[site] = memory.site(site).outlook(
+                amount,
+                condition,
+                in_flight=in_flight,
+                timeout_s=timeout_s,
+                bytes_out=self._runners[site].bytes_to_send(task),
+            )
+        return self._with_allowance(memory, task.size, outlooks)
 
     def forecast_in_batch(
-        self, memory: KindMemory, size: float, own: Mapping[str, int], *, timeout_s: float
+        self, memory: KindMemory, task: Task, own: Mapping[str, int], *, timeout_s: float
     ) -> Forecast:
         """The forecast of a task in a batch, without the wait for the batch's own tasks.
 
         `own` holds the sites that may be used, and how many tasks of the batch each of them has.
         """
-        amount = memory.amount(size)
-        outlooks = {}
+        amount, outlooks = memory.amount(task.size), {}
         for site, count in own.items():
-            here = memory.site(site)
-            condition = self._apart_from(site, count) if here.conditional else UNMEASURED
-            outlooks[site] = here.outlook(amount, condition, in_flight=count, timeout_s=timeout_s)
-        return self._with_allowance(memory, size, outlooks)
+            condition = self._apart_from(site, count) if memory.site(site).measured else UNMEASURED
+            outlooks[site] = memory.site(site).outlook(
+                amount,
+                condition,
+                in_flight=count,
+                timeout_s=timeout_s,
+                bytes_out=self._runners[site].bytes_to_send(task),
+            )
+        return self._with_allowance(memory, task.size, outlooks)
 
     def _with_allowance(self, memory: KindMemory, size: float, outlooks: Mapping[str, Outlook]) -> Forecast:
         allowance = self._allowance
@@ -67,12 +68,12 @@ class Forecaster:
             joules_left=allowance.joules_left,
         )
 
-    def _condition(self, site: str, in_flight: int, now_s: float) -> Condition:
+    def _behind(self, site: str, in_flight: int, now_s: float) -> Condition:
         """The condition of a site behind the runs under way there.
 
         Onboard runs one task at a time. The queue of a server may not yet count what was sent to it.
         """
-        condition = self._conditions.now(site)
+        condition = self._runners[site].condition()
         if not in_flight:
             return condition
         if site != ONBOARD:
@@ -80,5 +81,5 @@ class Forecaster:
         return condition._replace(wait_s=self._flights.left_s(site, now_s))
 
     def _apart_from(self, site: str, own: int) -> Condition:
-        condition = self._conditions.now(site)
+        condition = self._runners[site].condition()
         return condition._replace(queue=max(0, condition.queue - own))

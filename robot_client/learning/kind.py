@@ -22,7 +22,8 @@ class KindMemory:
     """The memory of one kind.
 
     `make` makes the predictor of one site. With `shared_work`, and if the kind tells the work of its results,
-    the sites learn seconds per unit of work instead of seconds per size.
+    the sites learn seconds per unit of work instead of seconds per size. With `measured`, heartbeats and load
+    count too.
     """
 
     def __init__(
@@ -33,6 +34,7 @@ class KindMemory:
         objective: Objective,
         energy: Energy,
         shared_work: bool,
+        measured: bool,
     ) -> None:
         self.sites: dict[str, SiteMemory] = {}
         self.last_site: str | None = None  # where the last task was sent
@@ -41,6 +43,7 @@ class KindMemory:
         self._make = make
         self._objective = objective
         self._energy = energy
+        self._measured = measured
         self._work = SharedWork() if shared_work and kind.work is not None else None
 
     @property
@@ -50,13 +53,9 @@ class KindMemory:
 
     def site(self, name: str) -> SiteMemory:
         if name not in self.sites:
-            from offboard.robot_client.learning.parts_memory import PartsMemory
-            from offboard.robot_client.predictors.parts import Parts
-
-            if isinstance(self._make(), Parts):
-                self.sites[name] = PartsMemory(name, self._objective, self._energy)
-            else:
-                self.sites[name] = SiteMemory(name, self._make, self._objective, self._energy)
+            self.sites[name] = SiteMemory(
+                name, self._make, self._objective, self._energy, measured=self._measured
+            )
         return self.sites[name]
 
     def observations(self, site: str) -> int:

@@ -20,6 +20,7 @@ class Memories:
     """One memory for each kind, made when the kind is first seen. Called under the offloader's lock.
 
     `predictor`: makes the predictor of one kind on one site.
+    `measured`: heartbeats and load count too, not only the times of tasks.
     `shared_work`: the sites learn seconds per unit of work for kinds that tell the work of their results.
     `objective`: what the policy makes small (None: the mean time).
     `energy`: what tasks take from the battery.
@@ -30,12 +31,14 @@ class Memories:
         self,
         predictor: Callable[[], Predictor],
         *,
+        measured: bool = False,
         shared_work: bool = False,
         objective: Objective | None = None,
         energy: Energy | None = None,
         store: Store | None = None,
     ) -> None:
         self._predictor = predictor
+        self._measured = measured
         self._shared_work = shared_work
         self._objective = objective or Mean()
         self._energy = energy or Energy()
@@ -52,6 +55,7 @@ class Memories:
                 objective=self._objective,
                 energy=self._energy,
                 shared_work=self._shared_work,
+                measured=self._measured,
             )
             if self._store is not None:
                 self._store.recall(found, sites)

@@ -13,7 +13,7 @@ from offboard.common import VERSION as SOFTWARE
 from offboard.robot_client.learning.site import OBSERVATIONS_MAX, Observation
 from offboard.robot_client.sites.runner import Condition
 
-FORMAT = 1
+FORMAT = 2
 PER_SIZE, PER_WORK = "size", "work"
 
 
@@ -97,9 +97,13 @@ def _observation(given: Any) -> Observation:
         condition=_condition(given["condition"]),
         predicted_s=None if given["predicted_s"] is None else _number(given["predicted_s"], -math.inf),
         waited_s=_number(given["waited_s"]),
-        bytes=_number(given["bytes"]),
+        bytes_out=_number(given["bytes_out"]),
+        bytes_in=_number(given["bytes_in"]),
         cpu_s=_maybe(given["cpu_s"]),
-        ahead=int(_number(given.get("ahead", 1))),  # earlier versions lack it
+        ahead=int(_number(given["ahead"])),
+        run_s=_maybe(given["run_s"]),
+        queue_s=_maybe(given["queue_s"]),
+        bound=_fact(given["bound"]),
     )
 
 
@@ -113,8 +117,8 @@ def _condition(given: Any) -> Condition:
         queue=int(_number(given["queue"])),
         load=_number(given["load"]),
         wait_s=_number(given["wait_s"]),
-        capacity=_share(given.get("capacity", 1.0)),  # earlier versions lack this and the next field
-        server_load=_number(given.get("server_load", 0.0)),
+        capacity=_share(given["capacity"]),
+        server_load=_number(given["server_load"]),
     )
 
 

@@ -45,6 +45,7 @@ class _Rule:
 
     `home`: its file and class. `arguments`: those of the class; a rule that `draws` gets a seeded generator.
     `predictor`: the name of the predictor that the rule is meant for.
+    `heartbeats`: whether the rule is meant for sites that send heartbeats.
     `weighs_cost`: whether an objective other than the expected time changes its decisions.
     """
 
@@ -52,23 +53,20 @@ class _Rule:
     arguments: tuple[str, ...] = ()
     draws: bool = False
     predictor: str = "least-squares"
+    heartbeats: bool = True
     weighs_cost: bool = True
 
 
 _RULES: dict[str, _Rule] = {
-    "paper": _Rule("paper.Paper", weighs_cost=False),
-    ONBOARD: _Rule("always.Always", (ONBOARD,), weighs_cost=False),
-    CLOUD: _Rule("always.Always", (CLOUD,), weighs_cost=False),
-    "greedy": _Rule("greedy.Greedy", predictor="work:average"),
-    "hysteresis": _Rule("greedy.Hysteresis"),
-    "epsilon": _Rule("exploration.Epsilon", draws=True),
-    "linucb": _Rule("exploration.LinUcb", predictor="bayesian-least-squares"),
-    "thompson": _Rule("exploration.Thompson", draws=True, predictor="bayesian-least-squares"),
+    "paper": _Rule("paper.Paper", weighs_cost=False, heartbeats=False),
+    "paper-with-heartbeats": _Rule("paper.Paper", weighs_cost=False),
+    ONBOARD: _Rule("always.Always", (ONBOARD,), weighs_cost=False, heartbeats=False),
+    CLOUD: _Rule("always.Always", (CLOUD,), weighs_cost=False, heartbeats=False),
+    "greedy": _Rule("greedy.Greedy", predictor="parts"),
 }
 _WRAPPERS: dict[str, str] = {
     "probe": "probe.WithProbes",
     "hedge": "hedge.WithHedges",
-    "breaker": "breaker.WithBreaker",
     "budget": "budget.WithBudget",
 }
 HELP = f"{', '.join(_RULES)}, {ALIAS} ({DEFAULT}); any of {', '.join(_WRAPPERS)} may go in front"
@@ -101,6 +99,11 @@ def full_name(name: str) -> str:
 def predictor_of(name: str) -> str:
     """The name of the predictor that a policy is meant for."""
     return _rule(name).predictor
+
+
+def heartbeats(name: str) -> bool:
+    """Whether this policy is meant for sites that send heartbeats."""
+    return _rule(name).heartbeats
 
 
 def weighs_cost(name: str) -> bool:

@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from offboard.common.errors import ConfigError
 from offboard.robot_client.predictors.base import Prediction, Predictor
 
-__all__ = ["LEAST_SQUARES", "Prediction", "Predictor", "check_name", "conditional", "make", "names", "slow"]
+__all__ = ["LEAST_SQUARES", "PARTS", "Prediction", "Predictor", "check_name", "make", "names", "slow"]
 
 LEAST_SQUARES = "least-squares"
-AVERAGE = "average"
-WORK = "work:"  # before any name: times are learnt per work if the kind says how much work a task was
-_NAME, _CLASS = "NAME", "MODULE.CLASS"
+PARTS = "parts"
+_CLASS = "MODULE.CLASS"
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,15 +21,13 @@ class _Entry:
     """What one name stands for.
 
     module, factory: where the predictor is made.
-    follows: what stands after the name and a colon, if anything: another predictor, or a class of river.
-    conditional: it is asked and taught with the measured condition of a site.
+    follows: what stands after the name and a colon, if anything: a class of river.
     slow: one fit takes tenths of a second or more.
     """
 
     module: str
     factory: str
     follows: str = ""
-    conditional: bool = False
     slow: bool = False
 
 
@@ -39,10 +36,7 @@ _ENTRIES: dict[str, _Entry] = {
     "recursive-least-squares": _Entry("least_squares", "RecursiveLeastSquares"),
     "clipped-least-squares": _Entry("adaptive", "ClippedLeastSquares"),
     "bayesian-least-squares": _Entry("adaptive", "BayesianLeastSquares"),
-    "kalman": _Entry("adaptive", "Kalman"),
-    "blind-average": _Entry("average", "blind_average", conditional=True),
-    AVERAGE: _Entry("average", "Average", conditional=True),
-    "parts": _Entry("parts", "make_parts", conditional=True),
+    PARTS: _Entry("parts", "Parts"),
     "theil-sen": _Entry("robust", "TheilSen"),
     "huber": _Entry("robust", "Huber"),
     "random-forest": _Entry("random_forest", "RandomForest", slow=True),
@@ -50,7 +44,6 @@ _ENTRIES: dict[str, _Entry] = {
     "sarima": _Entry("arima", "Sarima", slow=True),
     "lstm": _Entry("lstm", "Lstm", slow=True),
     "river": _Entry("river_model", "River", follows=_CLASS),
-    "features": _Entry("features", "Measured", follows=_NAME, conditional=True),
 }
 
 
@@ -59,7 +52,7 @@ def names() -> tuple[str, ...]:
     return tuple(name for name, entry in _ENTRIES.items() if not entry.follows)
 
 
-HELP = f"{', '.join(names())}, or river:{_CLASS}; features:{_NAME} also uses what is measured of a site"
+HELP = f"{', '.join(names())}, or river:{_CLASS}"
 
 
 def make(name: str, window: int, seed: int = 0) -> Predictor:
@@ -72,18 +65,11 @@ def make(name: str, window: int, seed: int = 0) -> Predictor:
     module = importlib.import_module(f"offboard.robot_client.predictors.{entry.module}")
     factory = getattr(module, entry.factory)
     made: Predictor
-    if entry.follows == _NAME:
-        made = factory(make(rest, window, seed))
-    elif entry.follows == _CLASS:
+    if entry.follows:
         made = factory(rest, window, seed)
     else:
         made = factory(window, seed=seed)
     return made
-
-
-def conditional(name: str) -> bool:
-    """Whether this predictor uses the measured condition of a site."""
-    return _find(name)[0].conditional
 
 
 def slow(name: str) -> bool:
@@ -101,10 +87,8 @@ def check_name(name: str, where: str = "predictor") -> None:
 
 def _find(name: str) -> tuple[_Entry, str]:
     """The entry of a name, and what follows its colon; KeyError if there is no such predictor."""
-    head, colon, rest = name.removeprefix(WORK).partition(":")
+    head, colon, rest = name.partition(":")
     entry = _ENTRIES[head]
     if bool(colon) != bool(entry.follows):
-        raise KeyError(name)
-    if entry.follows == _NAME and (rest.startswith(WORK) or _find(rest)[0].follows == _NAME):
         raise KeyError(name)
     return entry, rest

@@ -23,7 +23,7 @@ class Line:
 
     With `together`, `a` and `b` change by the same factor, because a site that slows down is slower for all
     amounts. Otherwise they change independently, each in proportion to itself: the delay of a link and its
-    bandwidth have nothing to do with each other.
+    bandwidth have nothing to do with each other. `slope`: the largest `b` that one time may suggest.
     """
 
     __slots__ = (
@@ -124,3 +124,17 @@ class Line:
         self._paa -= ka * pa
         self._pab -= ka * pb
         self._pbb -= kb * pb
+
+
+class RunningMean:
+    """The plain mean of the first values, then a mean in which old values fade."""
+
+    __slots__ = ("_count", "value")
+
+    def __init__(self) -> None:
+        self.value = 0.0
+        self._count = 0
+
+    def add(self, one: float) -> None:
+        self._count += 1
+        self.value += max(RATE, 1.0 / self._count) * (one - self.value)
