@@ -64,11 +64,7 @@ def make(name: str, window: int, seed: int = 0) -> Predictor:
     entry, rest = _find(name)
     module = importlib.import_module(f"offboard.robot_client.predictors.{entry.module}")
     factory = getattr(module, entry.factory)
-    made: Predictor
-    if entry.follows:
-        made = factory(rest, window, seed)
-    else:
-        made = factory(window, seed=seed)
+    made: Predictor = factory(rest, window, seed) if entry.follows else factory(window, seed=seed)
     return made
 
 

@@ -1,4 +1,4 @@
-"""The parts model: a task takes its time on the network, in a queue and in its run, and each is learned apart.
+"""The parts model: a task spends time on the network, in a queue and in its run; each is learned apart.
 
 A reply says how long the task waited and ran at the server, so the network took the rest. `line` is what a
 part is learned with; `learning/site.py` decides which executions say anything.
