@@ -30,6 +30,7 @@ class Observation:
     `predicted_s`: the prediction, if the interval learned its error.
     `ahead`: how many tasks after the previous run of the site this one came.
     `run_s`, `queue_s`: what the site measured of them; None: nothing.
+    `own_cpu_s`: CPU seconds of this process during a run onboard.
     `bound`: the robot ran the same task itself and may have received the answer of this site late.
     """
 
@@ -48,6 +49,7 @@ class Observation:
     run_s: float | None = None
     queue_s: float | None = None
     bound: bool = False
+    own_cpu_s: float | None = None
 
 
 class SiteMemory:
@@ -181,6 +183,7 @@ class SiteMemory:
                 run_s=execution.run_s,
                 queue_s=execution.queue_s,
                 bound=beside,
+                own_cpu_s=execution.own_cpu_s,
             )
         )
 
@@ -249,6 +252,7 @@ class SiteMemory:
                 queue_s=one.queue_s,
                 moved=moved,
                 bound=one.bound,
+                own_cpu_s=one.own_cpu_s,
                 condition=one.condition,
             )
         else:
