@@ -78,7 +78,7 @@ def cloud_s(rounds: float, bytes_moved: int) -> float:
     return robot_s + 2 * 0.015 + bytes_moved * 8e-6 / 8 + HASH.cpu_s(rounds)
 
 
-@pytest.mark.parametrize("policy", ["paper", "hedge:probe:greedy", "thompson", "epsilon"])
+@pytest.mark.parametrize("policy", ["paper", "paper-with-heartbeats", "hedge:probe:greedy"])
 @pytest.mark.parametrize("arrivals", ["", 'arrivals = "bursts"\nrate = 12\nburst = 6'])
 def test_a_seed_gives_the_same_run(read: Callable[..., Scenario], policy: str, arrivals: str) -> None:
     """Two runs of a seed are equal, also with several tasks at a time; another seed gives another run."""
