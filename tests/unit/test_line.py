@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 from offboard.robot_client.predictors.line import ODD, TAIL_MAX, Line, RunningMean
 
 
-def taught(*, together: bool = True, noise: float = 0.0, times: int = 40, a: float = 0.1, b: float = 0.3) -> Line:
+def taught(
+    *, together: bool = True, noise: float = 0.0, times: int = 40, a: float = 0.1, b: float = 0.3
+) -> Line:
     """A line that has learned times of `a + b x` with this share of noise."""
     rng, line = Random(1), Line(together=together)
     for _ in range(times):

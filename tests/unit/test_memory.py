@@ -41,9 +41,7 @@ def outlook(
     in_flight: int = 0,
     bytes_out: float = 100.0,
 ) -> Outlook:
-    return of.site(site).outlook(
-        1.0, condition, in_flight=in_flight, timeout_s=2.0, bytes_out=bytes_out
-    )
+    return of.site(site).outlook(1.0, condition, in_flight=in_flight, timeout_s=2.0, bytes_out=bytes_out)
 
 
 def learn(
@@ -217,7 +215,9 @@ def test_the_bytes_of_an_answer_are_those_of_earlier_answers() -> None:
     for n in range(40):
         moved = 1_000_000 + 500_000 * (n % 2)
         seconds = 0.05 + moved / 5e6 + RUN_S
-        learn(one, Execution(CLOUD, seconds, queue_s=0.0, run_s=RUN_S, bytes_out=moved - 10**6, bytes_in=10**6))
+        learn(
+            one, Execution(CLOUD, seconds, queue_s=0.0, run_s=RUN_S, bytes_out=moved - 10**6, bytes_in=10**6)
+        )
         learn(one, lost(CloudBroken("gone"), 0.001))
     assert outlook(one, bytes_out=0.0).predicted_s == pytest.approx(0.05 + 0.2 + RUN_S, rel=0.05)
 

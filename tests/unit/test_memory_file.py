@@ -61,7 +61,7 @@ def test_the_file_is_bounded(robot: Robot) -> None:
 def test_a_file_that_cannot_be_read_is_renamed(
     robot: Robot, caplog: pytest.LogCaptureFixture, text: bytes, reason: str
 ) -> None:
-    """A torn, foreign, older or newer file gives one warning with its name and the reason, and a cold start."""
+    """A torn, foreign, older or newer file gives one warning that says why, and a cold start."""
     robot.path.write_bytes(text)
     with robot.started() as offload:
         assert offload(store_plain, 2.0) == 2.0
@@ -118,7 +118,7 @@ def test_a_capacity_outside_0_to_1_makes_the_file_unreadable(
 def test_a_missing_field_makes_the_file_unreadable(
     robot: Robot, caplog: pytest.LogCaptureFixture, name: str
 ) -> None:
-    """Every field of an observation is needed to learn it again; the warning names the one that is missing."""
+    """Every field of an observation is needed to learn it again; the warning names the missing one."""
     with robot.started() as offload:
         robot.ask(offload, 20)
     whole = json.loads(robot.path.read_bytes())

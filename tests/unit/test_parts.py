@@ -41,9 +41,7 @@ def answer(
 ) -> None:
     """A server answers a task; `slow` is how many times as long it runs."""
     run_s, rtt_s = slow * run_of(size), condition.round_trip_s or 0.0
-    model.learn(
-        size, rtt_s + rest_s + run_s, run_s=run_s, queue_s=0.0, moved=moved, condition=condition
-    )
+    model.learn(size, rtt_s + rest_s + run_s, run_s=run_s, queue_s=0.0, moved=moved, condition=condition)
 
 
 def onboard(times: int = 30, condition: Condition = UNMEASURED, seconds: float | None = None) -> Parts:
@@ -55,9 +53,7 @@ def onboard(times: int = 30, condition: Condition = UNMEASURED, seconds: float |
     return model
 
 
-def predicted_s(
-    model: Parts, size: float = 1.0, condition: Condition = NEAR, moved: float = BYTES
-) -> float:
+def predicted_s(model: Parts, size: float = 1.0, condition: Condition = NEAR, moved: float = BYTES) -> float:
     found = model.predict(size, moved=moved, condition=condition)
     assert found is not None
     return found.seconds

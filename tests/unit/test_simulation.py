@@ -37,14 +37,6 @@ timeout = 0.5
 delay_ms = 15
 bandwidth_mbps = 8
 """
-WORKLOADS = {name: read_scenario(find_scenario(name)).workload for name in shipped()}
-CLOSED = [
-    name
-    for name, workload in WORKLOADS.items()
-    if name not in ("demo", "paper", "congested")
-    and workload.arrivals == "closed"
-    and workload.inputs is None
-]
 
 
 @pytest.fixture
@@ -178,21 +170,6 @@ def test_measured_tasks_run_on_both_sites(read: Callable[..., Scenario]) -> None
     """The first `measure` tasks run on both sites, whatever the policy."""
     run = played(read(workload="measure = 4"), "onboard")
     assert [len(one.sites) for one in run.answered[:6]] == [2, 2, 2, 2, 1, 1]
-
-
-@pytest.mark.timeout(60)  # the real planner plans every task once
-def test_all_shipped_scenarios_without_inputs_can_be_simulated() -> None:
-    """With closed arrivals no task is lost, and no policy is much faster than the oracle."""
-    strategies = {name: {"policy": name} for name in ("paper", "hedge:probe:greedy")}
-    with SimulationPool(1) as batch:
-        for name in CLOSED:
-            scenario = read_scenario(find_scenario(name))
-            check_simulated(scenario)
-            for policy, (run,) in batch.play([scenario], strategies).items():
-                assert [one.i for one in run.answered] == list(range(scenario.workload.tasks)), (name, policy)
-                over = FIGURES["time_over_oracle"].compute(run)
-                assert over is not None, (name, policy)
-                assert 0.95 < over < 3, (name, policy, over)
 
 
 def test_the_cost_of_a_plan_depends_on_its_planner() -> None:
