@@ -11,7 +11,7 @@ from offboard.common.errors import ConfigError
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.outcome_figures import FIGURES
 from offboard.loadgen.scenario.scenario import Scenario
-from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario, shipped
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks, find_tasks
 from offboard.loadgen.simulation.model.task_costs import DECIDING_CPU_S, HASH, START_S
 from offboard.loadgen.simulation.simulated_run import simulate
