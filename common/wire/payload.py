@@ -15,7 +15,7 @@ NUMBER_BYTES = 9  # of a float or a large integer in msgpack
 ARRAY_BYTES = 13  # of the type and the shape of an array
 DATACLASS_BYTES = 6  # around the name and the fields of a dataclass
 ITEMS_MAX = 1000  # of a list that are looked at; the rest of it counts as the mean of them
-PLACES = 4  # of a long list, in which neighbours are looked at: numbers may grow, and may come in groups
+PLACES = 10  # of a long list, in which neighbours are looked at: numbers may grow, and may come in groups
 SHORT_LIST, SHORT_TEXT = 16, 32  # msgpack needs one byte for the length of shorter ones
 
 Known = Callable[[memoryview], bool]
