@@ -50,7 +50,10 @@ class Robot:
             if one.size == ASKED:
                 return Execution(name, 0.0, failure=TaskFailed("this size only reads what is known"))
             seconds = 0.1 + 0.05 * one.size * self.random.uniform(0.9, 1.1)
-            return Execution(name, seconds, one.kind.function(*one.args), bytes_out=100, cpu_s=0.01)
+            value = one.kind.function(*one.args)
+            return Execution(
+                name, seconds, value, queue_s=0.01, run_s=seconds - 0.05, bytes_out=100, cpu_s=0.01
+            )
 
         runner = ScriptedRunner(name, script)
         runner.measured = (
@@ -68,10 +71,9 @@ class Robot:
         **options: Any,
     ) -> Offloader:
         self.windows = []
-        plain = predictor.removeprefix(predictors.WORK)
 
         def remember() -> predictors.Predictor:
-            made = predictors.make(plain, window)
+            made = predictors.make(predictor, window)
             if isinstance(made, LeastSquares):
                 self.windows.append(made)
             return made
@@ -81,7 +83,8 @@ class Robot:
             policy=policies.make(policy, 1),
             memories=Memories(
                 remember,
-                shared_work=plain != predictor,
+                measured=predictor == predictors.PARTS,
+                shared_work=predictor == predictors.PARTS,
                 store=Store(self.path, now=lambda: self.unix_s),
             ),
             clock=self.clock,

@@ -11,8 +11,8 @@ from collections import deque
 from offboard.robot_client.policies.forecast import ERRORS_MIN, PredictionErrors, unit_s
 from offboard.robot_client.policies.objectives import SPREADS_90
 
-COVERAGE = 0.9
-OUTSIDE = 1 - COVERAGE
+COVERAGE = 0.9  # share of the times that an interval should hold
+OUTSIDE = 1 - COVERAGE  # the other times
 OUTSIDE_MIN, OUTSIDE_MAX = -0.1, 0.5  # below 0, the interval is wider than all errors seen
 ERRORS_MAX = 100  # the last ones
 RATE = 0.03  # of the adaptation

@@ -13,7 +13,7 @@ from offboard.common import VERSION as SOFTWARE
 from offboard.robot_client.learning.site import OBSERVATIONS_MAX, Observation
 from offboard.robot_client.sites.runner import Condition
 
-FORMAT = 2
+FORMAT = 2  # version of the file: a file of another version is not read
 PER_SIZE, PER_WORK = "size", "work"
 
 

@@ -8,8 +8,8 @@ from collections import deque
 from dataclasses import dataclass
 
 PROBES_MAX = 200  # the last ones, of all kinds
-PROBES_MIN = 5
-NORMAL_95 = 1.959964
+PROBES_MIN = 5  # with fewer, the interval would be several times the mean
+NORMAL_95 = 1.959964  # standard deviations on each side that hold 95 % of a normal distribution
 
 
 @dataclass(frozen=True, slots=True)

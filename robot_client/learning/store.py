@@ -25,7 +25,7 @@ SAVE_EVERY_S = 30.0  # while tasks run; the file is also saved at the end
 WRITE_WAIT_S = 5.0  # that the end of the process waits for a slow disk
 HALF_LIFE_S = 3600.0  # without the process: after this time, half as many observations are recalled
 OBSERVATIONS_MIN = 5  # of a site; with fewer, the site starts cold
-FILE_BYTES_MAX = 64 * 1024 * 1024
+FILE_BYTES_MAX = 64 * 1024 * 1024  # of a memory file, so that a wrong file does not fill the memory
 
 log = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ from offboard.common.token_bucket import Bucket
 DUPLICATES = 0.1  # second runs per task
 DUPLICATES_MAX = 6.0  # second runs that can be saved up, and that can be owed
 DUPLICATES_FIRST = 6.0  # second runs at the start: about as many as a warm-up takes
-MINUTE_S = 60.0
+MINUTE_S = 60.0  # the caps are per minute
 
 
 class Allowance:

@@ -39,7 +39,7 @@ class Mean:
 class Tail:
     """The time that 95 % of such tasks stay below, in seconds."""
 
-    SHARE = 0.95
+    SHARE = 0.95  # of the times; the others may take longer
 
     def cost(self, expected: Expected, errors: PredictionErrors) -> float:
         below_s = errors.below(expected.seconds, self.SHARE)

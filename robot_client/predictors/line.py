@@ -93,11 +93,10 @@ class Line:
 
     def _begin(self, x: float, y: float, known: float) -> None:
         self._usual = unit = y + known or 1.0
-        self.b = 0.5 * y if x > 0 else 0.0
-        if self.slope is not None:
-            self.b = min(self.b, self.slope)
+        half = 0.5 * y if x > 0 else 0.0  # so uncertain is the slope, even if less of it is believed
+        self.b = half if self.slope is None else min(half, self.slope)
         self.a = y - self.b * x
-        square = self.b * self.b
+        square = half * half
         self._paa, self._pab, self._pbb = square * x * x + self._noise * unit * unit, -square * x, square
 
     def _loosen(self, share: float, known: float) -> None:

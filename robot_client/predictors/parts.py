@@ -87,9 +87,9 @@ class Parts:
         """
         check_observation(size, seconds)
         rtt_s = condition.round_trip_s or 0.0
-        if run_s is None:
+        if run_s is None or not self.remote:  # onboard, a busy CPU also makes the run begin late
             run_s = max(0.0, seconds - rtt_s)
-        elif self.remote:
+        else:
             rest_s = seconds - (queue_s or 0.0) - run_s - rtt_s
             self._learn_network(moved, max(0.0, rest_s), rtt_s, ahead, bound=bound)
         self._learn_run(size, run_s, condition, ahead, own_cpu_s)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from offboard.common.errors import ConfigError
 
 WINDOW = 50  # the default of N
-WINDOW_MAX = 1_000_000
+WINDOW_MAX = 1_000_000  # observations, so that a typing error does not fill the memory
 CANCELLATION_MAX = 1e-3  # sums are recomputed if less than this share of their largest value is left
 
 

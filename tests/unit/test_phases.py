@@ -12,13 +12,14 @@ import pytest
 
 from offboard.common.errors import CloudBroken, CloudBusy, CloudTimeout, OffloadError, TaskFailed
 from offboard.common.tasks import task
-from offboard.robot_client import policies, predictors
+from offboard.robot_client import policies
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Decision, Forecast, Hedge, Policy, Probe
 from offboard.robot_client.policies.allowance import DUPLICATES_MAX, Allowance
 from offboard.robot_client.predictors.least_squares import LeastSquares
 from offboard.robot_client.records.trace import Late, Record
+from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition
 from tests.virtual import VirtualClock, VirtualRunner
 
@@ -288,7 +289,7 @@ FAULTS: list[Callable[[Random], Run]] = [
 
 
 @pytest.mark.parametrize(
-    "policy", ["hedge:probe:greedy", "probe:hedge:breaker:epsilon", "hedge:thompson", "paper"]
+    "policy", ["hedge:probe:greedy", "probe:hedge:paper-with-heartbeats", "budget:hedge:greedy", "paper"]
 )
 @pytest.mark.parametrize("seed", [1, 2])
 def test_no_answer_is_lost_among_random_faults(policy: str, seed: int) -> None:
@@ -296,11 +297,10 @@ def test_no_answer_is_lost_among_random_faults(policy: str, seed: int) -> None:
     rng, clock = Random(seed), VirtualClock()
     sites = {site: VirtualRunner(site, clock) for site in (ONBOARD, CLOUD, EDGE)}
     records: list[Record] = []
-    name = policies.predictor_of(policy)
     offload = Offloader(
         list(sites.values()),
         policy=policies.make(policy, seed),
-        memories=Memories(lambda: predictors.make(name, 20)),
+        memories=Settings().make_memories(policy, 20),
         timeout_s=TIMEOUT_S,
         observers=[records.append],
         clock=clock,

@@ -44,7 +44,6 @@ class Course:
         self.sites = {site: VirtualRunner(site, self.clock) for site in (ONBOARD, CLOUD, EDGE)}
         self.begun: list[tuple[str, float]] = []
         self.late: list[tuple[str, Execution]] = []
-        self.idle: list[list[str]] = []  # the sites that had started by then
         self.allowed = True
 
     def run(self, plan: Plan, function: Callable[[int], int] = race_echo) -> tuple[Execution, ...]:
@@ -56,7 +55,6 @@ class Course:
             begun=lambda site: self.begun.append((site, self.clock.now_s())),
             allowed=lambda: self.allowed,
             late=lambda site, execution: self.late.append((site, execution)),
-            idle=lambda: self.idle.append([site for site, _ in self.begun]),
         )
         return race.run(plan)
 
@@ -119,14 +117,6 @@ def test_the_first_answer_of_a_hedge_counts_and_the_other_run_is_cancelled(
     assert lost.seconds == pytest.approx(waited_s - (0.4 if loser == ONBOARD else 0.0))
     assert [one.args for one in course.sites[loser].cancelled] == [(7,)]
     assert not course.sites[used].cancelled
-
-
-def test_idle_time_is_used_once_after_the_first_sites_have_started(course: Course) -> None:
-    """`idle` is called before the race waits, and before a second site starts."""
-    course.take(onboard=1.0, cloud=0.2)
-    course.run(Plan((ONBOARD,), Hedge(CLOUD, 0.1)))
-    assert course.idle == [[ONBOARD]]
-    assert [site for site, _ in course.begun] == [ONBOARD, CLOUD]
 
 
 def test_a_late_site_is_hurried(course: Course) -> None:

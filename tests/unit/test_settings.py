@@ -42,7 +42,7 @@ def test_values_cannot_be_changed(value: Any, field: str) -> None:
 def test_settings_take_keywords_only() -> None:
     """A setting is never given by its position."""
     with pytest.raises(TypeError):
-        Settings("average")  # type: ignore[misc]
+        Settings("parts")  # type: ignore[misc]
 
 
 def test_each_allowance_is_a_fresh_one() -> None:
@@ -75,7 +75,7 @@ def test_a_record_has_the_policy_as_the_user_named_it(name: str) -> None:
 def test_connect_uses_its_settings(tmp_path: Path) -> None:
     """What was learnt is in the memory file, and `default` is a policy name as any other."""
     path = tmp_path / "memory.json"
-    settings = Settings(memory=path, bytes_a_minute=1e6, predictor="average", seed=3)
+    settings = Settings(memory=path, bytes_a_minute=1e6, predictor="parts", seed=3)
     with Offloader.connect(policy="default", settings=settings) as offload:
         assert offload(echo, 2) == 2
     assert "settings_echo" in path.read_text()
@@ -84,7 +84,7 @@ def test_connect_uses_its_settings(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        (Settings(predictor="averge"), "'averge' is not one of"),
+        (Settings(predictor="part"), "'part' is not one of"),
         (Settings(duplicates=1.5), "must be a share of tasks"),
         (Settings(joules_a_minute=-1.0), "must be 0 or more"),
     ],

@@ -11,7 +11,7 @@ from offboard.common.errors import ConfigError
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.outcome_figures import FIGURES
 from offboard.loadgen.scenario.scenario import Scenario
-from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario, shipped
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks, find_tasks
 from offboard.loadgen.simulation.model.task_costs import DECIDING_CPU_S, HASH, START_S
 from offboard.loadgen.simulation.simulated_run import simulate
@@ -37,14 +37,6 @@ timeout = 0.5
 delay_ms = 15
 bandwidth_mbps = 8
 """
-WORKLOADS = {name: read_scenario(find_scenario(name)).workload for name in shipped()}
-CLOSED = [
-    name
-    for name, workload in WORKLOADS.items()
-    if name not in ("demo", "paper", "congested")
-    and workload.arrivals == "closed"
-    and workload.inputs is None
-]
 
 
 @pytest.fixture
@@ -78,7 +70,7 @@ def cloud_s(rounds: float, bytes_moved: int) -> float:
     return robot_s + 2 * 0.015 + bytes_moved * 8e-6 / 8 + HASH.cpu_s(rounds)
 
 
-@pytest.mark.parametrize("policy", ["paper", "hedge:probe:greedy", "thompson", "epsilon"])
+@pytest.mark.parametrize("policy", ["paper", "paper-with-heartbeats", "hedge:probe:greedy"])
 @pytest.mark.parametrize("arrivals", ["", 'arrivals = "bursts"\nrate = 12\nburst = 6'])
 def test_a_seed_gives_the_same_run(read: Callable[..., Scenario], policy: str, arrivals: str) -> None:
     """Two runs of a seed are equal, also with several tasks at a time; another seed gives another run."""
@@ -178,21 +170,6 @@ def test_measured_tasks_run_on_both_sites(read: Callable[..., Scenario]) -> None
     """The first `measure` tasks run on both sites, whatever the policy."""
     run = played(read(workload="measure = 4"), "onboard")
     assert [len(one.sites) for one in run.answered[:6]] == [2, 2, 2, 2, 1, 1]
-
-
-@pytest.mark.timeout(60)  # the real planner plans every task once
-def test_all_shipped_scenarios_without_inputs_can_be_simulated() -> None:
-    """With closed arrivals no task is lost, and no policy is much faster than the oracle."""
-    strategies = {name: {"policy": name} for name in ("paper", "hedge:probe:greedy")}
-    with SimulationPool(1) as batch:
-        for name in CLOSED:
-            scenario = read_scenario(find_scenario(name))
-            check_simulated(scenario)
-            for policy, (run,) in batch.play([scenario], strategies).items():
-                assert [one.i for one in run.answered] == list(range(scenario.workload.tasks)), (name, policy)
-                over = FIGURES["time_over_oracle"].compute(run)
-                assert over is not None, (name, policy)
-                assert 0.95 < over < 3, (name, policy, over)
 
 
 def test_the_cost_of_a_plan_depends_on_its_planner() -> None:

@@ -17,7 +17,7 @@ TABLES = (
     "heavy-tail",
     "--simulate",
     "--policies",
-    "cloud,hedge:probe:greedy@average",
+    "cloud,hedge:probe:greedy@least-squares",
 )
 FEW = ("--seeds", "2", "--tasks", "40", "--from-task", "10", "--jobs", "1")
 
@@ -37,7 +37,7 @@ def test_a_table_over_all_scenarios_comes_first(printed: Callable[..., str]) -> 
     """The summary has a row for each policy, with mean, worst and every scenario; a table of each follows."""
     tables = json.loads(printed("--format", "json"))["tables"]
     summary, *each = tables
-    assert [line["policy"] for line in summary["scores"]] == ["cloud", "hedge:probe:greedy@average"]
+    assert [line["policy"] for line in summary["scores"]] == ["cloud", "hedge:probe:greedy@least-squares"]
     for line in summary["scores"]:
         figures = [line["on_nonlinear"], line["on_heavy_tail"]]
         assert line["worst"] == max(figures)

@@ -9,6 +9,7 @@ from offboard.common.errors import CloudTimeout
 from offboard.robot_client.learning.store import HALF_LIFE_S
 from offboard.robot_client.policies import Probe
 from offboard.robot_client.policies.probe import STALE
+from offboard.robot_client.predictors import LEAST_SQUARES, PARTS
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.memory_robot import Robot, store_plain, store_worked
 
@@ -18,9 +19,7 @@ def robot(tmp_path: Path) -> Robot:
     return Robot(tmp_path)
 
 
-@pytest.mark.parametrize(
-    "name", ["least-squares", "average", "work:average", "kalman", "features:clipped-least-squares"]
-)
+@pytest.mark.parametrize("name", [LEAST_SQUARES, PARTS])
 def test_a_restart_at_once_predicts_the_same(robot: Robot, name: str) -> None:
     """Predictions, intervals, bytes and joules are equal to 1e-9, with every predictor."""
     with robot.started(name) as offload:
@@ -78,20 +77,20 @@ def test_each_half_life_away_halves_what_is_recalled(robot: Robot, half_lives: f
 def test_a_probe_comes_soon_after_a_restart(robot: Robot) -> None:
     """The slower site counts as STALE, so it is probed as soon as the allowance permits."""
     robot.sites[1].script = lambda one: Execution(CLOUD, 0.9, one.size)
-    with robot.started("average", "probe:greedy") as offload:
+    with robot.started(PARTS, "probe:greedy") as offload:
         robot.ask(offload, 60)
-    with robot.started("average", "probe:greedy") as offload:
+    with robot.started(PARTS, "probe:greedy") as offload:
         for _ in range(12):
             offload(store_plain, robot.random.uniform(1, 5))
     assert [one.decision.second for one in robot.records[-12:]].count(Probe(CLOUD)) == 1
 
 
 def test_every_predictor_learns_from_the_file_of_another_one(robot: Robot) -> None:
-    """Observations per work are learnt again, also by predictors per size."""
-    with robot.started("work:average") as offload:
+    """Observations per work are learnt again, also by a predictor per size."""
+    with robot.started(PARTS) as offload:
         robot.ask(offload, 100, store_worked)
     saved = robot.path.read_bytes()
-    for name in ("least-squares", "kalman", "work:least-squares", "average", "bayesian-least-squares"):
+    for name in (LEAST_SQUARES, PARTS):
         robot.path.write_bytes(saved)
         with robot.started(name, "greedy") as offload:
             predicted_s = robot.outlooks(offload, store_worked)[CLOUD].predicted_s
@@ -100,9 +99,9 @@ def test_every_predictor_learns_from_the_file_of_another_one(robot: Robot) -> No
 
 def test_times_per_size_are_not_recalled_as_times_per_work(robot: Robot) -> None:
     """If the work of the results was not recorded, the sites start cold."""
-    with robot.started("average") as offload:
+    with robot.started(LEAST_SQUARES) as offload:
         robot.ask(offload, 100, store_worked)
-    with robot.started("work:average", "greedy") as offload:
+    with robot.started(PARTS, "greedy") as offload:
         assert robot.outlooks(offload, store_worked)[CLOUD].predicted_s is None
 
 

@@ -6,11 +6,11 @@ import pytest
 
 from offboard.common.errors import CloudTimeout
 from offboard.common.tasks import Task, task
-from offboard.robot_client import policies, predictors
-from offboard.robot_client.learning.memories import Memories
+from offboard.robot_client import policies
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies.probe import PROBE_EVERY
 from offboard.robot_client.records.trace import Record
+from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution
 from tests.fakes import ScriptedRunner
 from tests.phases import EDGE, PHASES, TASKS, WITHIN, check, switch_point
@@ -42,8 +42,10 @@ def test_the_best_living_site_is_used_soon_after_each_change(
         trip_s, work_s = SITES[site]
         if site in failing and site != ONBOARD:
             return Execution(site, TIMEOUT_S, failure=CloudTimeout("late"), censored=True)
-        seconds = (trip_s + work_s * one.size) * random.uniform(1 - NOISE, 1 + NOISE)
-        return Execution(site, seconds * (SLOWED if site in failing else 1.0), one.args[0])
+        slowed = (SLOWED if site in failing else 1.0) * random.uniform(1 - NOISE, 1 + NOISE)
+        run_s = slowed * work_s * one.size
+        seconds = slowed * trip_s + run_s
+        return Execution(site, seconds, one.args[0], queue_s=0.0, run_s=run_s)
 
     def runner(site: str) -> ScriptedRunner:
         return ScriptedRunner(site, lambda one: execution(site, one))
@@ -53,7 +55,7 @@ def test_the_best_living_site_is_used_soon_after_each_change(
     with Offloader(
         [*servers, runner(ONBOARD)],
         policy=policies.make(policies.DEFAULT),
-        memories=Memories(lambda: predictors.make("average", 50)),
+        memories=Settings().make_memories(policies.DEFAULT, 50),
         observers=[records.append],
     ) as offload:
         for fail, _ in PHASES:

@@ -1,0 +1,71 @@
+"""Every shipped scenario in simulation: its checks hold with the default policy."""
+
+import pytest
+
+from offboard.common.errors import ConfigError
+from offboard.loadgen.scenario.outcome_figures import FIGURES
+from offboard.loadgen.scenario.scenario import Scenario
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario, shipped
+from offboard.loadgen.simulation.simulated_testbed import check_simulated
+from offboard.loadgen.simulation.simulation_pool import SimulationPool
+from tests.mazes import warm
+
+warm()  # compiles before the clock of any test runs
+POLICIES = ("default", "paper")
+TASKS_MAX = 200  # of a scenario that is played here
+REAL = {  # figures of real processes: a simulation computes no answers, and has no memory and no overhead
+    "wrong",
+    "unverified",
+    "overhead_ms",
+    "overhead_percent",
+    "memory_growth_percent",
+    "handles_growth_percent",
+}
+LONG = {"demo", "paper", "congested"}  # they make data sets, and have no checks
+
+
+def scenario(name: str) -> Scenario:
+    return read_scenario(find_scenario(name))
+
+
+def refused(name: str) -> bool:
+    """Whether the scenario needs real processes."""
+    try:
+        check_simulated(scenario(name))
+    except ConfigError:
+        return True
+    return False
+
+
+REFUSED = {name for name in shipped() if refused(name)}
+SIMULATED = [name for name in shipped() if name not in REFUSED | LONG]
+
+
+def test_few_scenarios_are_left_out() -> None:
+    """Only applications with inputs, the soak with its faults, and those that make data sets are."""
+    applications = {name for name in shipped() if scenario(name).workload.inputs is not None}
+    assert REFUSED - applications <= {"soak"}
+    assert all(scenario(name).workload.tasks <= TASKS_MAX for name in SIMULATED)
+    assert all(scenario(name).checks for name in SIMULATED)
+    assert not any(scenario(name).checks for name in LONG)
+
+
+@pytest.mark.timeout(30)  # the real planner plans every task once
+@pytest.mark.parametrize("name", SIMULATED)
+def test_the_checks_of_a_scenario_hold_in_simulation(name: str) -> None:
+    """With the default policy, each check that needs no real process does; no policy loses a task.
+
+    The verdicts of the published rule are printed only: some checks are about what it leaves out.
+    """
+    played = scenario(name)
+    with SimulationPool(1) as pool:
+        runs = pool.play([played], {policy: {"policy": policy} for policy in POLICIES})
+    failed = {}
+    for policy, (run,) in runs.items():
+        verdicts = [one.judge(run) for one in played.checks if one.figure not in REAL]
+        print(f"{name} with {policy}:", *verdicts, sep="\n  ")
+        failed[policy] = [str(one) for one in verdicts if not one.holds]
+        assert [one.i for one in run.answered if one.robot == "robot"] == list(range(played.workload.tasks))
+        over = FIGURES["time_over_oracle"].compute(run)
+        assert played.workload.arrivals != "closed" or 0.95 < (over or 0.0) < 3, (policy, over)
+    assert failed["default"] == []
