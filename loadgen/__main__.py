@@ -9,8 +9,7 @@ from typing import TypeVar
 
 from offboard.common.command_line import Command, CommandParser, add_flags, run_commands
 from offboard.common.config import check, resolve, setting
-from offboard.robot_client import predictors
-from offboard.robot_client.simulated.decision_settings import POLICY_HELP
+from offboard.loadgen import rivals
 
 C = TypeVar("C")
 
@@ -42,9 +41,9 @@ class RunConfig:
     )
     seed: int | None = setting(None, "another seed", group=CHANGES, minimum=0)
     tasks: int | None = setting(None, "another number of tasks per robot", group=CHANGES, minimum=1)
-    policy: str | None = setting(None, f"another policy: {POLICY_HELP}", group=CHANGES, metavar="NAME")
+    policy: str | None = setting(None, f"another policy: {rivals.POLICY_HELP}", group=CHANGES, metavar="NAME")
     predictor: str | None = setting(
-        None, f"another predictor: {predictors.HELP}", group=CHANGES, metavar="NAME"
+        None, f"another predictor: {rivals.PREDICTOR_HELP}", group=CHANGES, metavar="NAME"
     )
 
     def __post_init__(self) -> None:
