@@ -122,6 +122,7 @@ def _report(argv: Sequence[str]) -> int:
     parser.add_argument("run", type=Path, metavar="DIR", help="folder of a run, or a trace or CSV file")
     add_flags(parser, ReportConfig, PREFIX)
     flags = parser.parse_args(argv)
+    _find_modules_here()
     return run_report(flags.run, resolve(ReportConfig, flags, environ=os.environ, prefix=PREFIX))
 
 
@@ -170,11 +171,12 @@ def _file_and_config(name: str, cls: type[C], argv: Sequence[str]) -> tuple[Path
     parser.add_argument("trace", type=Path, metavar="TRACE", help=help)
     add_flags(parser, cls, PREFIX)
     flags = parser.parse_args(argv)
+    _find_modules_here()
     return flags.trace, resolve(cls, flags, environ=os.environ, prefix=PREFIX)
 
 
 def _find_modules_here() -> None:
-    """Let the task of a scenario be in a module of the current folder, as `python -m` does."""
+    """Let tasks, predictors and policies be in modules of the current folder, as `python -m` does."""
     sys.path.insert(0, str(Path.cwd()))
 
 

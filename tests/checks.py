@@ -1,5 +1,7 @@
 """The predictor contract, one function per check; tests/unit/test_predictors.py runs them on all predictors.
 
+WINDOWED holds for those whose memory is a window of observations.
+
 Each check gets `make`, which makes a fresh predictor with window WINDOW, always with the same seed.
 """
 
@@ -168,7 +170,6 @@ CONTRACT: tuple[Callable[[Make], None], ...] = (
     predicts_from_the_first_observation,
     predicts_finite_times_of_any_data,
     looks_ahead_without_harm,
-    is_full_after_the_window,
     has_bounded_memory,
     gives_the_same_answers_for_the_same_seed,
     predicts_without_learning,
@@ -176,6 +177,7 @@ CONTRACT: tuple[Callable[[Make], None], ...] = (
     predicts_the_mean_where_all_sizes_are_equal,
     predicts_constant_times,
 )
+WINDOWED: tuple[Callable[[Make], None], ...] = (is_full_after_the_window,)
 
 
 def line(count: int, seed: int = 1) -> list[Row]:

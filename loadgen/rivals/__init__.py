@@ -24,9 +24,9 @@ _SLOW = ("random-forest", "arima", "sarima", "lstm")
 _RULES = {"linucb": "bandits.LinUcb", "thompson": "bandits.Thompson"}
 
 PREDICTORS = (*predictors.names(), *_PREDICTORS)
-PREDICTOR_HELP = f"{', '.join(_PREDICTORS)}, {_RIVER}{MODULE_CLASS}, {predictors.HELP}"
+PREDICTOR_HELP = f"{predictors.HELP}; for comparison: {', '.join(_PREDICTORS)}, {_RIVER}{MODULE_CLASS}"
 RULES = (*policies.names(), *_RULES)
-POLICY_HELP = f"{', '.join(_RULES)}, {policies.HELP}"
+POLICY_HELP = f"{policies.HELP}; for comparison: {', '.join(_RULES)}"
 
 
 def predictor(name: str, where: str = "predictor") -> str:

@@ -64,6 +64,7 @@ _RULES: dict[str, _Rule] = {
     CLOUD: _Rule("always.Always", (CLOUD,), weighs_cost=False, heartbeats=False),
     "greedy": _Rule("greedy.Greedy", predictor="parts"),
 }
+_OWN = _Rule("", predictor="parts")  # a class of a user
 _WRAPPERS: dict[str, str] = {
     "probe": "probe.WithProbes",
     "hedge": "hedge.WithHedges",
@@ -103,8 +104,12 @@ def full_name(name: str) -> str:
 
 
 def predictor_of(name: str) -> str:
-    """The name of the predictor that a policy is meant for."""
-    return _rule(name).predictor
+    """The name of the predictor that a policy is meant for; a class of a user says it in `predictor`."""
+    rule = _rule(name)
+    if rule is not _OWN:
+        return rule.predictor
+    found: str = getattr(find_class(name.rpartition(":")[2], "policy"), "predictor", rule.predictor)
+    return found
 
 
 def heartbeats(name: str) -> bool:
@@ -134,11 +139,8 @@ def check_name(name: str, where: str = "policy", allowed: str = HELP) -> None:
 
 
 def _rule(name: str) -> _Rule:
-    """The rule of a policy; a class of a user may say in `predictor` what it is meant for."""
-    rule = full_name(name).rpartition(":")[2]
-    if rule in _RULES:
-        return _RULES[rule]
-    return _Rule(rule, predictor=getattr(find_class(rule, "policy"), "predictor", _RULES["greedy"].predictor))
+    """The rule of a policy."""
+    return _RULES.get(full_name(name).rpartition(":")[2], _OWN)
 
 
 def _load(home: str) -> Any:
