@@ -1,6 +1,7 @@
 """The predictor and the policy of docs/extending.md, used by the path of their class as a reader would."""
 
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 from offboard.common.class_path import find_class
 from offboard.common.errors import ConfigError, MissingExtra
 from offboard.loadgen import rivals
-from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
+from offboard.loadgen.scenario.scenario_file import read_scenario
 from offboard.loadgen.simulation.simulation_pool import SimulationPool
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.policies.hedge import WithHedges
@@ -20,6 +21,12 @@ from tests.outlooks import decide, known
 
 PAGE = (Path(__file__).parents[2] / "docs" / "extending.md").read_text(encoding="utf-8")
 MODULE = "\n".join(re.findall(r"```python\n(# mymodels\.py\n.*?)```", PAGE, re.DOTALL))
+SMALL = """name = "small"
+[workload]
+task = "offboard.loadgen.scenario.hash_tasks:hash_rounds"
+sizes = ["uniform:1000:30000"]
+tasks = 10
+"""
 CONSTANT, BY_SIZE = "mymodels.Constant", "mymodels.BySize"
 
 
@@ -30,7 +37,8 @@ def mymodels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     (tmp_path / "broken.py").write_text("import nothing_of_this_name\n")
     monkeypatch.syspath_prepend(tmp_path)
     yield
-    monkeypatch.delitem(__import__("sys").modules, "mymodels", raising=False)
+    for name in ("mymodels", "needy"):
+        sys.modules.pop(name, None)
 
 
 def test_the_predictor_keeps_the_contract_but_for_two_checks() -> None:
@@ -70,9 +78,10 @@ def test_settings_and_scenarios_take_the_path() -> None:
     assert (rivals.policy(f"probe:{BY_SIZE}"), rivals.predictor(CONSTANT)) == (f"probe:{BY_SIZE}", CONSTANT)
 
 
-def test_a_rival_and_a_class_of_a_user_play_a_scenario() -> None:
+def test_a_rival_and_a_class_of_a_user_play_a_scenario(tmp_path: Path) -> None:
     """In simulation, a scenario is played with short names and with paths."""
-    scenario = read_scenario(find_scenario("calm")).changed(tasks=10)
+    (tmp_path / "small.toml").write_text(SMALL)
+    scenario = read_scenario(tmp_path / "small.toml")
     strategies = {
         "rivals": {"policy": "hedge:linucb", "predictor": "huber"},
         "user's": {"policy": BY_SIZE, "predictor": CONSTANT},
