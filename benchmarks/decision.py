@@ -79,12 +79,11 @@ def tables() -> list[Table]:
 def _offloader(policy: str, window: int) -> tuple[Offloader, Remembering]:
     """An offloader that has learned both sites well, and its policy."""
     name = policies.predictor_of(policy)
-    plain = name.removeprefix(predictors.WORK)
     kept = Remembering(policies.make(policy))
     offload = Offloader(
         [InstantRunner(ONBOARD), InstantRunner(CLOUD)],
         policy=kept,
-        memories=Memories(lambda: predictors.make(plain, window), shared_work=name != plain),
+        memories=Memories(lambda: predictors.make(name, window), shared_work=name == predictors.PARTS),
     )
     for size in SIZES:
         offload(counted, size, where="both")
@@ -168,12 +167,12 @@ def _predictors() -> Table:
     from sklearn.linear_model import LinearRegression
 
     least = predictors.make(predictors.LEAST_SQUARES, WINDOW)
-    average = predictors.make("average", WINDOW)
+    parts = predictors.make(predictors.PARTS, WINDOW)
     streaming = linear_model.LinearRegression()
     sizes, seconds = np.array(SIZES[:WINDOW]), np.array(SIZES[:WINDOW]) * 0.04
     for size in SIZES[:WINDOW]:
         least.learn(size, 0.04 * size)
-        average.learn(size, 0.04 * size)
+        parts.learn(size, 0.04 * size)
 
     def ours(one: predictors.Predictor) -> Callable[[int], None]:
         def run(count: int) -> None:
@@ -199,7 +198,7 @@ def _predictors() -> Table:
             sizes[n % WINDOW], seconds[n % WINDOW] = size, 0.04 * size
             LinearRegression().fit(sizes[:, np.newaxis], seconds).predict([[size]])
 
-    found = each_of({"least squares": ours(least), "average of three": ours(average), "river": river}, CALLS)
+    found = each_of({"least squares": ours(least), "parts": ours(parts), "river": river}, CALLS)
     found |= each_of({"numpy.polyfit": polyfit, "scikit-learn": sklearn}, CALLS // 10)
     base = found["least squares"]
     rows = [[name, f"{each * 1e6:.2f}", f"{each / base:.1f}"] for name, each in found.items()]

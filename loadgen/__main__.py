@@ -9,8 +9,7 @@ from typing import TypeVar
 
 from offboard.common.command_line import Command, CommandParser, add_flags, run_commands
 from offboard.common.config import check, resolve, setting
-from offboard.robot_client import predictors
-from offboard.robot_client.simulated.decision_settings import POLICY_HELP
+from offboard.loadgen import rivals
 
 C = TypeVar("C")
 
@@ -42,9 +41,9 @@ class RunConfig:
     )
     seed: int | None = setting(None, "another seed", group=CHANGES, minimum=0)
     tasks: int | None = setting(None, "another number of tasks per robot", group=CHANGES, minimum=1)
-    policy: str | None = setting(None, f"another policy: {POLICY_HELP}", group=CHANGES, metavar="NAME")
+    policy: str | None = setting(None, f"another policy: {rivals.POLICY_HELP}", group=CHANGES, metavar="NAME")
     predictor: str | None = setting(
-        None, f"another predictor: {predictors.HELP}", group=CHANGES, metavar="NAME"
+        None, f"another predictor: {rivals.PREDICTOR_HELP}", group=CHANGES, metavar="NAME"
     )
 
     def __post_init__(self) -> None:
@@ -123,6 +122,7 @@ def _report(argv: Sequence[str]) -> int:
     parser.add_argument("run", type=Path, metavar="DIR", help="folder of a run, or a trace or CSV file")
     add_flags(parser, ReportConfig, PREFIX)
     flags = parser.parse_args(argv)
+    _find_modules_here()
     return run_report(flags.run, resolve(ReportConfig, flags, environ=os.environ, prefix=PREFIX))
 
 
@@ -171,11 +171,12 @@ def _file_and_config(name: str, cls: type[C], argv: Sequence[str]) -> tuple[Path
     parser.add_argument("trace", type=Path, metavar="TRACE", help=help)
     add_flags(parser, cls, PREFIX)
     flags = parser.parse_args(argv)
+    _find_modules_here()
     return flags.trace, resolve(cls, flags, environ=os.environ, prefix=PREFIX)
 
 
 def _find_modules_here() -> None:
-    """Let the task of a scenario be in a module of the current folder, as `python -m` does."""
+    """Let tasks, predictors and policies be in modules of the current folder, as `python -m` does."""
     sys.path.insert(0, str(Path.cwd()))
 
 

@@ -46,9 +46,7 @@ def _call(argv: Sequence[str]) -> int:
         "Call a task with numbers or with inputs of yours, one after the other or at a rate. "
         "Each call runs onboard or in the cloud."
     )
-    config = _load(CallConfig, argv, "call", about)
-    _find_modules_here()
-    return _run(config)
+    return _run(_load(CallConfig, argv, "call", about))
 
 
 def _check(argv: Sequence[str]) -> int:
@@ -107,6 +105,7 @@ def _run(config: RobotConfig) -> int:
     from offboard.robot_client.simulated.references import measure_alone
     from offboard.robot_client.simulated.work import make_work
 
+    _find_modules_here()
     answers = Answers(config.answers) if config.answers else None
     if answers and answers.done and isinstance(config, DriveConfig) and not config.jump:
         raise ConfigError(

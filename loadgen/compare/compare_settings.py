@@ -5,10 +5,11 @@ from pathlib import Path
 
 from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError
+from offboard.loadgen import rivals
 from offboard.loadgen.compare.resume import PLAYS_MAX
 from offboard.loadgen.play.play_scenario import TESTBEDS
 from offboard.loadgen.table.table_formats import FORMATS
-from offboard.robot_client import policies, predictors
+from offboard.robot_client import policies
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 SEEDS_MAX = 1000
@@ -22,7 +23,7 @@ class CompareConfig:
 
     policies: tuple[str, ...] = setting(
         ("paper", policies.DEFAULT, ONBOARD, CLOUD),
-        f"policies to compare: {policies.HELP}; POLICY@PREDICTOR uses another predictor than its own",
+        f"policies to compare: {rivals.POLICY_HELP}; POLICY@PREDICTOR uses another predictor than its own",
         metavar="NAME,NAME,..",
     )
     seeds: int = setting(
@@ -93,7 +94,7 @@ def split_strategy(name: str) -> tuple[str, str | None]:
     None: the predictor that the policy brings.
     """
     policy, at, predictor = name.partition("@")
-    policies.check_name(policy, "--policies")
+    rivals.policy(policy, "--policies")
     if at:
-        predictors.check_name(predictor, "--policies")
+        rivals.predictor(predictor, "--policies")
     return policy, predictor if at else None

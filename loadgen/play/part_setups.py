@@ -39,6 +39,7 @@ def setups(scenario: Scenario, out: Path, *, shown: bool = True) -> dict[str, Se
 def _robot_flags(scenario: Scenario, files: RobotFiles, *, first: bool) -> Mapping[str, Any]:
     """Flags of `robot-client drive` or `call`. Only the first robot runs `alone` and `reference`."""
     workload, robot = scenario.workload, scenario.robot
+    policy, predictor = robot.names()
     flags = {
         **(_map_flags(workload) if workload.map else {"task": workload.task, "inputs": workload.inputs}),
         "sizes": _sizes(workload.sizes),
@@ -50,8 +51,8 @@ def _robot_flags(scenario: Scenario, files: RobotFiles, *, first: bool) -> Mappi
         "measure": workload.measure,
         "alone": workload.alone if first else 0,
         "reference": workload.reference if first else 0,
-        "policy": robot.policy,
-        "predictor": robot.predictor,
+        "policy": policy,
+        "predictor": predictor,
         "window": robot.window,
         "timeout": robot.timeout_s,
         "seed": files.seed,

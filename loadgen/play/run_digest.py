@@ -21,6 +21,7 @@ PARTS = (
     "offboard.robot_client",
     "offboard.cloud_server",
     "offboard.loadgen.relay",
+    "offboard.loadgen.rivals",
 )
 
 

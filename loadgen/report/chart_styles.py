@@ -3,11 +3,12 @@
 Drawing is left to `charts.py`.
 """
 
+import zlib
 from dataclasses import dataclass, replace
 from typing import Any
 
+from offboard.loadgen import rivals
 from offboard.loadgen.table.replay import ORACLE, RECORDED
-from offboard.robot_client import policies
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 PAPER = "paper"  # the published rule
@@ -75,8 +76,9 @@ def policy_look(name: str) -> Look:
     """The look of a policy, which is the same in every report."""
     if name in LOOKS:
         return LOOKS[name]
-    further = [other for other in policies.names() if other not in LOOKS]
-    return FURTHER_LOOKS[further.index(name) % len(FURTHER_LOOKS)]
+    further = [other for other in rivals.RULES if other not in LOOKS]
+    number = further.index(name) if name in further else zlib.crc32(name.encode())
+    return FURTHER_LOOKS[number % len(FURTHER_LOOKS)]
 
 
 def predictor_look(look: Look, at: int, count: int) -> Look:

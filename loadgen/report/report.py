@@ -10,6 +10,7 @@ from pathlib import Path
 
 from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError, DataError
+from offboard.loadgen import rivals
 from offboard.loadgen.play.run_files import TRACE
 from offboard.loadgen.report.captions import all_charts
 from offboard.loadgen.report.findings import Findings
@@ -18,7 +19,7 @@ from offboard.loadgen.table import published_table_two as paper
 from offboard.loadgen.table.measured_rows import write_whole
 from offboard.loadgen.table.replay import ORACLE, ReplayConfig
 from offboard.loadgen.table.table_settings import ALL, BOTH, CHOSEN, FULL, TableConfig
-from offboard.robot_client import policies, predictors
+from offboard.robot_client import predictors
 from offboard.robot_client.predictors.window import WINDOW, WINDOW_MAX
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
@@ -35,7 +36,7 @@ class ReportConfig:
         metavar="DIR",
     )
     predictor: str = setting(
-        predictors.LEAST_SQUARES, f"predictor of the policies: {predictors.HELP}", metavar="NAME"
+        predictors.LEAST_SQUARES, f"predictor of the policies: {rivals.PREDICTOR_HELP}", metavar="NAME"
     )
     window: int = setting(WINDOW, "rows of warm-up before the policies decide", minimum=2, maximum=WINDOW_MAX)
     predictors: tuple[str, ...] = setting(
@@ -45,7 +46,7 @@ class ReportConfig:
     )
     policies: tuple[str, ...] = setting(
         ("paper", ONBOARD, CLOUD),
-        f"policies to replay: {policies.HELP}; the chart of decisions shows the first one",
+        f"policies to replay: {rivals.POLICY_HELP}; the chart of decisions shows the first one",
         metavar="NAME,NAME,..",
     )
     feedback: str = setting(
@@ -60,7 +61,7 @@ class ReportConfig:
 
     def __post_init__(self) -> None:
         check(self)
-        predictors.check_name(self.predictor, "--predictor")
+        rivals.predictor(self.predictor, "--predictor")
         self.replay()
         self.table()
 

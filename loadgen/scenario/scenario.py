@@ -11,6 +11,7 @@ from typing import Any
 from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError
 from offboard.common.planning.planner_names import DIJKSTRA, PLANNERS
+from offboard.loadgen import rivals
 from offboard.loadgen.relay.link.link_settings import LinkFlags
 from offboard.loadgen.scenario.event_timeline import AT_TASK_MAX, Event
 from offboard.loadgen.scenario.outcome_figures import FIGURES
@@ -18,7 +19,6 @@ from offboard.loadgen.scenario.pass_fail_check import Check, check_computable
 from offboard.loadgen.scenario.random_faults import Chaos
 from offboard.loadgen.testbed.cpu_quota import CPUS_MAX, CPUS_MIN
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN
-from offboard.robot_client import policies, predictors
 from offboard.robot_client.simulated.config import CallConfig, DriveConfig, RobotConfig
 from offboard.robot_client.simulated.workload import ARRIVALS
 
@@ -104,9 +104,9 @@ class RobotPart:
     """`[robot]`: how each robot decides, and its CPU quota."""
 
     cpus: float = setting(0.2, "CPU quota, in CPUs", minimum=CPUS_MIN, maximum=CPUS_MAX)
-    policy: str = setting("paper", f"policy that chooses the site: {policies.HELP}")
+    policy: str = setting("paper", f"policy that chooses the site: {rivals.POLICY_HELP}")
     predictor: str | None = setting(
-        None, f"predictor, if not the one that the policy brings: {predictors.HELP}"
+        None, f"predictor, if not the one that the policy brings: {rivals.PREDICTOR_HELP}"
     )
     window: int = setting(50, "number of executions remembered for each site", minimum=2)
     timeout_s: float = setting(
@@ -115,9 +115,14 @@ class RobotPart:
 
     def __post_init__(self) -> None:
         check(self)
-        policies.check_name(self.policy, "robot.policy")
-        if self.predictor is not None:
-            predictors.check_name(self.predictor, "robot.predictor")
+        self.names()
+
+    def names(self) -> tuple[str, str | None]:
+        """Policy and predictor, by the names that a robot knows."""
+        policy = rivals.policy(self.policy, "robot.policy")
+        if self.predictor is None:
+            return policy, None
+        return policy, rivals.predictor(self.predictor, "robot.predictor")
 
 
 @dataclass(frozen=True)

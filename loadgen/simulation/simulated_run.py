@@ -18,7 +18,6 @@ from offboard.loadgen.simulation.model.lockstep_clock import LockstepClock
 from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks
 from offboard.loadgen.simulation.simulated_testbed import SimulatedTestbed
 from offboard.loadgen.testbed.testbed import ROBOT
-from offboard.robot_client import policies
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import BOTH
 from offboard.robot_client.records.trace import Record, as_dict
@@ -84,14 +83,15 @@ class _Run:
         self._in_flight = 0
         self._queue: deque[tuple[int, float]] = deque()  # tasks that are due, while too many are in flight
         robot = scenario.robot
-        settings = Settings(predictor=robot.predictor, seed=scenario.seed)
-        heartbeat_s = heartbeat.EVERY_S if settings.beats(robot.policy) else 0.0
+        policy, predictor = robot.names()
+        settings = Settings(predictor=predictor, seed=scenario.seed)
+        heartbeat_s = heartbeat.EVERY_S if settings.beats(policy) else 0.0
         self._testbed = SimulatedTestbed(scenario, tasks, self._clock, heartbeat_s=heartbeat_s, noise=noise)
         self._own = OwnRecord()
         self.offload = Offloader(
             [self._testbed.cloud, self._testbed.onboard],
-            policy=settings.make_policy(robot.policy),
-            memories=settings.make_memories(robot.policy, robot.window),
+            policy=settings.make_policy(policy),
+            memories=settings.make_memories(policy, robot.window),
             timeout_s=robot.timeout_s,
             observers=[self._own],
             clock=self._clock,
@@ -188,9 +188,3 @@ class _Run:
             given_up_s=given_up_s,
             waited_s=waited_s,
         )
-
-
-def predictor_of(scenario: Scenario) -> str:
-    """The predictor of the scenario, or else the default predictor of its policy."""
-    named = scenario.robot.predictor
-    return policies.predictor_of(scenario.robot.policy) if named is None else named

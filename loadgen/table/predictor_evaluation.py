@@ -5,18 +5,25 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 
 from offboard.common.errors import MissingExtra
+from offboard.common.tasks import Kind
+from offboard.loadgen import rivals
 from offboard.loadgen.table import confidence_intervals
 from offboard.loadgen.table.confidence_intervals import Picks
 from offboard.loadgen.table.measured_rows import Column, Rows
 from offboard.loadgen.table.table_settings import ALL, CHOSEN, FULL, FULL_WINDOW, NONE, TableConfig
 from offboard.loadgen.table.table_two_figures import Score, Scored, figures, mean_r, plain
-from offboard.robot_client import predictors
+from offboard.robot_client.learning.memories import Memories
+from offboard.robot_client.learning.site import SiteMemory
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Execution
+
+ROW = Kind("row", function=float, size=float)
+SITES: tuple[str, ...] = (ONBOARD, CLOUD)
 
 
 class Evaluation:
@@ -70,7 +77,7 @@ class Evaluation:
 
     def _predictor_scores(self, name: str, feedback: str) -> Iterator[Score]:
         for window in self._config.windows:
-            if predictors.slow(name) and window != FULL_WINDOW and not self._config.every_window:
+            if rivals.slow(name) and window != FULL_WINDOW and not self._config.every_window:
                 continue
             try:
                 scored = self.predictions(name, window, feedback)
@@ -136,30 +143,29 @@ class Evaluation:
 
 
 def predict(rows: Rows, length: int, *, predictor: str, feedback: str, seed: int) -> tuple[Column, Column]:
-    """The predicted onboard and cloud times of every row after the first `length`; both sites learn those."""
-    onboard, cloud = (predictors.make(predictor, length, seed) for _ in range(2))
-    triples = list(zip(rows.size.tolist(), rows.onboard_s.tolist(), rows.cloud_s.tolist(), strict=True))
-    for size, onboard_s, cloud_s in triples[:length]:
-        onboard.learn(size, onboard_s)
-        cloud.learn(size, cloud_s)
-    predicted = np.empty((2, len(triples) - length))
-    onboard_ahead = cloud_ahead = 1
-    for at, (size, onboard_s, cloud_s) in enumerate(triples[length:]):
-        p_onboard, p_cloud = _seconds(onboard, size, onboard_ahead), _seconds(cloud, size, cloud_ahead)
-        predicted[:, at] = p_onboard, p_cloud
-        to_cloud = p_cloud < p_onboard  # Eq. 1; a tie stays onboard
-        onboard_ahead += 1
-        cloud_ahead += 1
-        if feedback == FULL or (feedback == CHOSEN and not to_cloud):
-            onboard.learn(size, onboard_s)
-            onboard_ahead = 1
-        if feedback == FULL or (feedback == CHOSEN and to_cloud):
-            cloud.learn(size, cloud_s)
-            cloud_ahead = 1
+    """The predicted onboard and cloud times of every row after the first `length`; both sites learn those.
+
+    The memory of a robot asks and teaches the predictors, so that a robot with these times predicts the same.
+    """
+    memory = Memories(partial(rivals.make, predictor, length, seed)).of(ROW, SITES)
+    predicted = np.empty((2, len(rows) - length))
+    triples = zip(rows.size.tolist(), rows.onboard_s.tolist(), rows.cloud_s.tolist(), strict=True)
+    for at, (size, onboard_s, cloud_s) in enumerate(triples, start=-length):
+        learning = SITES
+        if at >= 0:
+            p_onboard, p_cloud = (_seconds(memory.site(site), size) for site in SITES)
+            predicted[:, at] = p_onboard, p_cloud
+            # Eq. 1; a tie stays onboard.
+            chosen = CLOUD if p_cloud < p_onboard else ONBOARD
+            learning = {FULL: SITES, CHOSEN: (chosen,), NONE: ()}[feedback]
+        memory.count_task()
+        for site, seconds in ((ONBOARD, onboard_s), (CLOUD, cloud_s)):
+            if site in learning:
+                memory.site(site).learn(size, Execution(site, seconds), None, silent=False, size=size)
     return predicted[0], predicted[1]
 
 
-def _seconds(predictor: predictors.Predictor, size: float, ahead: int) -> float:
-    prediction = predictor.predict(size, ahead)
-    assert prediction is not None, "a predictor that has learnt something can predict"
-    return prediction.seconds
+def _seconds(memory: SiteMemory, size: float) -> float:
+    outlook = memory.outlook(size, UNMEASURED, in_flight=0, timeout_s=0.0, bytes_out=0.0)
+    assert outlook.predicted_s is not None, "a predictor that has learnt something can predict"
+    return outlook.predicted_s

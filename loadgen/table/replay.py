@@ -14,13 +14,14 @@ import numpy as np
 
 from offboard.common.config import check, setting
 from offboard.common.tasks import Kind, Task, task
+from offboard.loadgen import rivals
 from offboard.loadgen.table import confidence_intervals, table_two_figures
 from offboard.loadgen.table.measured_rows import Column, Rows, read_lived
 from offboard.loadgen.table.measurement_notes import read_noted
 from offboard.loadgen.table.table_formats import Heading, Table, render
 from offboard.loadgen.table.table_settings import BOTH, FULL, MeasuredTimesConfig
 from offboard.loadgen.table.table_two_figures import Scored, Sides
-from offboard.robot_client import policies, predictors
+from offboard.robot_client import policies
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Decision, Forecast, Policy, Probe
@@ -37,11 +38,11 @@ class ReplayConfig(MeasuredTimesConfig):
     """Which policies to replay, and with which predictor."""
 
     policies: tuple[str, ...] = setting(
-        (*policies.names(), policies.DEFAULT), f"policies to replay: {policies.HELP}", metavar="NAME,NAME,.."
+        (*rivals.RULES, policies.DEFAULT), f"policies to replay: {rivals.POLICY_HELP}", metavar="NAME,NAME,.."
     )
     predictor: str | None = setting(
         None,
-        f"predictor for all policies, instead of the one that each policy brings: {predictors.HELP}",
+        f"predictor for all policies, instead of the one that each policy brings: {rivals.PREDICTOR_HELP}",
         metavar="NAME",
     )
     window: int = setting(
@@ -54,9 +55,9 @@ class ReplayConfig(MeasuredTimesConfig):
     def __post_init__(self) -> None:
         check(self)
         for policy in self.policies:
-            policies.check_name(policy, "--policies")
+            rivals.policy(policy, "--policies")
         if self.predictor is not None:
-            predictors.check_name(self.predictor, "--predictor")
+            rivals.predictor(self.predictor, "--predictor")
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,11 +123,12 @@ def replay(
     rows: Rows, policy: str, *, predictor: str | None, window: int, feedback: str, seed: int = 1
 ) -> Replayed:
     """Replay the policy with this name; without a `predictor` it uses its own."""
-    name = policies.predictor_of(policy) if predictor is None else predictor
+    known = rivals.policy(policy)
+    name = policies.predictor_of(known) if predictor is None else predictor
     return replay_policy(
         rows,
-        policies.make(policy, seed),
-        predictor=lambda: predictors.make(name, window, seed),
+        policies.make(known, seed),
+        predictor=lambda: rivals.make(name, window, seed),
         window=window,
         feedback=feedback,
     )
@@ -191,6 +193,9 @@ class _Replaying:
         future: Future[Execution] = Future()
         future.set_result(Execution(self.site, self._seconds[row]))
         return future
+
+    def bytes_to_send(self, task: Task) -> int:  # noqa: ARG002 - nothing is sent
+        return 0
 
     def cancel(self, task: Task) -> None:
         pass

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError
+from offboard.loadgen import rivals
 from offboard.loadgen.table.confidence_intervals import Blocks
 from offboard.loadgen.table.table_formats import FORMATS
 from offboard.robot_client import predictors
@@ -55,7 +56,7 @@ class TableConfig(MeasuredTimesConfig):
     )
     predictors: tuple[str, ...] = setting(
         (predictors.LEAST_SQUARES,),
-        f"predictors to evaluate: {predictors.HELP}; or {ALL}",
+        f"predictors to evaluate: {rivals.PREDICTOR_HELP}; or {ALL}",
         metavar="NAME,NAME,..",
     )
     every_window: bool = setting(
@@ -71,11 +72,11 @@ class TableConfig(MeasuredTimesConfig):
                 raise ConfigError(f"--windows: {window!r} is neither {allowed}")
         for name in self.predictors:
             if name != ALL:
-                predictors.check_name(name, "--predictors")
+                rivals.predictor(name, "--predictors")
 
     def names(self) -> tuple[str, ...]:
         """The predictors by name, each once."""
-        named = (predictors.names() if name == ALL else (name,) for name in self.predictors)
+        named = (rivals.PREDICTORS if name == ALL else (name,) for name in self.predictors)
         return tuple(dict.fromkeys(name for group in named for name in group))
 
 

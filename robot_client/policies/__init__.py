@@ -1,14 +1,15 @@
 """The registry of policies, by name; and the names that a policy is written with.
 
 A policy is named by its rule, with wrappers in front: `hedge:probe:greedy`. `default` stands for that name.
-Rules and wrappers are loaded when they are first made: `--help` only lists their names.
+A rule of a user is named by the path of its class. Rules and wrappers are loaded when they are first made:
+`--help` only lists their names.
 """
 
 import importlib
 from dataclasses import dataclass
-from random import Random
 from typing import TYPE_CHECKING, Any
 
+from offboard.common.class_path import MODULE_CLASS, find_class
 from offboard.common.errors import ConfigError
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
@@ -43,7 +44,7 @@ ALIAS = "default"
 class _Rule:
     """Where a rule is, and what it is made with.
 
-    `home`: its file and class. `arguments`: those of the class; a rule that `draws` gets a seeded generator.
+    `home`: its file and class. `arguments`: those of the class.
     `predictor`: the name of the predictor that the rule is meant for.
     `heartbeats`: whether the rule is meant for sites that send heartbeats.
     `weighs_cost`: whether an objective other than the expected time changes its decisions.
@@ -51,7 +52,6 @@ class _Rule:
 
     home: str
     arguments: tuple[str, ...] = ()
-    draws: bool = False
     predictor: str = "least-squares"
     heartbeats: bool = True
     weighs_cost: bool = True
@@ -64,12 +64,16 @@ _RULES: dict[str, _Rule] = {
     CLOUD: _Rule("always.Always", (CLOUD,), weighs_cost=False, heartbeats=False),
     "greedy": _Rule("greedy.Greedy", predictor="parts"),
 }
+_OWN = _Rule("", predictor="parts")  # a class of a user
 _WRAPPERS: dict[str, str] = {
     "probe": "probe.WithProbes",
     "hedge": "hedge.WithHedges",
     "budget": "budget.WithBudget",
 }
-HELP = f"{', '.join(_RULES)}, {ALIAS} ({DEFAULT}); any of {', '.join(_WRAPPERS)} may go in front"
+HELP = (
+    f"{', '.join(_RULES)}, {ALIAS} ({DEFAULT}), or {MODULE_CLASS} of your own; "
+    f"any of {', '.join(_WRAPPERS)} may go in front"
+)
 
 
 def __getattr__(name: str) -> Any:
@@ -83,8 +87,11 @@ def make(name: str, seed: int = 0) -> "Policy":
     """The policy of this name; policies with the same seed draw the same numbers."""
     check_name(name)
     *wrappers, last = full_name(name).split(":")
-    rule = _RULES[last]
-    policy: Policy = _load(rule.home)(*([Random(seed)] if rule.draws else rule.arguments))
+    policy: Policy
+    if last in _RULES:
+        policy = _load(_RULES[last].home)(*_RULES[last].arguments)
+    else:
+        policy = find_class(last, "policy")(seed=seed)
     for wrapper in reversed(wrappers):
         policy = _load(_WRAPPERS[wrapper])(policy)
     return policy
@@ -97,8 +104,12 @@ def full_name(name: str) -> str:
 
 
 def predictor_of(name: str) -> str:
-    """The name of the predictor that a policy is meant for."""
-    return _rule(name).predictor
+    """The name of the predictor that a policy is meant for; a class of a user says it in `predictor`."""
+    rule = _rule(name)
+    if rule is not _OWN:
+        return rule.predictor
+    found: str = getattr(find_class(name.rpartition(":")[2], "policy"), "predictor", rule.predictor)
+    return found
 
 
 def heartbeats(name: str) -> bool:
@@ -116,19 +127,20 @@ def names() -> tuple[str, ...]:
     return tuple(_RULES)
 
 
-def check_name(name: str, where: str = "policy") -> None:
-    """ConfigError unless `make` knows this name; `where` says where the name was given."""
+def check_name(name: str, where: str = "policy", allowed: str = HELP) -> None:
+    """ConfigError unless all parts of the name are known or a path; `where` names its flag or field."""
     *wrappers, rule = full_name(name).split(":")
-    if rule not in _RULES:
-        raise ConfigError(f"{where}: {name!r} is not one of {HELP}")
+    if rule not in _RULES and "." not in rule:
+        raise ConfigError(f"{where}: {name!r} is not one of {allowed}")
     for n, wrapper in enumerate(wrappers):
         if wrapper not in _WRAPPERS or wrapper in wrappers[:n]:
-            allowed = ", ".join(_WRAPPERS)
-            raise ConfigError(f"{where}: {name!r}: {wrapper!r} is not one of {allowed}, once each")
+            known = ", ".join(_WRAPPERS)
+            raise ConfigError(f"{where}: {name!r}: {wrapper!r} is not one of {known}, once each")
 
 
 def _rule(name: str) -> _Rule:
-    return _RULES[full_name(name).rpartition(":")[2]]
+    """The rule of a policy."""
+    return _RULES.get(full_name(name).rpartition(":")[2], _OWN)
 
 
 def _load(home: str) -> Any:

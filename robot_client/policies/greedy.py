@@ -1,6 +1,6 @@
-"""The rule `greedy`, and `hysteresis`, which is greedy but changes the site less often.
+"""The rule `greedy`: the site with the lowest cost, and the reason in words.
 
-The rules that try worse sites on purpose are in `exploration`.
+The costs come from `objectives`.
 """
 
 from functools import partial
@@ -10,23 +10,17 @@ from offboard.robot_client.policies.forecast import Forecast, Outlook, cheapest,
 from offboard.robot_client.sites.runner import ONBOARD, Condition
 
 WARM_UP = 6  # observations of each site before sites are compared
-MARGIN = 0.1  # of the cost of the last site: another site must cost less by this much
 
 
 class Greedy:
     """Runs each task on the site with the lowest cost, after a short warm-up on all sites."""
 
-    name = "greedy"
-
     def decide(self, forecast: Forecast) -> Decision:
         for outlook in forecast.sites.values():
             if outlook.observations < WARM_UP and (warming := self._warm_up(forecast)) is not None:
                 return warming
-        site = self._choose(forecast, costs_of(forecast))
-        return Decision(site, partial(explain, forecast, site), self.name)
-
-    def _choose(self, forecast: Forecast, costs: dict[str, float]) -> str:  # noqa: ARG002 - other rules use it
-        return cheapest(costs)
+        site = cheapest(costs_of(forecast))
+        return Decision(site, partial(explain, forecast, site), "greedy")
 
     def _warm_up(self, forecast: Forecast) -> Decision | None:
         """Run on all sites except silent ones, unless tasks under way will soon tell enough."""
@@ -36,19 +30,7 @@ class Greedy:
             return None
         reason = f"warm-up: too little is known of {' and '.join(sorted(cold))}"
         silent = tuple(site for site in forecast.sites if site not in heard)
-        return Decision(home(forecast.only(heard)), reason, self.name, both=True, spared=silent)
-
-
-class Hysteresis(Greedy):
-    """Stays on the last site until another one costs less by MARGIN, so that equal sites do not alternate."""
-
-    name = "hysteresis"
-
-    def _choose(self, forecast: Forecast, costs: dict[str, float]) -> str:
-        best, last = cheapest(costs), forecast.last_site
-        if last in costs and costs[best] > (1 - MARGIN) * costs[last]:
-            return last
-        return best
+        return Decision(home(forecast.only(heard)), reason, "greedy", both=True, spared=silent)
 
 
 def explain(forecast: Forecast, site: str) -> str:

@@ -34,8 +34,7 @@ class DecisionSettings:
     )
     predictor: str | None = setting(
         None,
-        f"predictor to use instead of the one that the policy is meant for: {predictors.HELP}; "
-        "work:NAME learns seconds per unit of work",
+        f"predictor to use instead of the one that the policy is meant for: {predictors.HELP}",
         group=DECISIONS,
         rare=True,
         metavar="NAME",

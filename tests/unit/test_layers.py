@@ -49,8 +49,9 @@ FOLDERS: dict[str, set[str]] = {
     "loadgen/relay/toxiproxy": {"loadgen/relay/link", "loadgen/relay/tcp"},
     "loadgen/relay": {"loadgen/relay/link", "loadgen/relay/tcp", "loadgen/relay/toxiproxy"},
     "loadgen/testbed": {"loadgen/relay", "loadgen/relay/link"},
-    "loadgen/table": set(),
-    "loadgen/scenario": {"loadgen/relay/link", "loadgen/table", "loadgen/testbed"},
+    "loadgen/rivals": set(),
+    "loadgen/table": {"loadgen/rivals"},
+    "loadgen/scenario": {"loadgen/relay/link", "loadgen/rivals", "loadgen/table", "loadgen/testbed"},
     "loadgen/play": {"loadgen/scenario", "loadgen/table", "loadgen/testbed"},
     "loadgen/simulation/model": {"loadgen/relay/link", "loadgen/scenario", "loadgen/testbed"},
     "loadgen/simulation": {
@@ -60,8 +61,14 @@ FOLDERS: dict[str, set[str]] = {
         "loadgen/simulation/model",
         "loadgen/testbed",
     },
-    "loadgen/compare": {"loadgen/play", "loadgen/scenario", "loadgen/simulation", "loadgen/table"},
-    "loadgen/report": {"loadgen/play", "loadgen/table"},
+    "loadgen/compare": {
+        "loadgen/play",
+        "loadgen/rivals",
+        "loadgen/scenario",
+        "loadgen/simulation",
+        "loadgen/table",
+    },
+    "loadgen/report": {"loadgen/play", "loadgen/rivals", "loadgen/table"},
 }
 # Heavy or optional libraries, and the files that may import them.
 OWNERS = {
@@ -88,11 +95,11 @@ OWNERS = {
     "PIL": {"common/planning/map_files.py"},
     "yaml": {"common/planning/map_files.py"},
     "matplotlib": {"loadgen/report/chart_parts.py"},
-    "sklearn": {"robot_client/predictors/random_forest.py"},
-    "statsmodels": {"robot_client/predictors/arima.py"},
-    "threadpoolctl": {"robot_client/predictors/arima.py"},
-    "torch": {"robot_client/predictors/lstm.py"},
-    "river": {"robot_client/predictors/river_model.py"},
+    "sklearn": {"loadgen/rivals/random_forest.py"},
+    "statsmodels": {"loadgen/rivals/arima.py"},
+    "threadpoolctl": {"loadgen/rivals/arima.py"},
+    "torch": {"loadgen/rivals/lstm.py"},
+    "river": {"loadgen/rivals/river_model.py"},
 }
 
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from offboard.common.errors import ConfigError
-from offboard.robot_client.predictors import LEAST_SQUARES, Predictor, make
+from offboard.loadgen.rivals import make
+from offboard.robot_client.predictors import LEAST_SQUARES, Predictor
 
 Row = tuple[float, float]  # size, seconds
 
@@ -21,7 +22,7 @@ REFITTED = {"random-forest": ("forest", 10), "arima": ("series", 4), "lstm": ("t
 @pytest.fixture
 def forest() -> Any:
     pytest.importorskip("sklearn", reason="scikit-learn is not installed: `make install`")
-    from offboard.robot_client.predictors import random_forest as forest
+    from offboard.loadgen.rivals import random_forest as forest
 
     return forest
 
@@ -29,7 +30,7 @@ def forest() -> Any:
 @pytest.fixture
 def series() -> Any:
     pytest.importorskip("statsmodels", reason="statsmodels is not installed: `make install`")
-    from offboard.robot_client.predictors import arima as series
+    from offboard.loadgen.rivals import arima as series
 
     return series
 
@@ -42,7 +43,7 @@ def torch() -> Any:
 @pytest.fixture
 def online() -> Any:
     pytest.importorskip("river", reason="river is not installed: `make install`")
-    from offboard.robot_client.predictors import river_model as online
+    from offboard.loadgen.rivals import river_model as online
 
     return online
 
@@ -332,10 +333,9 @@ def test_if_the_model_has_no_answer_the_mean_is_predicted(
             return answer
 
     monkeypatch.setattr(online, "load", lambda *_: Mute())
-    assert seconds(taught("river:mute", 5, [(1.0, 0.1), (2.0, 0.2), (3.0, 0.6)]), 2.0) == pytest.approx(0.3)
+    assert seconds(taught("river:a.Mute", 5, [(1.0, 0.1), (2.0, 0.2), (3.0, 0.6)]), 2.0) == pytest.approx(0.3)
 
 
-@pytest.mark.usefixtures("online")
 @pytest.mark.parametrize(
     ("path", "said"),
     [
@@ -357,12 +357,23 @@ def test_if_the_model_has_no_answer_the_mean_is_predicted(
         ("a\nb.C", "no regressor"),
     ],
 )
-def test_an_unusable_path_of_river_is_refused(path: str, said: str) -> None:
+def test_an_unusable_path_of_river_is_refused(online: Any, path: str, said: str) -> None:
     """One line names the path and the alternatives, and nothing outside of river is loaded."""
     with pytest.raises(ConfigError) as refused:
-        make(f"river:{path}", 50)
+        online.load(path, seed=0)
     text = str(refused.value)
     assert text.startswith(f"predictor {f'river:{path}'!r} ")
     assert said in text
     assert "\n" not in text
     assert "this" not in sys.modules
+
+
+@pytest.mark.usefixtures("online")
+def test_a_name_of_river_that_stands_for_nothing_is_refused() -> None:
+    """A wrong class gets the error of above. A name without a package is no name of a predictor."""
+    with pytest.raises(ConfigError, match=r"'river:tree.HoeffdingTree' is no regressor of river, such as "):
+        make("river:tree.HoeffdingTree", 50)
+    with pytest.raises(
+        ConfigError, match=r"'river:tree' is not one of least-squares, .* river:MODULE.CLASS$"
+    ):
+        make("river:tree", 50)

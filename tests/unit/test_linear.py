@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from offboard.common.errors import ConfigError
-from offboard.robot_client.predictors.least_squares import RecursiveLeastSquares
+from offboard.loadgen.rivals.recursive import RecursiveLeastSquares
 from tests.checks import Row, line, teach
 
 RELATIVE = 1e-9

@@ -6,20 +6,21 @@ from itertools import permutations
 import pytest
 
 from offboard.common.errors import ConfigError
+from offboard.loadgen import rivals
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.policies.hedge import WithHedges
 from tests import policy_checks
 
-WRAPPERS = ("probe", "hedge", "breaker", "budget")
-WRAPPINGS = [":".join(some) for count in range(5) for some in permutations(WRAPPERS, count)]
+WRAPPERS = ("probe", "hedge", "budget")
+WRAPPINGS = [":".join(some) for count in range(4) for some in permutations(WRAPPERS, count)]
 
 
-@pytest.mark.parametrize("rule", policies.names())
+@pytest.mark.parametrize("rule", rivals.RULES)
 @pytest.mark.parametrize("check", policy_checks.CONTRACT, ids=lambda check: check.__name__)
 def test_contract(check: Callable[[policy_checks.Make], None], rule: str) -> None:
     """Every check of the contract holds for every rule in every order of wrappers."""
     for wrapping in WRAPPINGS:
-        name = f"{wrapping}:{rule}".removeprefix(":")
+        name = rivals.policy(f"{wrapping}:{rule}".removeprefix(":"))
         try:
             check(lambda name=name: policies.make(name, seed=3))
         except Exception as error:
@@ -30,13 +31,13 @@ def test_contract(check: Callable[[policy_checks.Make], None], rule: str) -> Non
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("gredy", "'gredy' is not one of paper, onboard, cloud, greedy"),
+        ("gredy", "'gredy' is not one of paper, paper-with-heartbeats, onboard, cloud, greedy, default"),
         ("", "'' is not one of paper"),
         ("hedge", "'hedge' is not one of paper"),
-        ("hegde:greedy", "'hegde' is not one of probe, hedge, breaker, budget, once each"),
-        ("hedge:hedge:greedy", "'hedge' is not one of probe, hedge, breaker, budget, once each"),
-        (":greedy", "'' is not one of probe, hedge, breaker, budget, once each"),
-        ("hedge:default", "'hedge' is not one of probe, hedge, breaker, budget, once each"),
+        ("hegde:greedy", "'hegde' is not one of probe, hedge, budget, once each"),
+        ("hedge:hedge:greedy", "'hedge' is not one of probe, hedge, budget, once each"),
+        (":greedy", "'' is not one of probe, hedge, budget, once each"),
+        ("hedge:default", "'hedge' is not one of probe, hedge, budget, once each"),
     ],
 )
 def test_the_error_for_a_wrong_name_is_one_line(name: str, says: str) -> None:
@@ -59,7 +60,7 @@ def test_default_is_a_name_like_any_other() -> None:
     assert policies.weighs_cost("default")
 
 
-@pytest.mark.parametrize("name", policies.names())
+@pytest.mark.parametrize("name", [rivals.policy(rule) for rule in rivals.RULES])
 def test_every_rule_names_a_predictor_that_exists(name: str) -> None:
     """The predictor that a policy is meant for can be made, and wrappers do not change it."""
     assert predictors.make(policies.predictor_of(f"hedge:probe:{name}"), 5).predict(1.0) is None

@@ -1,4 +1,4 @@
-"""The predictor contract for every predictor, and the registry."""
+"""The predictor contract for every predictor and every rival, and their registries."""
 
 import subprocess
 import sys
@@ -8,17 +8,18 @@ from pathlib import Path
 import pytest
 
 from offboard.common.errors import ConfigError, MissingExtra
+from offboard.loadgen import rivals
 from offboard.robot_client import predictors
 from offboard.robot_client.predictors import Predictor
 from tests import checks
 
 ROOT = Path(__file__).parents[2]
 BAYES = "river:linear_model.BayesianLinearRegression"
-NAMES = (*predictors.names(), BAYES)
-
+NAMES = (*rivals.PREDICTORS, BAYES)
+WINDOWED = tuple(name for name in NAMES if name != predictors.PARTS)
 
 # Limits of the error on a straight line, as a share of the error of the mean time.
-GAINS = dict.fromkeys(NAMES, 0.05) | {"random-forest": 0.2, "lstm": 0.3}
+GAINS = dict.fromkeys(NAMES, 0.05) | {predictors.PARTS: 0.1, "random-forest": 0.2, "lstm": 0.3}
 EXTRAS = {  # for each predictor, the library that it needs, and the extra that installs it
     "random-forest": ("sklearn", "learned"),
     "arima": ("statsmodels", "learned"),
@@ -26,7 +27,7 @@ EXTRAS = {  # for each predictor, the library that it needs, and the extra that 
     "lstm": ("torch", "lstm"),
     BAYES: ("river", "river"),
 }
-BASE = tuple(name for name in predictors.names() if name not in EXTRAS)
+BASE = tuple(name for name in rivals.PREDICTORS if name not in EXTRAS)
 HEAVY = ("sklearn", "statsmodels", "river", "torch", "scipy", "pandas")
 
 
@@ -35,7 +36,7 @@ def name(request: pytest.FixtureRequest) -> str:
     """Each predictor whose library is installed."""
     name: str = request.param
     try:
-        predictors.make(name, checks.WINDOW)
+        rivals.make(name, checks.WINDOW)
     except MissingExtra as missing:
         pytest.skip(str(missing))
     return name
@@ -43,12 +44,19 @@ def name(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def make(name: str) -> Callable[[], Predictor]:
-    return lambda: predictors.make(name, checks.WINDOW, seed=3)
+    return lambda: rivals.make(name, checks.WINDOW, seed=3)
 
 
 @pytest.mark.parametrize("check", checks.CONTRACT, ids=lambda check: check.__name__)
 def test_contract(check: Callable[[checks.Make], None], make: checks.Make) -> None:
     """Every check of the contract holds for every predictor."""
+    check(make)
+
+
+@pytest.mark.parametrize("name", WINDOWED, indirect=True)
+@pytest.mark.parametrize("check", checks.WINDOWED, ids=lambda check: check.__name__)
+def test_contract_of_a_window(check: Callable[[checks.Make], None], make: checks.Make) -> None:
+    """Every check of the contract holds for every predictor that remembers a window."""
     check(make)
 
 
@@ -58,19 +66,33 @@ def test_a_line_is_learnt(name: str, make: checks.Make) -> None:
 
 
 def test_an_unknown_name_is_refused_with_all_names() -> None:
-    """The error lists every name, and how names of river are written."""
-    for refuse in (predictors.check_name, lambda name: predictors.make(name, 50)):
+    """The error lists every name. A robot knows two; the test bench knows the rivals and river too."""
+    more = (*rivals.PREDICTORS, "river:MODULE.CLASS")
+    for refuse, names in (
+        (predictors.check_name, predictors.names()),
+        (lambda name: predictors.make(name, 50), predictors.names()),
+        (rivals.predictor, more),
+        (lambda name: rivals.make(name, 50), more),
+    ):
         with pytest.raises(ConfigError) as refused:
             refuse("theil-send")
-        for part in ("'theil-send'", *predictors.names(), "river:MODULE.CLASS"):
+        for part in ("'theil-send'", *names, "or MODULE.CLASS of your own"):
             assert part in str(refused.value)
 
 
+def test_a_robot_knows_a_rival_by_its_path(name: str) -> None:
+    """What `loadgen` passes to a robot is a name of the robot, and makes the same predictor."""
+    known = rivals.predictor(name)
+    predictors.check_name(known)
+    assert type(predictors.make(known, 50)) is type(rivals.make(name, 50))
+
+
+@pytest.mark.parametrize("name", WINDOWED, indirect=True)
 @pytest.mark.parametrize("length", [0, 1, 10**9])
 def test_a_window_out_of_bounds_is_refused(name: str, length: int) -> None:
     """No predictor accepts a window shorter than 2 or longer than its limit."""
     with pytest.raises(ConfigError, match=f"window {length}: "):
-        predictors.make(name, length)
+        rivals.make(name, length)
 
 
 @pytest.mark.parametrize(("name", "library", "extra"), [(name, *needs) for name, needs in EXTRAS.items()])
@@ -80,9 +102,9 @@ def test_a_missing_library_names_its_extra(name: str, library: str, extra: str) 
         "import sys\n"
         f"sys.modules[{library!r}] = None\n"
         "from offboard.common.errors import MissingExtra\n"
-        "from offboard.robot_client import predictors\n"
+        "from offboard.loadgen import rivals\n"
         "try:\n"
-        f"    predictors.make({name!r}, 50)\n"
+        f"    rivals.make({name!r}, 50)\n"
         "except MissingExtra as missing:\n"
         "    print(missing)\n"
     )
@@ -94,9 +116,9 @@ def test_the_base_predictors_load_no_heavy_library() -> None:
     """Predictors that need no extra work with numpy only."""
     said = python(
         "import sys\n"
-        "from offboard.robot_client import predictors\n"
+        "from offboard.loadgen import rivals\n"
         f"for name in {BASE!r}:\n"
-        "    predictor = predictors.make(name, 5)\n"
+        "    predictor = rivals.make(name, 5)\n"
         "    for i in range(6):\n"
         "        predictor.learn(i, i * i)\n"
         "    assert predictor.predict(3.0)\n"

@@ -9,15 +9,25 @@ from typing import Any
 import pytest
 
 from offboard.common.errors import ConfigError, DataError
+from offboard.common.tasks import task
+from offboard.loadgen import rivals
 from offboard.loadgen.table import table_two
-from offboard.loadgen.table.measured_rows import read
+from offboard.loadgen.table.measured_rows import Rows, read
+from offboard.loadgen.table.predictor_evaluation import predict
 from offboard.loadgen.table.replay import ReplayConfig, replay_policy, run_replay
 from offboard.loadgen.table.table_settings import TableConfig
-from offboard.robot_client import policies, predictors
-from offboard.robot_client.policies import Decision, Forecast, Outlook
+from offboard.robot_client import predictors
+from offboard.robot_client.learning.memories import Memories
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import BOTH, Decision, Forecast, Outlook, Policy
+from offboard.robot_client.policies.paper import Paper
 from offboard.robot_client.records.trace import Record, Trace
-from offboard.robot_client.sites.runner import Execution
+from offboard.robot_client.settings import Settings
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
+from tests.fakes import ScriptedRunner
 from tests.table_loops import THOUSAND, TWELVE, csv_of
+
+DATASETS = Path(__file__).parents[2] / "loadgen" / "datasets"
 
 Replayed = Callable[..., list[dict[str, Any]]]
 
@@ -62,6 +72,51 @@ def test_paper_policy_equals_the_table(tmp_path: Path, replayed: Replayed, feedb
     line = table.lines[0]
     for name in ("scored", "accuracy_percent", "cloud_percent", "time_over_oracle", "regret_s"):
         assert paper[name] == getattr(line, name), name
+
+
+@pytest.mark.parametrize("predictor", ["least-squares", "parts"])
+@pytest.mark.parametrize("feedback", ["chosen", "full"])
+def test_table_replay_and_robot_predict_the_same(predictor: str, feedback: str) -> None:
+    """For the same sizes and seconds, table, replay and the offloader of a robot predict exactly the same."""
+    rows, window = read(DATASETS / "paper.csv"), 30
+    table = predict(rows, window, predictor=predictor, feedback=feedback, seed=1)
+    make = partial(predictors.make, predictor, window)
+    played = Foretold(every=feedback == "full")
+    replay_policy(rows, played, predictor=make, window=window, feedback=feedback)
+    robot = Foretold(every=feedback == "full")
+    live(rows, robot, Settings(predictor=predictor).make_memories("paper", window), window)
+    for one in (played, robot):
+        assert [found[ONBOARD] for found in one.predicted_s] == table[0].tolist()
+        assert [found[CLOUD] for found in one.predicted_s] == table[1].tolist()
+
+
+class Foretold(Paper):
+    """The rule of the paper, which keeps the predictions it decides from; with `every`, both sites run."""
+
+    def __init__(self, *, every: bool) -> None:
+        self.predicted_s: list[dict[str, float | None]] = []
+        self._every = every
+
+    def decide(self, forecast: Forecast) -> Decision:
+        self.predicted_s.append({site: one.predicted_s for site, one in forecast.sites.items()})
+        return super().decide(forecast)._replace(both=self._every)
+
+
+def live(rows: Rows, policy: Policy, memories: Memories, warm_up: int) -> None:
+    """The offloader of a robot runs all rows, the first ones on both sites."""
+    taken_s = {ONBOARD: rows.onboard_s.tolist(), CLOUD: rows.cloud_s.tolist()}
+
+    def runner(site: str) -> ScriptedRunner:
+        return ScriptedRunner(site, lambda task: Execution(site, taken_s[site][task.args[1]]))
+
+    with Offloader([runner(ONBOARD), runner(CLOUD)], policy=policy, memories=memories) as offload:
+        for number, size in enumerate(rows.size.tolist()):
+            offload(measured, size, number, where=BOTH if number < warm_up else None)
+
+
+@task("measured", size=lambda size, number: size)  # noqa: ARG005
+def measured(size: float, number: int) -> None:
+    """A task whose times are known."""
 
 
 def test_the_twelve_rows_equal_those_by_hand(tmp_path: Path, replayed: Replayed) -> None:
@@ -157,16 +212,16 @@ def test_every_format_names_policy_and_feedback(
     run_replay(dataset(tmp_path, TWELVE), ReplayConfig(format=format, feedback="both"))
     out = capsys.readouterr().out
     said = "12 tasks ran on both sites, but the warm-up needs 50"
-    assert out.count(said) == 2 * (len(policies.names()) + 2)
+    assert out.count(said) == 2 * (len(rivals.RULES) + 2)
     assert "chosen" in out
     assert "full" in out
 
 
 def test_an_unknown_name_or_file_is_refused(tmp_path: Path) -> None:
     """An unknown policy or predictor, and a missing file, are errors that name it."""
-    with pytest.raises(ConfigError, match="--policies: 'papr' is not one of paper, onboard, cloud"):
+    with pytest.raises(ConfigError, match=r"--policies: 'papr' is not one of paper, .* linucb"):
         ReplayConfig(policies=("papr",))
-    with pytest.raises(ConfigError, match="--predictor: 'x' is not one of least-squares"):
+    with pytest.raises(ConfigError, match=r"--predictor: 'x' is not one of least-squares, .* theil-sen"):
         ReplayConfig(predictor="x")
     with pytest.raises(DataError, match="No such file"):
         run_replay(tmp_path / "none.jsonl", ReplayConfig())

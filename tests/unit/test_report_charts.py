@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from offboard.loadgen import rivals
 from offboard.loadgen.report import chart_data, charts
 from offboard.loadgen.report.captions import all_charts
 from offboard.loadgen.report.chart_styles import LOOKS, policy_look
 from offboard.loadgen.report.findings import Findings
 from offboard.loadgen.report.report import ReportConfig, facts
-from offboard.robot_client import policies
 from tests.reports import CHARTS, write_rows
 from tests.table_loops import THOUSAND, Line
 from tests.unit.test_replay import trace_of
@@ -176,7 +176,7 @@ def test_captions_say_how_the_figures_were_computed(found: Callable[..., Finding
 def test_every_policy_has_its_own_look(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each policy has its own colour and line style, also policies that are added later."""
     later = tuple(f"later-{number}" for number in range(6))
-    monkeypatch.setattr(policies, "names", lambda: ("paper", "onboard", "cloud", *later))
+    monkeypatch.setattr(rivals, "RULES", ("paper", "onboard", "cloud", *later))
     looks = [*LOOKS.values(), *map(policy_look, later)]
     assert len({look.colour for look in looks}) == len({str(look.line) for look in looks}) == len(looks)
     assert charts.draw("ecdf", {name: np.array([0.1, 0.2]) for name in ("paper", *later)}).png

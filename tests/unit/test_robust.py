@@ -11,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from offboard.common.errors import ConfigError
-from offboard.robot_client.predictors import Predictor, make
+from offboard.loadgen.rivals import make
+from offboard.loadgen.rivals.refitted import Column
+from offboard.loadgen.rivals.robust import EPSILON, SAMPLE, Huber, TheilSen, huber_line, median
+from offboard.robot_client.predictors import Predictor
 from offboard.robot_client.predictors.base import Prediction
-from offboard.robot_client.predictors.refitted import Column
-from offboard.robot_client.predictors.robust import EPSILON, SAMPLE, Huber, TheilSen, huber_line, median
 from tests.checks import Row, teach
 
 ROBUST = ("theil-sen", "huber")

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from offboard.common.errors import ConfigError, DataError, MissingExtra
+from offboard.loadgen import rivals
 from offboard.loadgen.table.table_settings import TableConfig
 from tests.table_loops import THOUSAND, TWELVE, lines_of
 
@@ -80,10 +81,10 @@ def test_a_missing_library_is_named(print_table: Print, monkeypatch: pytest.Monk
     """
     monkeypatch.setitem(sys.modules, "sklearn", None)
     monkeypatch.setitem(sys.modules, "sklearn.ensemble", None)
-    monkeypatch.delitem(sys.modules, "offboard.robot_client.predictors.random_forest", raising=False)
+    monkeypatch.delitem(sys.modules, "offboard.loadgen.rivals.random_forest", raising=False)
     with pytest.raises(MissingExtra, match=r"random-forest needs the extra 'learned'"):
         print_table(TWELVE, windows=("full",), predictors=("random-forest",))
-    monkeypatch.setattr("offboard.robot_client.predictors.names", lambda: ("least-squares", "random-forest"))
+    monkeypatch.setattr(rivals, "PREDICTORS", ("least-squares", "random-forest"))
     lines = lines_of(print_table(TWELVE, windows=("full",), predictors=("all",)))
     assert lines[0][:2] == ["least-squares", "full"]
     assert lines[1][0].startswith("random-forest: predictor random-forest needs the extra 'learned'")

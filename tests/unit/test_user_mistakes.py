@@ -36,6 +36,7 @@ def nothing(seed):
     return None
 """,
     "inputs.toml": 'name = "odd"\n[workload]\nmap = "open.map"\ninputs = "camera:few"\n',
+    "rows.csv": "size,onboard_s,cloud_s\n1,2,3\n2,3,4\n3,4,5\n",
     "odd.toml": 'name = "odd"\n[workload]\nmap = "m.yaml"\ntaks = 3\n',
 }
 
@@ -78,7 +79,7 @@ def nothing(seed):
         (["robot_client", "drive", "--map", "m.yaml", "--window", "0"], "--window: 0 is below 2"),
         (
             ["robot_client", "drive", "--map", "m.yaml", "--policy", "x"],
-            "'x' is not one of paper, ",
+            "'x' is not one of paper, paper-with-heartbeats, onboard, cloud",
         ),
         (
             ["robot_client", "drive", "--map", "m.yaml", "--cloud", "tcp:/x"],
@@ -130,6 +131,18 @@ def nothing(seed):
         (["loadgen", "table", "empty.csv"], "empty.csv"),
         (["loadgen", "table", "bad.jsonl"], "bad.jsonl:1: no field"),
         (["loadgen", "table", "text.csv", "--windows", "0"], "--windows: '0'"),
+        (
+            ["loadgen", "table", "rows.csv", "--windows", "2", "--predictors", "no.Such"],
+            "predictor 'no.Such': module 'no' cannot be imported: ModuleNotFoundError: ",
+        ),
+        (
+            ["loadgen", "replay", "rows.csv", "--window", "2", "--policies", "camera.Such"],
+            "policy 'camera.Such': module 'camera' has no class 'Such'",
+        ),
+        (
+            ["robot_client", "drive", "--map", "open.map", "--radius", "0", "--policy", "camera.Such"],
+            "policy 'camera.Such': module 'camera' has no class 'Such'",
+        ),
         (["loadgen", "run", "odd.toml"], "odd.toml:4: unknown key 'taks'; did you mean 'tasks'?"),
         (["loadgen", "run", "no-map.toml"], "no-map.toml: workload.map: "),
         (["cloud_server", "--tasks", "json"], "--tasks: json registers no task"),

@@ -1,4 +1,4 @@
-"""What the wrappers probe, hedge, breaker and budget change in a decision."""
+"""What the wrappers probe, hedge and budget change in a decision."""
 
 from typing import Any
 
@@ -6,7 +6,6 @@ import pytest
 
 from offboard.robot_client import policies
 from offboard.robot_client.policies import Forecast, Hedge, Outlook, Probe
-from offboard.robot_client.policies.breaker import BREAK_AFTER, BROKEN_FOR, BROKEN_MAX
 from offboard.robot_client.policies.probe import ONBOARD_PROBE_FACTOR, PROBE_EVERY, PROBE_FACTOR_MAX, STALE
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.outlooks import UNKNOWN, decide, known
@@ -93,31 +92,12 @@ def test_a_probe_goes_before_a_hedge() -> None:
     assert second.site == ONBOARD
 
 
-@pytest.mark.parametrize("more", range(6))
-def test_a_broken_site_rests_twice_as_long_each_time(more: int) -> None:
-    """After three failures in a row a site gets no task for 10 tasks; each further failure doubles that."""
-    failures, rests = BREAK_AFTER + more, min(BROKEN_MAX, BROKEN_FOR * 2**more)
-    for age, site in ((0, ONBOARD), (rests - 1, ONBOARD), (rests, CLOUD)):
-        sites = {ONBOARD: known(0.5), CLOUD: known(0.1, failures=failures, age=age)}
-        assert decide("breaker:greedy", sites).site == site, (failures, age)
-    almost = {ONBOARD: known(0.5), CLOUD: known(0.1, failures=BREAK_AFTER - 1)}
-    assert decide("breaker:greedy", almost).site == CLOUD
-
-
-def test_the_breaker_never_leaves_out_onboard() -> None:
-    """If every site keeps failing, tasks run onboard."""
-    sites = {ONBOARD: known(0.1, failures=99), CLOUD: known(0.5, failures=99)}
-    assert decide("breaker:greedy", sites).site == ONBOARD
-
-
 def test_the_warm_up_spares_the_sites_that_a_wrapper_leaves_out() -> None:
-    """The first tasks run on all sites except broken ones and those that the caps exclude."""
-    sites = {ONBOARD: UNKNOWN, EDGE: UNKNOWN, CLOUD: known(0.1, failures=9)}
-    assert decide("breaker:greedy", sites).spared == (CLOUD,)
-    assert decide("breaker:paper", sites).spared == (CLOUD,)
-    sites[CLOUD] = known(0.1, bytes=500.0)
-    decision = decide("budget:greedy", sites, bytes_left=100.0)
-    assert (decision.both, decision.spared) == (True, (CLOUD,))
+    """The first tasks run on all sites except those that the caps exclude."""
+    sites = {ONBOARD: UNKNOWN, EDGE: UNKNOWN, CLOUD: known(0.1, bytes=500.0)}
+    for rule in ("greedy", "paper"):
+        decision = decide(f"budget:{rule}", sites, bytes_left=100.0)
+        assert (decision.both, decision.spared) == (True, (CLOUD,))
 
 
 @pytest.mark.parametrize(
@@ -145,7 +125,7 @@ def test_a_second_run_must_be_within_the_caps_too() -> None:
 
 
 def test_the_first_wrapper_in_a_name_is_the_outermost() -> None:
-    """A probe around a breaker reaches the site that the breaker leaves out; a probe inside it does not."""
-    sites = {ONBOARD: known(0.5), CLOUD: known(0.1, failures=9, age=50)}
-    assert decide("probe:breaker:greedy", sites).second == Probe(CLOUD)
-    assert decide("breaker:probe:greedy", sites).second is None
+    """Caps inside a probe do not hold for the probe; caps around it do."""
+    sites = {ONBOARD: known(0.1), CLOUD: known(0.5, bytes=500.0, age=PROBE_EVERY)}
+    assert decide("probe:budget:greedy", sites, bytes_left=100.0).second == Probe(CLOUD)
+    assert decide("budget:probe:greedy", sites, bytes_left=100.0).second is None

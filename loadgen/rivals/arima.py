@@ -10,8 +10,8 @@ import numpy as np
 from numpy.linalg import LinAlgError
 
 from offboard.common.errors import MissingExtra
+from offboard.loadgen.rivals.refitted import Column, Refitted
 from offboard.robot_client.predictors.base import SIZE_MIN, Prediction
-from offboard.robot_client.predictors.refitted import Column, Refitted
 
 try:
     from statsmodels.tsa.arima.model import ARIMA

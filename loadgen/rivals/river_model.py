@@ -5,6 +5,8 @@ import importlib
 import inspect
 import math
 import pkgutil
+from collections.abc import Callable
+from functools import partial
 
 from offboard.common.errors import ConfigError, MissingExtra, describe
 from offboard.robot_client.predictors.base import Prediction, check_observation
@@ -100,6 +102,14 @@ class _Scale:
         """In standard deviations from the mean; 0 while all values were equal."""
         deviation = self.deviation
         return (value - self.mean) / deviation if deviation > 0 else 0.0
+
+
+def __getattr__(name: str) -> Callable[..., River]:
+    """PACKAGE__CLASS is a predictor with that regressor of river, so that it has a path as others have."""
+    package, both, regressor = name.partition("__")
+    if not (package and both and regressor):
+        raise AttributeError(name)
+    return partial(River, f"{package}.{regressor}")
 
 
 def load(path: str, seed: int) -> Regressor:

@@ -5,8 +5,8 @@ All limits are relative to the running error of the site, so that they fit tasks
 
 import math
 
+from offboard.loadgen.rivals.recursive import ROUNDING, RecursiveLeastSquares, checked_forgetting
 from offboard.robot_client.predictors.base import SIZE_MIN, Prediction, check_observation
-from offboard.robot_client.predictors.least_squares import ROUNDING, RecursiveLeastSquares, checked_forgetting
 from offboard.robot_client.predictors.window import checked_length
 
 CLIP = 3.0  # an error counts as at most this many standard deviations of the running error

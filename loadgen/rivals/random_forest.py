@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from offboard.common.errors import MissingExtra
+from offboard.loadgen.rivals.refitted import Column, Refitted
 from offboard.robot_client.predictors.base import Prediction
-from offboard.robot_client.predictors.refitted import Column, Refitted
 
 try:
     from sklearn.ensemble import RandomForestRegressor

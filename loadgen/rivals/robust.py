@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from offboard.common.errors import ConfigError
+from offboard.loadgen.rivals.refitted import Column, Refitted
 from offboard.robot_client.predictors.base import SIZE_MIN, Prediction
-from offboard.robot_client.predictors.refitted import Column, Refitted
 
 SAMPLE = 1_000  # values that show roughly where the median of many more lies
 

@@ -9,8 +9,8 @@ from itertools import islice
 import numpy as np
 
 from offboard.common.errors import MissingExtra
+from offboard.loadgen.rivals.refitted import Column, Refitted
 from offboard.robot_client.predictors.base import SIZE_MIN, Prediction
-from offboard.robot_client.predictors.refitted import Column, Refitted
 
 try:
     import torch
