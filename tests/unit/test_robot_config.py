@@ -124,6 +124,23 @@ def test_objective_energy_and_limits_are_made_from_the_flags() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("policy", "flags", "beats"),
+    [
+        ("paper", (), False),
+        ("paper", ("--heartbeats",), True),
+        ("paper-with-heartbeats", (), True),
+        ("default", (), True),
+        ("default", ("--no-heartbeats",), False),
+    ],
+)
+def test_a_flag_switches_heartbeats(policy: str, flags: tuple[str, ...], beats: bool) -> None:
+    """Without the flag, the policy says whether there are heartbeats."""
+    given = [f"--policy={policy}", "--map=m.yaml", *flags]
+    made = load(DriveConfig, given, prog="r", description="", environ={}, prefix="R")
+    assert made.settings(seed=0).beats(policy) == beats
+
+
 @pytest.mark.parametrize("cls", [DriveConfig, CallConfig])
 def test_the_help_explains_the_default_policy(
     cls: type[RobotConfig], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
