@@ -13,7 +13,7 @@ from offboard.robot_client import policies
 from offboard.robot_client.policies.allowance import DUPLICATES_MAX
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.objectives import Mean, TimeAndEnergy
-from offboard.robot_client.policies.probe import STALE
+from offboard.robot_client.policies.probe import PROBE_EVERY
 from offboard.robot_client.records import trace
 from offboard.robot_client.simulated.config import CallConfig, DriveConfig, RobotConfig
 
@@ -169,7 +169,7 @@ def test_a_second_run_starts_with_what_the_first_one_learnt(tmp_path: Path) -> N
     records = list(trace.read(tmp_path / "trace.jsonl"))
     assert records[0]["sites"]["onboard"]["predicted_s"] is None
     assert records[8]["sites"]["onboard"]["predicted_s"] is not None
-    assert (records[8]["i"], records[8]["sites"]["onboard"]["age"]) == (0, STALE)
+    assert (records[8]["i"], records[8]["sites"]["onboard"]["age"]) == (0, PROBE_EVERY)
     command = [
         sys.executable,
         "-m",
