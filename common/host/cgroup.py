@@ -66,11 +66,11 @@ def parse_usage(text: bytes) -> float:
     return int(figure) / (1e6 if text.startswith(b"usage_usec ") else 1e9)
 
 
-def read_small(path: str | Path) -> bytes:
+def read_small(path: str | Path, bytes_max: int = READ_BYTES_MAX) -> bytes:
     """The content of a small kernel file. Python's file objects would cost more than the read itself."""
     file = os.open(path, os.O_RDONLY)
     try:
-        return os.read(file, READ_BYTES_MAX)
+        return os.read(file, bytes_max)
     finally:
         os.close(file)
 

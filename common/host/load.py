@@ -1,14 +1,15 @@
 """Measures the load and the capacity of the CPU: features from which the times of tasks are predicted.
 
-If a CPU quota limits this process, as in a container, "the CPU" means the quota: other processes of the group
-use it up as well, and all of them wait while the group is throttled. `load_watch` decides when to measure.
+"The CPU" means the CPUs that this process may use (`taskset`, cpusets). If a CPU quota limits the process, as
+in a container, it means the quota: other processes of the group use it up as well, and all of them wait while
+the group is throttled. `load_watch` decides when to measure.
 """
 
 import contextlib
 import os
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from pathlib import Path
 
 from offboard.common.host.cgroup import QuotaGroup, parse_usage, quota_group, read_small
@@ -24,6 +25,7 @@ FREE_MIN = 0.1  # share of the CPU: if this process leaves less to others, their
 PROCESSES_MAX = 64  # of a group whose CPU time is summed over its processes
 CLOCKS = Path("/sys/devices/system/cpu/cpufreq")
 CLOCKS_MAX = 16  # clocks that are looked at: CPUs of the same type share one
+CPU_LINE_BYTES = 256  # of /proc/stat, at most
 TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 
 
@@ -56,6 +58,7 @@ class Load:
         # Time of a reading, and the CPU seconds of others and of our own until then.
         self._read_before: deque[tuple[float, float, float]] = deque(maxlen=READINGS_MAX)
         self._cpus = 0.0
+        self._allowed: set[int] = set()  # the numbers of the CPUs that this process may use
         self._share = 0.0
 
     def share(self, every_s: float = EVERY_S) -> float:
@@ -66,7 +69,8 @@ class Load:
         """
         now_s = time.monotonic()
         if now_s - self._read_at_s >= every_s:
-            with contextlib.suppress(OSError, ValueError, IndexError):
+            # AttributeError: systems other than Linux report no CPUs that a process may use.
+            with contextlib.suppress(OSError, ValueError, IndexError, AttributeError):
                 self._read(now_s)
         return self._share
 
@@ -75,17 +79,18 @@ class Load:
         if self._readings % LOOKED_UP_EVERY == 0:
             first = self._look_up() or first
         self._readings += 1
-        cpus = self._quota() or float(os.cpu_count() or 1)
+        allowed = os.sched_getaffinity(os.getpid())
+        cpus = self._quota() or float(len(allowed))
         self.capacity = self._clock * min(1.0, cpus)
         own_s = self._ours_s()
-        others_s = self._total_s() - own_s
+        others_s = self._total_s(allowed) - own_s
         before = self._read_before
-        if first or cpus != self._cpus:
+        if first or cpus != self._cpus or allowed != self._allowed:
             before.clear()
         telling = (one for one in reversed(before) if cpus * (now_s - one[0]) >= TELLING_S)
         since = next(telling, before[0] if before else None)
         before.append((now_s, others_s, own_s))
-        self._read_at_s, self._cpus = now_s, cpus
+        self._read_at_s, self._cpus, self._allowed = now_s, cpus, allowed
         if since is None:
             return
         then_s, others_then_s, own_then_s = since
@@ -107,21 +112,21 @@ class Load:
     def _quota(self) -> float | None:
         return self._group.cpus() if self._group else None
 
-    def _total_s(self) -> float:
-        """CPU seconds of all processes, this one included."""
+    def _total_s(self, allowed: Set[int]) -> float:
+        """CPU seconds of all processes on these CPUs or in the quota's group, this process included."""
         if self._group is None:
-            return self._machine_s()
+            return self._machine_s(allowed)
         if self._group.usage is not None:
             return parse_usage(read_small(self._group.usage))
         pids = read_small(f"{self._group.folder}/cgroup.procs").decode().split()
         return sum(self._process_s(pid) for pid in pids[:PROCESSES_MAX])
 
-    def _machine_s(self) -> float:
-        """From /proc/stat, without idle time, waits for disks, and guests: user time includes guests."""
-        user, nice, system, _idle, _wait, *rest = map(
-            int, read_small(f"{self._root}/stat").split(b"\n", 1)[0].split()[1:9]
-        )
-        return TICK_S * (user + nice + system + sum(rest))
+    def _machine_s(self, allowed: Set[int]) -> float:
+        """From /proc/stat, whose first line counts all CPUs, and each further line one of them."""
+        file, all_cpus = f"{self._root}/stat", len(allowed) >= (os.cpu_count() or 1)
+        names = {b"cpu"} if all_cpus else {b"cpu%d" % number for number in allowed}
+        lines = read_small(file, CPU_LINE_BYTES * (max(allowed) + 2)).split(b"\n")
+        return TICK_S * sum(_busy_ticks(line) for line in lines if line.partition(b" ")[0] in names)
 
     def _process_s(self, pid: str) -> float:
         if pid == str(os.getpid()):
@@ -131,6 +136,12 @@ class Load:
         except OSError:  # the process has just ended
             return 0.0
         return TICK_S * (int(fields[11]) + int(fields[12]))
+
+
+def _busy_ticks(line: bytes) -> int:
+    """From a line of /proc/stat, without idle time, waits for disks, and guests (the user time has them)."""
+    user, nice, system, _idle, _wait, *rest = map(int, line.split()[1:9])
+    return user + nice + system + sum(rest)
 
 
 def _clock(folder: Path) -> float:

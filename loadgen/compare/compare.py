@@ -24,7 +24,9 @@ from offboard.loadgen.table.table_formats import Table, render
 def run_compare(names: Sequence[str], config: CompareConfig) -> int:
     """Play all scenarios, then print one table for each to stdout. Progress lines go to stderr."""
     scenarios = [
-        read_scenario(find_scenario(name)).changed(tasks=config.tasks, reference=config.reference)
+        read_scenario(find_scenario(name)).changed(
+            tasks=config.tasks, reference=config.reference, heartbeats=config.heartbeats
+        )
         for name in names
     ]
     for scenario in scenarios:

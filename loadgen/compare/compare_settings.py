@@ -47,6 +47,9 @@ class CompareConfig:
         "run every K-th task again on each site alone (default: as in the scenario); 0: none (faster)",
         minimum=0,
     )
+    heartbeats: bool | None = setting(
+        None, "whether the robots send heartbeats (default: as the scenario, or else each policy, says)"
+    )
     from_task: int = setting(0, "first task that counts, for example the first one after warm-up", minimum=0)
     format: str = setting("md", "output format", choices=FORMATS)
     stolen_max: float | None = setting(

@@ -53,6 +53,7 @@ def _robot_flags(scenario: Scenario, files: RobotFiles, *, first: bool) -> Mappi
         "reference": workload.reference if first else 0,
         "policy": policy,
         "predictor": predictor,
+        "heartbeats": robot.heartbeats,
         "window": robot.window,
         "timeout": robot.timeout_s,
         "seed": files.seed,

@@ -108,6 +108,9 @@ class RobotPart:
     predictor: str | None = setting(
         None, f"predictor, if not the one that the policy brings: {rivals.PREDICTOR_HELP}"
     )
+    heartbeats: bool | None = setting(
+        None, "whether each robot sends heartbeats, if not as its policy is meant to be used"
+    )
     window: int = setting(50, "number of executions remembered for each site", minimum=2)
     timeout_s: float = setting(
         2.0, "longest wait for an answer of a server, in seconds", name="timeout", minimum=0.001
@@ -187,6 +190,7 @@ class Scenario:
         reference: int | None = None,
         policy: str | None = None,
         predictor: str | None = None,
+        heartbeats: bool | None = None,
     ) -> "Scenario":
         """A copy with these changes; None keeps a value.
 
@@ -205,6 +209,8 @@ class Scenario:
             robot = replace(robot, policy=policy, predictor=predictor)
         elif predictor is not None:
             robot = replace(robot, predictor=predictor)
+        if heartbeats is not None:
+            robot = replace(robot, heartbeats=heartbeats)
         checks = self.checks
         if reference == 0:
             checks = tuple(one for one in checks if FIGURES[one.figure].needs != "reference")

@@ -22,7 +22,6 @@ from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client.sites.cloud import PENDING_MAX
 from offboard.robot_client.sites.heartbeat import EARLY_S, Heartbeat, ServerReport
-from offboard.robot_client.sites.own_cpu import OwnCpu
 from offboard.robot_client.sites.runner import CLOUD, Condition, Execution
 
 TASK, BEAT, CANCEL, BLOB = "task", "beat", "cancel", "blob"  # sorts of messages
@@ -63,7 +62,6 @@ class SimulatedCloud:
         link: Link,
         seed: int,
         heartbeat_s: float,
-        own_cpu: OwnCpu,
     ) -> None:
         self.connection = SimulatedConnection(
             clock, server, link, seed, on_up=self._start_beating, on_lost=self._fail_all
@@ -73,7 +71,7 @@ class SimulatedCloud:
         self._cpu = cpu
         self._costs = costs
         self._pending: dict[int, _Pending] = {}
-        self._heartbeat = Heartbeat(heartbeat_s, seed, own_cpu)
+        self._heartbeat = Heartbeat(heartbeat_s, seed)
         self._start_beating()
 
     def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - the server knows every kind

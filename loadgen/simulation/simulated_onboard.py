@@ -5,14 +5,13 @@ from concurrent.futures import Future
 from functools import partial
 
 from offboard.common.errors import Overtaken
-from offboard.common.host.load import EVERY_S, HURRIED_S, LOADED
+from offboard.common.host.load import EVERY_S, HURRIED_S
 from offboard.common.tasks import Kind, Task
 from offboard.loadgen.simulation.model.simulated_cpu import Run, SimulatedCpu
 from offboard.loadgen.simulation.model.simulated_load import SimulatedLoad
 from offboard.loadgen.simulation.model.true_costs import TrueCosts
 from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
 from offboard.loadgen.testbed.testbed import ROBOT
-from offboard.robot_client.sites.own_cpu import OwnCpu
 from offboard.robot_client.sites.runner import ONBOARD, Condition, Execution
 
 
@@ -27,7 +26,6 @@ class SimulatedOnboard:
         self._costs = costs
         self._runs: dict[int, tuple[Run, Future[Execution]]] = {}
         self._load = SimulatedLoad(clock, cpu)
-        self.own_cpu = OwnCpu()
 
     def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - onboard always exists
         return None
@@ -37,7 +35,6 @@ class SimulatedOnboard:
         cpu_s = self._costs.cpu_s(ONBOARD, task)
         run = self._cpu.add(cpu_s, partial(self._ended, task, cpu_s), owner=ROBOT)
         self._runs[task.id] = run, future
-        self.own_cpu.begin()
         return future
 
     def bytes_to_send(self, task: Task) -> int:  # noqa: ARG002 - nothing is sent
@@ -48,7 +45,6 @@ class SimulatedOnboard:
         run, future = self._runs.pop(task.id, (None, None))
         if run is not None and future is not None:
             self._cpu.stop(run)
-            self.own_cpu.end(self._clock.now_s())
             failure, seconds = Overtaken("another site answered first"), self._clock.now_s() - run.added_s
             started = run.begun_s < math.inf
             future.set_result(Execution(ONBOARD, seconds, failure=failure, censored=True, started=started))
@@ -57,9 +53,7 @@ class SimulatedOnboard:
         self._load.share(HURRIED_S)
 
     def condition(self) -> Condition:
-        load = self._load.share(self.own_cpu.pause_s(EVERY_S))
-        self.own_cpu.loaded = load > LOADED
-        return Condition(load=load, capacity=self._load.capacity)
+        return Condition(load=self._load.share(EVERY_S), capacity=self._load.capacity)
 
     def close(self) -> None:
         pass
@@ -67,7 +61,6 @@ class SimulatedOnboard:
     def _ended(self, task: Task, cpu_s: float, run: Run) -> None:
         _, future = self._runs.pop(task.id)
         now_s = self._clock.now_s()
-        self.own_cpu.end(now_s)
         future.set_result(
             Execution(
                 ONBOARD,

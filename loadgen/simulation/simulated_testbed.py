@@ -58,7 +58,6 @@ class SimulatedTestbed:
             link=self._link,
             seed=seed,
             heartbeat_s=heartbeat_s,
-            own_cpu=self.onboard.own_cpu,
         )
         self._oracle = Oracle(
             clock=clock,

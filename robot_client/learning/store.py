@@ -19,7 +19,7 @@ from offboard.robot_client.learning import memory_file
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.memory_file import PER_SIZE, PER_WORK, KeptKind, KeptSite, Unreadable
 from offboard.robot_client.learning.site import Observation
-from offboard.robot_client.policies.probe import STALE
+from offboard.robot_client.policies.probe import PROBE_EVERY
 
 SAVE_EVERY_S = 30.0  # while tasks run; the file is also saved at the end
 WRITE_WAIT_S = 5.0  # that the end of the process waits for a slow disk
@@ -67,7 +67,7 @@ class Store:
             if name not in sites:
                 self._away.setdefault(kind.name, {})[name] = site
             elif observations := _as_learnt(self._believed(site), kept.per, memory.per_work):
-                memory.site(name).recall(observations, age=STALE)
+                memory.site(name).recall(observations, age=PROBE_EVERY)
                 log.info("%s on %s: %d observations recalled", kind.name, name, len(observations))
 
     def due(self, now_s: float) -> bool:

@@ -89,7 +89,6 @@ class Outlook(NamedTuple):
     `in_flight`: tasks of any kind that run there now.
     `bytes`, `joules`: what running the task there should take.
     `condition`: what was measured of the site. `errors`: how wrong its past predictions were.
-    `smallest`: the site has never run a task nearly as small as this one.
 
     Build it with keywords. It is a named tuple because every task needs one for each site, and a frozen
     dataclass takes twice as long to build.
@@ -110,7 +109,6 @@ class Outlook(NamedTuple):
     joules: float = 0.0
     condition: Condition = UNMEASURED
     errors: PredictionErrors = NO_ERRORS
-    smallest: bool = False
 
     def overdue_s(self, worth_s: float) -> float | None:
         """How old, in seconds, a running task is when it should still need more than `worth_s`."""

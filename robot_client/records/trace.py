@@ -16,7 +16,6 @@ from offboard.robot_client.learning.regret import Regret
 from offboard.robot_client.policies import Decision, Hedge, Outlook
 from offboard.robot_client.records import lines
 from offboard.robot_client.records.lines import VERSION, Lines
-from offboard.robot_client.sites.own_cpu import OWN_CPU
 from offboard.robot_client.sites.runner import UNMEASURED, Condition, Execution
 
 WRITE_EVERY_S = 0.2
@@ -98,8 +97,8 @@ _LATE_FIELDS, _REGRET_FIELDS = (tuple(one.name for one in fields(of)) for of in 
 class Trace(Lines):
     """Appends records to a file, in order. A line that cannot be written is logged; tasks go on.
 
-    A thread writes the waiting records every WRITE_EVERY_S, and less often on a loaded robot. With a tenth of
-    a CPU, writing between two tasks would delay the next one. A crash loses the waiting records.
+    A thread writes the waiting records every WRITE_EVERY_S. With a tenth of a CPU, writing between two tasks
+    would delay the next one. A crash loses the waiting records.
     """
 
     def __init__(self, path: Path) -> None:
@@ -133,7 +132,7 @@ class Trace(Lines):
                 self.append(record.i, as_dict(record))
 
     def _run(self) -> None:
-        while not self._closing.wait(OWN_CPU.pause_s(WRITE_EVERY_S)):
+        while not self._closing.wait(WRITE_EVERY_S):
             self.flush()
 
 

@@ -39,6 +39,12 @@ class DecisionSettings:
         rare=True,
         metavar="NAME",
     )
+    heartbeats: bool | None = setting(
+        None,
+        "ask each server twice a second if it is there (default: unless the policy is meant to do without)",
+        group=DECISIONS,
+        rare=True,
+    )
     memory: Path | None = setting(
         None, "file that keeps what the robot learns, and is read at start", group=DECISIONS, rare=True
     )
@@ -134,6 +140,7 @@ class DecisionSettings:
         """The rare options of the offloader."""
         return Settings(
             predictor=self.predictor,
+            heartbeats=self.heartbeats,
             objective=objectives.make(self.objective, deadline_s=self.deadline_s, s_a_joule=self.s_per_joule),
             energy=Energy(self.compute_watts, self.idle_watts, self.radio_joules_byte),
             duplicates=self.duplicates,

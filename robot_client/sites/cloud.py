@@ -30,7 +30,6 @@ from offboard.robot_client.sites.blob_uploads import BlobUploads
 from offboard.robot_client.sites.cloud_socket import MESSAGE_BYTES_MAX, CloudSocket, SocketEvent
 from offboard.robot_client.sites.connection import Action, Connection, HandshakeFailure
 from offboard.robot_client.sites.heartbeat import EARLY_S, Heartbeat, ServerReport
-from offboard.robot_client.sites.own_cpu import OWN_CPU
 from offboard.robot_client.sites.pending_request import PendingRequest
 from offboard.robot_client.sites.runner import CLOUD, Condition, Execution, check_endpoint
 from offboard.robot_client.sites.shared_reader import Answer, SharedReader
@@ -65,7 +64,7 @@ class CloudRunner:
         check_endpoint(site, endpoint)
         self.site = site
         self._connection = Connection(site, endpoint)
-        self._heartbeat = Heartbeat(heartbeat_s, seed, OWN_CPU)
+        self._heartbeat = Heartbeat(heartbeat_s, seed)
         self._heartbeat_wanted = False  # by `hurry`
         self._remote: dict[str, str] = {}  # source hashes at the server, by kind
         self._message_bytes_max = MESSAGE_BYTES_MAX  # what the server takes, once it has said so

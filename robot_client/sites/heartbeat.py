@@ -8,7 +8,6 @@ from collections import deque
 from random import Random
 from typing import NamedTuple
 
-from offboard.robot_client.sites.own_cpu import OwnCpu, may_be_late
 from offboard.robot_client.sites.runner import Condition
 
 EVERY_S = 0.5  # between two heartbeats: an outage is noticed at most this much later
@@ -21,7 +20,6 @@ SLACK_S = 0.02  # an answer is late if it takes this much longer than usual, and
 UNANSWERED_MAX = 16  # heartbeats that are remembered; while that many have no answer, pauses are longer
 SLOWER = 5  # times as long are those pauses
 LEAST_OF = 2  # the shortest of that many round trips counts: one stalled segment does not make a slow link
-BUSY_LEAST_OF = 4  # the same, if a task that ran onboard at the time may have made them longer
 _SMOOTHING, _VARIATION = 1 / 8, 1 / 4  # RFC 6298
 
 
@@ -37,13 +35,10 @@ class Heartbeat:
     """Times the heartbeats of one connection, and measures it.
 
     every_s: usual pause; 0: no heartbeat is sent, and nothing is measured.
-    own_cpu: tells whether a task ran onboard since a given time. During such a run the robot reads answers
-        late, so measured round trips are too long.
     """
 
-    def __init__(self, every_s: float, seed: int = 0, own_cpu: OwnCpu | None = None) -> None:
+    def __init__(self, every_s: float, seed: int = 0) -> None:
         self._every_s = every_s
-        self._own_cpu = own_cpu or OwnCpu()
         self._random = Random(seed)
         self._next_id = 0
         self._round_trip_s: float | None = None
@@ -61,7 +56,7 @@ class Heartbeat:
         self._sent: dict[int, float] = {}
         self._oldest_s = float("inf")  # when the oldest unanswered heartbeat was sent
         self._heard_s = -float("inf")
-        self._recent: deque[float] = deque(maxlen=BUSY_LEAST_OF)
+        self._recent: deque[float] = deque(maxlen=LEAST_OF)
         self._smooth_s = self._varies_s = 0.0
         self._back_s = -float("inf")  # when the site was last heard again
         self._report = ServerReport()
@@ -82,7 +77,7 @@ class Heartbeat:
         self._next_id += 1
         self._sent[self._next_id] = now_s
         self._oldest_s = min(self._oldest_s, now_s)
-        pause_s = self._own_cpu.pause_s(self._every_s) * (1 + JITTER * self._random.uniform(-1, 1))
+        pause_s = self._every_s * (1 + JITTER * self._random.uniform(-1, 1))
         if len(self._sent) > UNANSWERED_MAX:
             del self._sent[next(iter(self._sent))]
             pause_s *= SLOWER
@@ -103,15 +98,9 @@ class Heartbeat:
             self.hurry(now_s)  # the silence delayed this answer, so it does not measure the link as it is now
         else:
             self._vary(now_s - sent_s)
-            self._measure(now_s - sent_s, busy=self._own_cpu.since(sent_s))
+            self._recent.append(now_s - sent_s)
+            self._round_trip_s = min(self._recent)
         self.hear(now_s, report)
-
-    def _measure(self, round_trip_s: float, *, busy: bool) -> None:
-        self._recent.append(round_trip_s)
-        if not (busy and may_be_late(round_trip_s, self._round_trip_s)):
-            while len(self._recent) > LEAST_OF:
-                self._recent.popleft()
-        self._round_trip_s = min(self._recent)
 
     def hear(self, now_s: float, report: ServerReport) -> None:
         """Any message from the server shows that it is there."""

@@ -15,14 +15,13 @@ from typing import Any
 from offboard.common.errors import OffloadError, Overtaken, TaskFailed, Unwanted, describe
 from offboard.common.host import cpu_time
 from offboard.common.host.cgroup import SELF
-from offboard.common.host.load import LOADED, Load
+from offboard.common.host.load import Load
 from offboard.common.host.load_watch import LoadWatch
 from offboard.common.task_states import TaskStates
 from offboard.common.tasks import Kind, Task
 from offboard.common.threads import join_all
 from offboard.common.tracebacks import traceback_of
 from offboard.common.wanted import call_while
-from offboard.robot_client.sites.own_cpu import OWN_CPU
 from offboard.robot_client.sites.runner import ONBOARD, Condition, Execution
 
 ABANDONED_MAX = 4  # cancelled runs that go on at the same time
@@ -86,7 +85,7 @@ class OnboardRunner:
         self._preparing: dict[str, Future[None]] = {}  # by kind
         self._closed = False
         self._lock = threading.Lock()
-        self._load = LoadWatch(Load(SELF), pause_s=OWN_CPU.pause_s)
+        self._load = LoadWatch(Load(SELF))
         self._condition = Condition()
 
     def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - onboard always exists
@@ -142,7 +141,6 @@ class OnboardRunner:
 
     def condition(self) -> Condition:
         found, (load, capacity) = self._condition, self._load.latest()
-        OWN_CPU.loaded = load > LOADED
         if found.load != load or found.capacity != capacity:
             found = self._condition = Condition(load=load, capacity=capacity)
         return found
@@ -154,7 +152,6 @@ class OnboardRunner:
                 return
             self._closed = True
             self._load.close()
-            OWN_CPU.loaded = False  # no later reading would reset it
             waiting = [run for run in self._runs.values() if run.thread is None]
             for run in waiting:
                 del self._runs[run.task.id]
@@ -189,15 +186,12 @@ class OnboardRunner:
         self._start_thread()
 
     def _prepare(self, kind: Kind, prepared: "Future[None]") -> None:
-        OWN_CPU.begin()
         try:
             self._states.prepare(kind)
         except TaskFailed as failure:
             prepared.set_exception(failure)
         else:
             prepared.set_result(None)
-        finally:
-            OWN_CPU.end(time.perf_counter())
 
     def _work(self) -> None:
         """Run tasks until a run is abandoned or the runner is closed. Each thread does this."""
@@ -216,7 +210,6 @@ class OnboardRunner:
 
 
 def _run(run: _Run, states: TaskStates) -> Execution:
-    OWN_CPU.begin()
     try:
         with states.lend(run.task.kind) as state:
             if not run.wanted:  # cancelled during the setup
@@ -225,8 +218,6 @@ def _run(run: _Run, states: TaskStates) -> Execution:
     except TaskFailed as failure:  # of the setup
         seconds = time.perf_counter() - run.published_s - run.future.setup_s()
         return Execution(ONBOARD, seconds, failure=failure, queue_s=seconds, network_s=0.0, started=False)
-    finally:
-        OWN_CPU.end(time.perf_counter())
 
 
 def _call(run: _Run, state: tuple[Any, ...], states: TaskStates) -> Execution:

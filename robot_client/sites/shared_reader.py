@@ -11,8 +11,6 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import TypeVar
 
-from offboard.robot_client.sites.own_cpu import OWN_CPU
-
 LINGER_S = 0.1  # for which the thread leaves the socket alone after a caller has read from it
 
 T = TypeVar("T")
@@ -96,10 +94,9 @@ class SharedReader:
         """Whether callers read for now; if so, the thread rests until it is called, or for a while."""
         self._thread_rests = True  # set before looking: a caller that expects a message from now on calls
         idle_s = time.perf_counter() - self._caller_read_s
-        linger_s = OWN_CPU.pause_s(LINGER_S)
-        rests = self.turn.locked() or (idle_s < linger_s and not self._expects_message())
+        rests = self.turn.locked() or (idle_s < LINGER_S and not self._expects_message())
         if rests and not self._called.is_set():
-            self._called.wait(linger_s)
+            self._called.wait(LINGER_S)
             return True
         self._thread_rests = False
         self._called.clear()

@@ -3,15 +3,18 @@
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
+from types import NoneType
 
 import pytest
 import zmq
 
+from offboard import Offloader, Settings
 from offboard.common.tasks import Task, kind_of, kinds, task
 from offboard.common.wire import messages as wire
 from offboard.common.wire.messages import Hello, Message, Ping, Pong, Reply, Request
 from offboard.robot_client.sites import cloud
 from offboard.robot_client.sites.cloud import CloudRunner
+from offboard.robot_client.sites.heartbeat import EVERY_S
 from offboard.robot_client.sites.shared_reader import LINGER_S
 
 pytestmark = pytest.mark.integration
@@ -41,6 +44,23 @@ class Peer:
 
     def say(self, message: Message) -> None:
         self._socket.send_multipart([self._client, *wire.pack(message)])
+
+
+@pytest.mark.parametrize(
+    ("policy", "heartbeats", "beats"),
+    [("paper", None, False), ("paper", True, True), ("default", None, True), ("default", False, False)],
+)
+def test_the_policy_or_the_settings_say_whether_there_are_heartbeats(
+    policy: str, heartbeats: bool | None, beats: bool
+) -> None:
+    """With heartbeats, the first message after `hello` is a ping; without, there is none."""
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as socket:
+        socket.linger = 0
+        peer = Peer(socket)
+        with Offloader.connect(peer.endpoint, policy=policy, settings=Settings(heartbeats=heartbeats)):
+            assert isinstance(peer.hear(), Hello)
+            peer.say(Hello({kind.name: kind.source_hash for kind in kinds()}, "0", 2**20))
+            assert isinstance(peer.hear(WAIT_S if beats else 2 * EVERY_S), Ping if beats else NoneType)
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 import pytest
 
 from offboard.robot_client.sites.heartbeat import (
-    BUSY_LEAST_OF,
     EVERY_S,
     JITTER,
     SILENT_S,
@@ -13,18 +12,15 @@ from offboard.robot_client.sites.heartbeat import (
     Heartbeat,
     ServerReport,
 )
-from offboard.robot_client.sites.own_cpu import LATE_MAX, LOADED_SLOWER, OwnCpu
 from offboard.robot_client.sites.runner import Condition
 
 TRIP_S = 0.03
 IDLE = ServerReport()
 
 
-def beating(
-    until_s: float, trip_s: float = TRIP_S, queue: int = 0, own_cpu: OwnCpu | None = None
-) -> Heartbeat:
+def beating(until_s: float, trip_s: float = TRIP_S, queue: int = 0) -> Heartbeat:
     """Heartbeats from 0 s on, each answered after `trip_s`."""
-    heartbeat = Heartbeat(EVERY_S, seed=1, own_cpu=own_cpu)
+    heartbeat = Heartbeat(EVERY_S, seed=1)
     heartbeat.start(0.0)
     while heartbeat.due_s < until_s:
         now_s = heartbeat.due_s
@@ -76,18 +72,6 @@ def test_pauses_are_jittered() -> None:
     assert pauses != others
 
 
-def test_pauses_are_longer_on_a_loaded_robot() -> None:
-    """Pauses are LOADED_SLOWER times as long under load, and as before afterwards."""
-    own_cpu = OwnCpu()
-    heartbeat = beating(2.0, own_cpu=own_cpu)
-    for loaded, slower in ((True, LOADED_SLOWER), (False, 1)):
-        own_cpu.loaded = loaded
-        now_s = heartbeat.due_s
-        heartbeat.answer(heartbeat.beat(now_s), now_s + TRIP_S, IDLE)
-        pause = (heartbeat.due_s - now_s) / EVERY_S
-        assert (1 - JITTER) * slower <= pause <= (1 + JITTER) * slower
-
-
 def test_the_condition_has_round_trip_and_queue() -> None:
     """Both come from the last answers."""
     condition = beating(2.0, queue=4).condition(2.0)
@@ -102,53 +86,6 @@ def test_one_stalled_answer_does_not_make_a_slow_link() -> None:
     assert heartbeat.condition(2.2).round_trip_s == pytest.approx(TRIP_S)
     heartbeat.answer(heartbeat.beat(2.3), 2.5, IDLE)
     assert heartbeat.condition(2.5).round_trip_s == pytest.approx(0.2)
-
-
-def test_while_a_task_runs_onboard_more_round_trips_are_needed() -> None:
-    """BUSY_LEAST_OF longer round trips in a row are believed, and the first shorter one at once."""
-    own_cpu = OwnCpu()
-    heartbeat = beating(2.0, own_cpu=own_cpu)
-    own_cpu.begin()
-    for count in range(1, BUSY_LEAST_OF + 1):
-        at_s = heartbeat.due_s
-        heartbeat.answer(heartbeat.beat(at_s), at_s + 1.5 * TRIP_S, IDLE)
-        known_s = heartbeat.condition(at_s + 0.1).round_trip_s
-        assert known_s == pytest.approx(TRIP_S if count < BUSY_LEAST_OF else 1.5 * TRIP_S)
-    heartbeat.answer(heartbeat.beat(at_s + 1), at_s + 1 + TRIP_S, IDLE)
-    assert heartbeat.condition(at_s + 1.1).round_trip_s == pytest.approx(TRIP_S)
-
-
-def test_a_run_onboard_does_not_explain_a_far_slower_link() -> None:
-    """Two round trips of more than LATE_MAX times the known one are believed during a run onboard too."""
-    own_cpu = OwnCpu()
-    heartbeat = beating(2.0, own_cpu=own_cpu)
-    own_cpu.begin()
-    for at_s in (2.0, 2.5):
-        heartbeat.answer(heartbeat.beat(at_s), at_s + 1.1 * LATE_MAX * TRIP_S, IDLE)
-    assert heartbeat.condition(2.6).round_trip_s == pytest.approx(1.1 * LATE_MAX * TRIP_S)
-
-
-def test_a_link_that_became_slow_stays_slow_during_a_run_onboard() -> None:
-    """Two slow answers in a row replace the fast ones before them for good."""
-    own_cpu = OwnCpu()
-    heartbeat = beating(2.0, own_cpu=own_cpu)
-    for at_s in (2.0, 2.3):
-        heartbeat.answer(heartbeat.beat(at_s), at_s + 0.2, IDLE)
-    own_cpu.begin()
-    heartbeat.answer(heartbeat.beat(2.6), 2.9, IDLE)
-    assert heartbeat.condition(2.9).round_trip_s == pytest.approx(0.2)
-
-
-def test_a_run_counts_if_it_ended_after_the_heartbeat_was_sent() -> None:
-    """A run onboard that ended before cannot have delayed the answer."""
-    for ended_s, known_s in ((1.9, 1.5 * TRIP_S), (2.1, TRIP_S)):
-        own_cpu = OwnCpu()
-        heartbeat = beating(2.0, own_cpu=own_cpu)
-        own_cpu.begin()
-        own_cpu.end(ended_s)
-        for at_s in (2.0, 2.05):
-            heartbeat.answer(heartbeat.beat(at_s), at_s + 1.5 * TRIP_S, IDLE)
-        assert heartbeat.condition(2.3).round_trip_s == pytest.approx(known_s)
 
 
 @pytest.mark.parametrize("reply_first", [False, True])

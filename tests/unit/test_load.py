@@ -16,7 +16,8 @@ from offboard.common.host.load import (
 )
 from tests.cgroups import Machine
 
-CPUS = os.cpu_count() or 1
+CPUS = 2
+OWN = {1}  # of the CPUs 0 and 1
 
 
 class Times:
@@ -26,6 +27,15 @@ class Times:
         self.now_s, self.own_s = 100.0, 5.0
         monkeypatch.setattr(load.time, "monotonic", lambda: self.now_s)
         monkeypatch.setattr(load.time, "process_time", lambda: self.own_s)
+
+
+@pytest.fixture(autouse=True)
+def allowed(monkeypatch: pytest.MonkeyPatch) -> set[int]:
+    """The CPUs that this process may use, of a machine with CPUS of them; the test may change the set."""
+    cpus = set(range(CPUS))
+    monkeypatch.setattr(load.os, "cpu_count", lambda: CPUS)
+    monkeypatch.setattr(load.os, "sched_getaffinity", lambda _: set(cpus))
+    return cpus
 
 
 @pytest.fixture
@@ -41,10 +51,15 @@ class Host:
         (self.root / "self").mkdir(parents=True)
         self.busy_s(0.0)
 
-    def busy_s(self, seconds: float) -> None:
-        """CPU seconds of all processes, half in the kernel. The time of guests is part of the user time."""
+    def busy_s(self, seconds: float, on: int = 0) -> None:
+        """CPU seconds of all processes, half in the kernel, all on one CPU.
+
+        The time of guests is part of the user time.
+        """
         half = round(seconds / 2 / TICK_S)
-        (self.root / "stat").write_text(f"cpu  {half} 0 {half} 99999 500 0 0 0 777 0\ncpu0 1 2 3\n")
+        busy = f"{half} 0 {half} 99999 500 0 0 0 777 0"
+        each = [f"cpu{number} {busy if number == on else '0 ' * 10}" for number in range(CPUS)]
+        (self.root / "stat").write_text("\n".join([f"cpu  {busy}", *each, "intr 5\n"]))
 
     def load(self) -> Load:
         return Load(self.root / "self", self.root)
@@ -123,6 +138,60 @@ def test_a_process_that_uses_the_whole_cpu_keeps_the_last_load(tmp_path: Path, t
     later(times, 0.5, 0.5 * CPUS)
     host.busy_s(1000.0)
     assert one.share() == before
+
+
+@pytest.mark.parametrize(("on", "expected"), [(0, 0.0), (1, 0.5)])
+def test_only_the_cpus_that_this_process_may_use_count(
+    tmp_path: Path, times: Times, allowed: set[int], on: int, expected: float
+) -> None:
+    """Other programs are load on a CPU of this process, and none on another CPU."""
+    allowed.intersection_update(OWN)
+    host = Host(tmp_path)
+    one = host.load()
+    one.share()
+    for n in range(1, 11):
+        later(times, EVERY_S)
+        host.busy_s(0.5 * EVERY_S * n, on)
+        assert one.share() == pytest.approx(expected, abs=2 * TICK_S / EVERY_S)
+    assert one.capacity == 1.0
+
+
+def test_other_cpus_are_measured_anew(tmp_path: Path, times: Times, allowed: set[int]) -> None:
+    """If this process moves to another CPU, what that CPU did before is no load."""
+    allowed.intersection_update(OWN)
+    host = Host(tmp_path)
+    host.busy_s(50.0, on=0)
+    one = host.load()
+    one.share()
+    allowed.symmetric_difference_update({0, 1})
+    later(times, EVERY_S)
+    assert one.share() == 0.0
+    later(times, EVERY_S)
+    host.busy_s(50.0 + 0.25 * EVERY_S, on=0)
+    assert one.share() == pytest.approx(0.25, abs=2 * TICK_S / EVERY_S)
+
+
+def test_all_lines_of_a_large_machine_are_read(
+    tmp_path: Path, times: Times, allowed: set[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The last of 256 CPUs counts too."""
+    monkeypatch.setattr(load.os, "cpu_count", lambda: 256)
+    allowed.clear()
+    allowed.add(255)
+    host = Host(tmp_path)
+
+    def busy(ticks: int) -> None:
+        lines = [f"cpu{n} {10**12} {10**12} {10**12} {10**12} 5 0 0 0 0 0" for n in range(255)]
+        (host.root / "stat").write_text(
+            "\n".join(["cpu 9 9 9 9 9 9 9 9 9 9", *lines, f"cpu255 {ticks} 0 0 9 5"])
+        )
+
+    busy(0)
+    one = host.load()
+    one.share()
+    later(times, EVERY_S)
+    busy(round(0.5 * EVERY_S / TICK_S))
+    assert one.share() == pytest.approx(0.5, abs=2 * TICK_S / EVERY_S)
 
 
 @pytest.mark.parametrize("text", ["", "cpu a b c d\n", "intr 5\n"])

@@ -39,24 +39,6 @@ def test_only_the_first_reading_is_in_the_callers_thread() -> None:
     assert not reader.is_alive()
 
 
-def test_the_pause_before_each_reading_can_be_changed() -> None:
-    """`pause_s` gets the usual interval before every reading but the first."""
-    counted, asked, done = Counted(), list[float](), threading.Event()
-
-    def pause_s(usual_s: float) -> float:
-        asked.append(usual_s)
-        if len(asked) < 3:
-            return 0.001
-        done.set()
-        return 60.0
-
-    watch = LoadWatch(counted, 7.0, pause_s)
-    watch.latest()
-    assert done.wait(WAIT_S)
-    assert (asked, watch.latest()[0]) == ([7.0, 7.0, 7.0], 3)
-    watch.close()
-
-
 def test_a_hurried_watch_reads_in_the_callers_thread() -> None:
     """`hurry` reads at once, but not before the first `latest`."""
     counted = Counted()

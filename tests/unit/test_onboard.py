@@ -7,12 +7,10 @@ from collections.abc import Iterator
 import pytest
 
 from offboard.common.errors import OffloadError, Overtaken, Unwanted
-from offboard.common.host.load_watch import LoadWatch
 from offboard.common.tasks import Task, kind_of, task
 from offboard.common.wanted import check_wanted
 from offboard.robot_client.sites import onboard
 from offboard.robot_client.sites.onboard import ABANDONED_MAX, ABANDONED_NICE, OnboardRunner
-from offboard.robot_client.sites.own_cpu import LOADED_SLOWER, OWN_CPU
 
 WAIT_S = 5.0
 
@@ -209,24 +207,3 @@ def test_as_many_tasks_run_at_a_time_as_there_are_workers() -> None:
     assert [future.result(WAIT_S).value for future in futures] == list(range(6))
     assert sorted(gate.begun) == list(range(6))
     many.close()
-
-
-def test_closing_a_runner_ends_the_longer_pauses(
-    runner: OnboardRunner, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Under load, pauses in the whole process are longer, until the runner that read the load is closed."""
-    monkeypatch.setattr(LoadWatch, "latest", lambda _: (0.9, 1.0))
-    runner.condition()
-    assert OWN_CPU.pause_s(1.0) == LOADED_SLOWER
-    runner.close()
-    assert OWN_CPU.pause_s(1.0) == 1.0
-
-
-def test_a_reading_without_load_ends_the_longer_pauses(
-    runner: OnboardRunner, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """This holds even if the reading equals the one before, because another runner may have set them."""
-    monkeypatch.setattr(LoadWatch, "latest", lambda _: (0.0, 1.0))
-    monkeypatch.setattr(OWN_CPU, "loaded", True)
-    runner.condition()
-    assert OWN_CPU.pause_s(1.0) == 1.0

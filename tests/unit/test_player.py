@@ -69,6 +69,17 @@ def test_every_robot_gets_the_planner_of_the_scenario(tmp_path: Path) -> None:
     assert [setup.flags["planner"] for part, setup in made.items() if part.startswith(ROBOT)] == ["jps"] * 2
 
 
+@pytest.mark.parametrize("heartbeats", [None, True, False])
+def test_every_robot_gets_the_heartbeats_of_the_scenario(tmp_path: Path, heartbeats: bool | None) -> None:
+    """Without `robot.heartbeats`, the policy of the robots decides."""
+    made = setups(scenario(robots=2).changed(heartbeats=heartbeats), tmp_path)
+    for part, setup in made.items():
+        if part.startswith(ROBOT):
+            flags = [*as_flags(setup.flags), "--cloud=tcp://wan:5555"]
+            robot = load(DriveConfig, flags, prog="", description="", environ={}, prefix="X")
+            assert robot.heartbeats == heartbeats
+
+
 def test_every_robot_has_its_own_files_and_seed(tmp_path: Path) -> None:
     """Robots have different files and seeds; the file names of the first robot have no number."""
     files = list(RobotFiles.of(scenario(robots=3), tmp_path))

@@ -13,7 +13,7 @@ from offboard.robot_client import policies
 from offboard.robot_client.policies.allowance import DUPLICATES_MAX
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.objectives import Mean, TimeAndEnergy
-from offboard.robot_client.policies.probe import STALE
+from offboard.robot_client.policies.probe import PROBE_EVERY
 from offboard.robot_client.records import trace
 from offboard.robot_client.simulated.config import CallConfig, DriveConfig, RobotConfig
 
@@ -124,6 +124,23 @@ def test_objective_energy_and_limits_are_made_from_the_flags() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("policy", "flags", "beats"),
+    [
+        ("paper", (), False),
+        ("paper", ("--heartbeats",), True),
+        ("paper-with-heartbeats", (), True),
+        ("default", (), True),
+        ("default", ("--no-heartbeats",), False),
+    ],
+)
+def test_a_flag_switches_heartbeats(policy: str, flags: tuple[str, ...], beats: bool) -> None:
+    """Without the flag, the policy says whether there are heartbeats."""
+    given = [f"--policy={policy}", "--map=m.yaml", *flags]
+    made = load(DriveConfig, given, prog="r", description="", environ={}, prefix="R")
+    assert made.settings(seed=0).beats(policy) == beats
+
+
 @pytest.mark.parametrize("cls", [DriveConfig, CallConfig])
 def test_the_help_explains_the_default_policy(
     cls: type[RobotConfig], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -152,7 +169,7 @@ def test_a_second_run_starts_with_what_the_first_one_learnt(tmp_path: Path) -> N
     records = list(trace.read(tmp_path / "trace.jsonl"))
     assert records[0]["sites"]["onboard"]["predicted_s"] is None
     assert records[8]["sites"]["onboard"]["predicted_s"] is not None
-    assert (records[8]["i"], records[8]["sites"]["onboard"]["age"]) == (0, STALE)
+    assert (records[8]["i"], records[8]["sites"]["onboard"]["age"]) == (0, PROBE_EVERY)
     command = [
         sys.executable,
         "-m",

@@ -49,6 +49,14 @@ def test_an_event_is_due_once_by_time_or_by_task(read: Callable[[str], Scenario]
     assert not timeline.left()
 
 
+@pytest.mark.parametrize(("text", "heartbeats"), [("", None), ("true", True), ("false", False)])
+def test_a_scenario_may_switch_heartbeats(
+    read: Callable[[str], Scenario], text: str, heartbeats: bool | None
+) -> None:
+    """Without the key, the policy of the robots decides."""
+    assert read(f"[robot]\nheartbeats = {text}\n" if text else "").robot.heartbeats == heartbeats
+
+
 def test_a_part_that_an_event_starts_is_absent_before(read: Callable[[str], Scenario]) -> None:
     """A part is absent at first if its first event is a start, but not if it is killed before that."""
     events = read(

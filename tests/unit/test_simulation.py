@@ -134,6 +134,15 @@ def test_tasks_in_an_outage_time_out(read: Callable[..., Scenario]) -> None:
         assert expected - 1e-9 <= one.response_s <= expected + behind + 1e-9
 
 
+def test_heartbeats_can_be_switched_on_and_off(read: Callable[..., Scenario]) -> None:
+    """With heartbeats, the paper's rule does not warm up a silent site; `robot.heartbeats` decides."""
+    scenario = read("[[event]]\nat_task = 2\nlink = {outage = true}\n")
+    paper, beating = played(scenario, "paper"), played(scenario, "paper-with-heartbeats")
+    assert paper != beating
+    assert played(scenario.changed(heartbeats=True), "paper") == beating
+    assert played(scenario.changed(heartbeats=False), "paper-with-heartbeats") == paper
+
+
 def test_a_dead_server_is_not_used_until_it_is_back(read: Callable[..., Scenario]) -> None:
     """A crash fails the task in flight at once; tasks run onboard until the server is warm and connected."""
     scenario = read(

@@ -70,6 +70,18 @@ def test_one_scenario_has_no_summary(capsys: pytest.CaptureFixture[str]) -> None
     assert out.startswith("Scenario nonlinear in simulation: 3 runs of each policy with seeds 1 to 3")
 
 
+def test_a_flag_switches_the_heartbeats_of_all_policies(capsys: pytest.CaptureFixture[str]) -> None:
+    """Without heartbeats, the paper's rule with outage detection is the paper's rule."""
+    command = ["compare", "outage", "--simulate", "--seeds", "1", "--jobs", "1", "--tasks", "100"]
+    command += ["--policies", "paper,paper-with-heartbeats", "--format", "json"]
+    means = []
+    for flags in ((), ("--no-heartbeats",)):
+        assert main([*command, *flags]) == 0
+        (table,) = json.loads(capsys.readouterr().out)["tables"]
+        means.append({line["mean_ms"] for line in table["scores"] if not line["bound"]})
+    assert [len(each) for each in means] == [2, 1]
+
+
 def test_a_scenario_without_an_oracle_is_left_out_of_the_mean() -> None:
     """Open arrivals have no oracle, so their scenario has no figure and does not count in the mean."""
     table: Table = summary_table({"paper": {"calm": 1.2, "burst": None, "outage": 1.4}}, "all")

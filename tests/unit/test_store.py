@@ -8,7 +8,7 @@ import pytest
 from offboard.common.errors import CloudTimeout
 from offboard.robot_client.learning.store import HALF_LIFE_S
 from offboard.robot_client.policies import Probe
-from offboard.robot_client.policies.probe import STALE
+from offboard.robot_client.policies.probe import PROBE_EVERY
 from offboard.robot_client.predictors import LEAST_SQUARES, PARTS
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.memory_robot import Robot, store_plain, store_worked
@@ -71,11 +71,11 @@ def test_each_half_life_away_halves_what_is_recalled(robot: Robot, half_lives: f
     with robot.started(window=300) as offload:
         found = robot.outlooks(offload)
         assert [list(one.window) for one in robot.windows] == newest
-        assert found[CLOUD].age == (STALE if kept else 0)
+        assert found[CLOUD].age == (PROBE_EVERY if kept else 0)
 
 
 def test_a_probe_comes_soon_after_a_restart(robot: Robot) -> None:
-    """The slower site counts as STALE, so it is probed as soon as the allowance permits."""
+    """The slower site counts as old, so it is probed as soon as the allowance permits."""
     robot.sites[1].script = lambda one: Execution(CLOUD, 0.9, one.size)
     with robot.started(PARTS, "probe:greedy") as offload:
         robot.ask(offload, 60)
