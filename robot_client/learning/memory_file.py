@@ -124,7 +124,7 @@ def _condition(given: Any) -> Condition:
 
 
 def _size(given: Any) -> Size:
-    return tuple(map(_number, given)) if isinstance(given, list) and given else _number(given)
+    return tuple(map(_number, given)) if isinstance(given, list) and len(given) > 1 else _number(given)
 
 
 def _number(given: Any, least: float = 0.0) -> float:
