@@ -8,7 +8,7 @@ import inspect
 import itertools
 import math
 import textwrap
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -18,22 +18,25 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 NAME_LENGTH_MAX = 64
 KINDS_MAX = 256  # a `hello` message names all of them
+SIZE_NUMBERS_MAX = 8  # a size sums up the arguments; with more numbers, a window says too little of each
+
+Size = float | tuple[float, ...]  # a tuple has 2 to SIZE_NUMBERS_MAX numbers
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
     """A registered function.
 
-    `size` maps the arguments to the input size d (finite, >= 0). `types` are the dataclasses that arguments
-    and result may contain. `warm` is called once per process before the first task. A kind with
-    `duplicate=False` never runs on two sites. `work` maps a result to the amount of work that it took, in any
-    unit. `setup` is called once per worker; its result is the first argument of the function, which callers
-    do not give.
+    `size` maps the arguments to the input size d: a number, or a tuple or list of them that always has the
+    same length (each finite, >= 0). `types` are the dataclasses that arguments and result may contain. `warm`
+    is called once per process before the first task. A kind with `duplicate=False` never runs on two sites.
+    `work` maps a result to the amount of work that it took, in any unit. `setup` is called once per worker;
+    its result is the first argument of the function, which callers do not give.
     """
 
     name: str
     function: Callable[..., Any]
-    size: Callable[..., float]
+    size: Callable[..., float | Sequence[float]]
     duplicate: bool = True
     types: tuple[type, ...] = ()
     warm: Callable[[], None] | None = None
@@ -41,6 +44,7 @@ class Kind:
     work: Callable[[Any], float] | None = None
     positional: int | None = None  # a call with this many positional arguments needs no binding
     setup: Callable[[], Any] | None = None
+    _counts: list[int] = field(default_factory=list, compare=False, repr=False)  # the first one holds for all
 
     def bind(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:
         """The call as positional arguments with defaults filled in. TypeError as if it were called."""
@@ -54,12 +58,36 @@ class Kind:
         """What a caller gives: the parameters of the function, without the first one if there is a setup."""
         return _without_state(inspect.signature(self.function), self.setup)
 
-    def size_of(self, args: tuple[Any, ...]) -> float:
-        """The input size d of a call. BadValue if the size function returns no finite number >= 0."""
-        size = float(self.size(*args))
-        if not (math.isfinite(size) and size >= 0):
-            raise BadValue(f"task {self.name}: input size {size} is not a finite number >= 0")
-        return size
+    def size_of(self, args: tuple[Any, ...]) -> Size:
+        """The input size d of a call. BadValue unless it is finite, not negative and as long as before."""
+        given: Any = self.size(*args)
+        numbers = self._numbers(given) if isinstance(given, tuple | list) else (float(given),)
+        for number in numbers:
+            if not (math.isfinite(number) and number >= 0):
+                raise BadValue(f"task {self.name}: input size {number} is not a finite number >= 0")
+        self._check_count(len(numbers))
+        return numbers if len(numbers) > 1 else numbers[0]
+
+    @property
+    def size_count(self) -> int | None:
+        """How many numbers a size has; None before the first one."""
+        return self._counts[0] if self._counts else None
+
+    def _numbers(self, given: Sequence[Any]) -> tuple[float, ...]:
+        if not 1 <= len(given) <= SIZE_NUMBERS_MAX:
+            allowed = f"1 to {SIZE_NUMBERS_MAX} are allowed"
+            raise BadValue(f"task {self.name}: input size has {len(given)} numbers; {allowed}")
+        try:
+            return tuple(map(float, given))
+        except (TypeError, ValueError, OverflowError) as error:
+            raise BadValue(f"task {self.name}: input size: {describe(error)}") from error
+
+    def _check_count(self, count: int) -> None:
+        if not self._counts:
+            self._counts.append(count)  # if two threads do this at once, the first one counts
+        if self._counts[0] != count:
+            before = f"{self._counts[0]} before; the count must not change"
+            raise BadValue(f"task {self.name}: input size has {count} numbers, but had {before}")
 
     def work_of(self, result: Any) -> float | None:
         """The amount of work that a result took; None if it is unknown or not a number above 0."""
@@ -75,7 +103,7 @@ class Task:
 
     kind: Kind
     args: tuple[Any, ...]
-    size: float
+    size: Size
     id: int = field(default_factory=itertools.count(1).__next__)
 
 
@@ -85,7 +113,7 @@ _kinds: dict[str, Kind] = {}
 def task(
     name: str,
     *,
-    size: Callable[..., float],
+    size: Callable[..., float | Sequence[float]],
     duplicate: bool = True,
     types: tuple[type, ...] = (),
     warm: Callable[[], None] | None = None,
@@ -95,6 +123,8 @@ def task(
     """Register a function as a kind of task. It can still be called as an ordinary function.
 
     Robot and server load the same module. If the source of a kind differs between them, it runs onboard.
+    If `size` returns several numbers, the predictor `least-squares` uses all of them, and every other one
+    uses the first; `parts` predicts from the work instead if the kind tells it (by the first number too).
     """
     if not name or len(name) > NAME_LENGTH_MAX or not name.isidentifier():
         raise ConfigError(f"task name {name!r} is not an identifier of at most {NAME_LENGTH_MAX} characters")
@@ -125,6 +155,17 @@ def task(
         return function
 
     return register
+
+
+def first_number(size: Size) -> float:
+    """The number of a size, or the first one of several."""
+    return size[0] if isinstance(size, tuple) else size
+
+
+def show_size(size: Size, form: str) -> str:
+    """A size in words, with each number in this format."""
+    numbers = size if isinstance(size, tuple) else (size,)
+    return " and ".join(format(number, form) for number in numbers)
 
 
 def kind_of(function: Callable[..., Any]) -> Kind:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from offboard.common.tasks import Kind, kinds
+from offboard.common.tasks import Kind, first_number, kinds
 from offboard.common.wire.messages import byte_count
 from offboard.common.wire.values import encode
 
@@ -62,7 +62,7 @@ def row(kind: Kind, engine: tuple[Any, ...], args: tuple[Any, ...]) -> tuple[flo
         result = kind.function(*engine, *args)
         times.append(time.process_time() - began)
     out, back = (byte_count(encode(value, kind.types).frames) for value in (list(args), result))
-    return out, back, min(times), kind.size_of(args), kind.work_of(result) or np.nan
+    return out, back, min(times), first_number(kind.size_of(args)), kind.work_of(result) or np.nan
 
 
 def spread(values: np.ndarray[Any, Any]) -> str:

@@ -20,6 +20,11 @@ def detect(detector: Detector, frame: bytes) -> list[int]:
     return list(frame)
 
 
+@task("typed_render", size=lambda pixels, layers: (pixels, layers))
+def render(pixels: int, layers: int) -> bytes:
+    return bytes(pixels * layers)
+
+
 def untyped(limit):  # type: ignore[no-untyped-def]
     return limit
 
@@ -28,6 +33,7 @@ async def calls(offload: Offloader) -> None:
     assert_type(offload(count, 5), str)
     assert_type(offload(count, 5, scale=2.0, where="cloud", timeout_s=1.0), str)
     assert_type(offload(detect, b"frame"), list[int])
+    assert_type(offload(render, 5, 3), bytes)
     assert_type(offload(untyped, 5), Any)
     assert_type(offload.map(count, [1, (2, 3.0)]), list[str])
     assert_type(offload.map(detect, [b"frame"], where="both"), list[list[int]])

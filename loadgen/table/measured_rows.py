@@ -203,7 +203,10 @@ def _trace_row(where: str, fields: dict[str, Any]) -> Row | None:
         ) from None
     if ONBOARD not in seconds or CLOUD not in seconds:
         return None
-    return _number(where, "size", fields["size"]), seconds[ONBOARD], seconds[CLOUD]
+    size = fields["size"]
+    if isinstance(size, list):
+        raise DataError(f"{where}: size: {_short(size)} has several numbers; one is needed here")
+    return _number(where, "size", size), seconds[ONBOARD], seconds[CLOUD]
 
 
 def _number(where: str, name: str, value: Any) -> float:

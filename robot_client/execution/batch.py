@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from offboard.common.errors import Overtaken, TaskError
-from offboard.common.tasks import Kind, Task
+from offboard.common.tasks import Kind, Task, first_number
 from offboard.robot_client.execution.placement import (
     BUDGET_SHARE,
     SERVER_IN_FLIGHT_MAX,
@@ -67,8 +67,8 @@ class Batch:
         timeout_s: float,
     ) -> None:
         self._tasks = tasks
-        # The tasks are of one kind, so the largest takes longest.
-        self._waiting = sorted(range(len(tasks)), key=lambda number: -tasks[number].size)
+        # The tasks are of one kind, so the largest takes longest, by the first number of its size.
+        self._waiting = sorted(range(len(tasks)), key=lambda number: -first_number(tasks[number].size))
         self._queues = {site: Queue(site, BUDGET_SHARE * timeout_s) for site in sites}
         self._predict = predict
         self._run = run

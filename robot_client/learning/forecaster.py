@@ -5,7 +5,7 @@ The times come from the memories; what is measured of the sites comes from the r
 
 from collections.abc import Collection, Mapping
 
-from offboard.common.tasks import Task
+from offboard.common.tasks import Size, Task
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.runs_in_flight import Flights
 from offboard.robot_client.policies import Forecast, Outlook
@@ -57,7 +57,7 @@ class Forecaster:
             )
         return self._with_allowance(memory, task.size, outlooks)
 
-    def _with_allowance(self, memory: KindMemory, size: float, outlooks: Mapping[str, Outlook]) -> Forecast:
+    def _with_allowance(self, memory: KindMemory, size: Size, outlooks: Mapping[str, Outlook]) -> Forecast:
         allowance = self._allowance
         return Forecast(
             size=size,

@@ -7,7 +7,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterable
 
-from offboard.common.tasks import Kind
+from offboard.common.tasks import Kind, Size, first_number
 from offboard.robot_client.learning.shared_work import SharedWork
 from offboard.robot_client.learning.site import OBSERVATIONS_MAX, SiteMemory
 from offboard.robot_client.policies.energy import Energy
@@ -62,9 +62,9 @@ class KindMemory:
         """How many observations the predictor of a site rests on."""
         return len(self.site(site).predictor)
 
-    def amount(self, size: float) -> float | None:
+    def amount(self, size: Size) -> Size | None:
         """What the predictors are asked for: the expected work of this size, or the size itself."""
-        return size if self._work is None else self._work.predict(size)
+        return size if self._work is None else self._work.predict(first_number(size))
 
     def work_of(self, execution: Execution) -> float | None:
         """The work of a task, by the result of this execution; None if the result does not say."""
@@ -80,11 +80,11 @@ class KindMemory:
         """The work of a task, by the first of its executions whose result says it."""
         return next((work for one in executions if (work := self.work_of(one)) is not None), None)
 
-    def learn_size(self, size: float, work: float) -> None:
-        """Learn that a task of this size had this much work."""
+    def learn_size(self, size: Size, work: float) -> None:
+        """Learn that a task of this size had this much work; of several numbers, the first one counts."""
         if self._work is not None:
-            self._work.learn(size, work)
-            self.worked.append((size, work))
+            self._work.learn(first_number(size), work)
+            self.worked.append((first_number(size), work))
 
     def count_task(self) -> None:
         """Count one more task of this kind, wherever it ran."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from offboard.common.errors import Overtaken
-from offboard.common.tasks import Task
+from offboard.common.tasks import Size, Task
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.regret import RegretEstimate
 from offboard.robot_client.policies import Decision, Forecast, Probe
@@ -26,7 +26,7 @@ class PendingTask:
     id: str
     memory: KindMemory
     forecast: Forecast
-    amount: float | None
+    amount: Size | None
     decision: Decision
     seconds: dict[str, float] = field(default_factory=dict)
 

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from offboard.common import VERSION as SOFTWARE
+from offboard.common.tasks import Size
 from offboard.robot_client.learning.site import OBSERVATIONS_MAX, Observation
 from offboard.robot_client.sites.runner import Condition
 
@@ -89,8 +90,8 @@ def _site(given: Any) -> KeptSite:
 
 def _observation(given: Any) -> Observation:
     return Observation(
-        size=_number(given["size"]),
-        amount=_number(given["amount"]),
+        size=_size(given["size"]),
+        amount=_size(given["amount"]),
         work=_maybe(given["work"]),
         seconds=_number(given["seconds"]),
         ok=_fact(given["ok"]),
@@ -121,6 +122,10 @@ def _condition(given: Any) -> Condition:
         capacity=_share(given["capacity"]),
         server_load=_number(given["server_load"]),
     )
+
+
+def _size(given: Any) -> Size:
+    return tuple(map(_number, given)) if isinstance(given, list) and len(given) > 1 else _number(given)
 
 
 def _number(given: Any, least: float = 0.0) -> float:

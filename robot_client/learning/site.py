@@ -8,11 +8,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from offboard.common.errors import Overtaken, TaskError
+from offboard.common.tasks import Size, first_number
 from offboard.robot_client.learning.conformal import Conformal
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.forecast import Outlook
 from offboard.robot_client.policies.objectives import Expected, Objective
 from offboard.robot_client.predictors import Prediction, Predictor
+from offboard.robot_client.predictors.least_squares import LeastSquares
 from offboard.robot_client.predictors.line import RunningMean
 from offboard.robot_client.predictors.parts import Parts
 from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Execution
@@ -34,8 +36,8 @@ class Observation:
     `bound`: the robot ran the same task itself and may have received the answer of this site late.
     """
 
-    size: float
-    amount: float
+    size: Size
+    amount: Size
     work: float | None
     seconds: float
     ok: bool
@@ -77,6 +79,7 @@ class SiteMemory:
         self._parts = predictor if isinstance(predictor, Parts) else None
         if self._parts is not None:
             self._parts.remote = site != ONBOARD
+        self._least_squares = predictor if isinstance(predictor, LeastSquares) else None
         self._site = site
         self._failures = 0
         self._conformal = Conformal()
@@ -88,7 +91,7 @@ class SiteMemory:
 
     def outlook(
         self,
-        amount: float | None,
+        amount: Size | None,
         condition: Condition,
         *,
         in_flight: int,
@@ -137,12 +140,12 @@ class SiteMemory:
 
     def learn(
         self,
-        amount: float | None,
+        amount: Size | None,
         execution: Execution,
         outlook: Outlook | None,
         *,
         silent: bool,
-        size: float,
+        size: Size,
         work: float | None = None,
         beside: bool = False,
     ) -> None:
@@ -200,10 +203,12 @@ class SiteMemory:
             return self._energy.onboard_j(execution.cpu_s or execution.run_s or execution.seconds)
         return self._energy.remote_j(execution.seconds, execution.bytes_out + execution.bytes_in)
 
-    def _predict(self, amount: float, moved: float, condition: Condition) -> Prediction | None:
-        if self._parts is None:
-            return self.predictor.predict(amount, self.age + 1)
-        return self._parts.predict(amount, moved=moved, condition=condition)
+    def _predict(self, amount: Size, moved: float, condition: Condition) -> Prediction | None:
+        if self._parts is not None:
+            return self._parts.predict(first_number(amount), moved=moved, condition=condition)
+        if self._least_squares is not None:
+            return self._least_squares.predict(amount)
+        return self.predictor.predict(first_number(amount), self.age + 1)
 
     def _is_longer(self, execution: Execution, expected_s: float | None, *, silent: bool) -> bool:
         """Whether a failed run shows that the site takes longer than predicted."""
@@ -240,12 +245,14 @@ class SiteMemory:
         self._teach(one)
 
     def _teach(self, one: Observation) -> None:
-        model, moved = self._parts, one.bytes_out + one.bytes_in
-        if model is None:
-            self.predictor.learn(one.amount, one.seconds)
+        model, moved, number = self._parts, one.bytes_out + one.bytes_in, first_number(one.amount)
+        if self._least_squares is not None:
+            self._least_squares.learn(one.amount, one.seconds)
+        elif model is None:
+            self.predictor.learn(number, one.seconds)
         elif one.ok:
             model.learn(
-                one.amount,
+                number,
                 one.seconds,
                 one.ahead,
                 run_s=one.run_s,
@@ -256,7 +263,7 @@ class SiteMemory:
                 condition=one.condition,
             )
         else:
-            model.learn_late(one.amount, one.seconds, one.ahead, moved=moved, condition=one.condition)
+            model.learn_late(number, one.seconds, one.ahead, moved=moved, condition=one.condition)
 
     def _joules(self, seconds: float) -> float:
         if self._site == ONBOARD:

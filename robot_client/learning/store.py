@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from offboard.common.errors import ConfigError
+from offboard.common.tasks import Size
 from offboard.robot_client.learning import memory_file
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.memory_file import PER_SIZE, PER_WORK, KeptKind, KeptSite, Unreadable
@@ -60,6 +61,9 @@ class Store:
             return
         if not kind.source_hash or kept.source != kind.source_hash:
             log.info("memory %s: task %s starts cold because its source has changed", self.path, kind.name)
+            return
+        if not _fits(kept, kind.size_count):
+            log.info("memory %s: task %s starts cold: its sizes had another count", self.path, kind.name)
             return
         for size, work in kept.worked:
             memory.learn_size(size, work)
@@ -189,5 +193,11 @@ def _as_learnt(observations: Collection[Observation], saved_per: str, per_work: 
     return [_with_amount(one, one.work) for one in observations if one.work is not None]
 
 
-def _with_amount(one: Observation, amount: float) -> Observation:
+def _fits(kept: KeptKind, count: int | None) -> bool:
+    """Whether all kept sizes have as many numbers as the sizes of now."""
+    sizes = [one.size for site in kept.sites.values() for one in site.observations]
+    return count is None or all(count == (len(size) if isinstance(size, tuple) else 1) for size in sizes)
+
+
+def _with_amount(one: Observation, amount: Size) -> Observation:
     return one if one.amount == amount else replace(one, amount=amount)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
+from offboard.common.tasks import Size
 from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition
 
 ERRORS_MIN = 10  # with fewer errors, only the spread says how far a prediction may be off
@@ -130,7 +131,7 @@ class Forecast(NamedTuple):
     Build it with keywords. It is a named tuple for the same reason as `Outlook`.
     """
 
-    size: float
+    size: Size
     sites: Mapping[str, Outlook]
     last_site: str | None = None
     duplicates: float = math.inf

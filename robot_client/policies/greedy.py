@@ -5,6 +5,7 @@ The costs come from `objectives`.
 
 from functools import partial
 
+from offboard.common.tasks import show_size
 from offboard.robot_client.policies.decision import Decision
 from offboard.robot_client.policies.forecast import Forecast, Outlook, cheapest, costs_of, home
 from offboard.robot_client.sites.runner import ONBOARD, Condition
@@ -37,7 +38,7 @@ def explain(forecast: Forecast, site: str) -> str:
     """The reason to choose this site: predictions, what was measured, how old the other sites are."""
     sites = forecast.sites
     parts, stale = [f"{site}: {_times(sites[site])}"], ""
-    measured = f"size {forecast.size:.3g}"
+    measured = f"size {show_size(forecast.size, '.3g')}"
     for name, one in sites.items():
         if name != site:
             parts.append(f"{name} {_times(one)}")

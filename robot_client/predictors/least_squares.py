@@ -5,7 +5,9 @@ The window and its sums are in `window`.
 
 import math
 
+from offboard.common.tasks import Size
 from offboard.robot_client.predictors.base import Prediction, check_observation
+from offboard.robot_client.predictors.plane import Plane
 from offboard.robot_client.predictors.window import Window
 
 
@@ -13,24 +15,32 @@ class LeastSquares:
     """Ordinary least squares of seconds on size over the last `window` executions.
 
     m = sum((d - mean d)(t - mean t)) / sum((d - mean d)^2); c = mean t - m mean d; p = m d + c.
-    If all sizes are equal, the slope is 0 and p = mean t.
+    If all sizes are equal, the slope is 0 and p = mean t. Sizes of several numbers get a plane.
     """
 
     def __init__(self, window: int, seed: int = 0) -> None:  # noqa: ARG002 - nothing is random
         self.window = Window(window)
+        self._plane = Plane(window)  # empty, or the window is
 
     @property
     def full(self) -> bool:
-        return self.window.full
+        return self.window.full or self._plane.full
 
     def __len__(self) -> int:
-        return len(self.window)
+        return len(self.window) + len(self._plane)
 
-    def learn(self, size: float, seconds: float) -> None:
+    def learn(self, size: Size, seconds: float) -> None:
+        if isinstance(size, tuple):
+            for number in size:
+                check_observation(number, seconds)
+            self._plane.learn(size, seconds)
+            return
         check_observation(size, seconds)
         self.window.append(size, seconds)
 
-    def predict(self, size: float, ahead: int = 1) -> Prediction | None:  # noqa: ARG002
+    def predict(self, size: Size, ahead: int = 1) -> Prediction | None:  # noqa: ARG002
+        if isinstance(size, tuple):
+            return self._plane.predict(size)
         if not len(self.window):
             return None
         of = self.window.moments()

@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self
 
+from offboard.common.tasks import Size
 from offboard.robot_client.learning.regret import Regret
 from offboard.robot_client.policies import Decision, Hedge, Outlook
 from offboard.robot_client.records import lines
@@ -79,13 +80,13 @@ class Record:
     i: int
     id: str
     kind: str
-    size: float
+    size: Size
     sites: Mapping[str, Outlook]
     decision: Decision
     executions: tuple[Execution, ...]
     used: str | None
     waited_s: float
-    amount: float | None = None
+    amount: Size | None = None
     late: tuple[Late, ...] = ()
     regret: Regret | None = None
     started_at: datetime = field(default_factory=lambda: datetime.now(UTC))
@@ -169,8 +170,9 @@ def as_dict(record: Record) -> dict[str, Any]:
 def features(record: Record) -> dict[str, float]:
     """What was measured, by name; a value of a site is named SITE.NAME."""
     found: dict[str, float] = {}
-    if record.amount is not None and record.amount != record.size:
-        found["work"] = record.amount
+    amount = record.amount
+    if not (amount is None or isinstance(amount, tuple) or amount == record.size):
+        found["work"] = amount
     for site, outlook in record.sites.items():
         if outlook.condition is not UNMEASURED:
             for name, value in zip(Condition._fields, outlook.condition, strict=True):

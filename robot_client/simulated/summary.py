@@ -8,6 +8,7 @@ import sys
 from array import array
 from collections.abc import Callable, Sequence
 
+from offboard.common.tasks import show_size
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.runner import ONBOARD
 
@@ -91,7 +92,7 @@ def describe(record: Record) -> str:
         f"{one.site} {one.seconds * 1e3:.1f} ms" if one.ok else f"{one.site} {one.error}"
         for one in record.executions
     )
-    return f"size {record.size:.2f} -> {took} ({record.decision.reason})"
+    return f"size {show_size(record.size, '.2f')} -> {took} ({record.decision.reason})"
 
 
 def show_progress(done: int, total: int, about: Callable[[], str]) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from offboard.common.errors import ConfigError
-from offboard.common.tasks import Kind, kind_of
+from offboard.common.tasks import Kind, Size, kind_of
 from offboard.common.wire import messages as wire
 from offboard.loadgen.scenario.scenario import Workload
 from offboard.loadgen.simulation.model.task_costs import COSTS, PARTS, PLANS, ROUNDS, Cost
@@ -23,7 +23,7 @@ OTHERS_TASKS_MAX = 50  # tasks of each other robot, which repeats them
 class SimulatedTask:
     """One task: its input size, its work on each site, and the bytes of its request and reply."""
 
-    size: float
+    size: Size
     work: Mapping[str, float]
     bytes_out: int
     bytes_in: int
