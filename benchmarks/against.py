@@ -1,4 +1,4 @@
-"""Plays scenarios with this checkout and with another one, in turns, and compares the times of the same tasks.
+"""Plays scenarios with this checkout and another one, in turns, and compares the times of the same tasks.
 
     python -m benchmarks.against ../before --cases calm,apriltags-10 --seeds 4 --out out/against
 
@@ -145,7 +145,7 @@ def play(checkout: Path, file: Path, out: Path, *, policy: str, seed: int, tasks
 
 
 def read(out: Path) -> Played:
-    """The files of a run. The trace is read line by line, because another checkout may have another format."""
+    """The files of a run. The trace is read as plain JSON: another checkout may have another format."""
     times = {line["i"]: line["ended_s"] - line["due_s"] for line in read_lines(out / ANSWERS)}
     predicted: dict[str, list[tuple[float, float]]] = {site: [] for site in CONSTANTS}
     chosen = []
