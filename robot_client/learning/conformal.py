@@ -10,13 +10,12 @@ from collections import deque
 
 from offboard.robot_client.policies.forecast import ERRORS_MIN, PredictionErrors, unit_s
 from offboard.robot_client.policies.objectives import SPREADS_90
+from offboard.robot_client.predictors.line import RunningMean
 
 COVERAGE = 0.9  # share of the times that an interval should hold
-OUTSIDE = 1 - COVERAGE  # the other times
 OUTSIDE_MIN, OUTSIDE_MAX = -0.1, 0.5  # below 0, the interval is wider than all errors seen
 ERRORS_MAX = 100  # the last ones
 RATE = 0.03  # of the adaptation
-USUAL_FROM = 20  # times: the usual time is their mean; from then on, old times fade from it
 
 
 class Conformal:
@@ -31,9 +30,8 @@ class Conformal:
     def __init__(self) -> None:
         self._order: deque[float] = deque()
         self._sorted: list[float] = []
-        self._usual_s = 0.0
-        self._count = 0
-        self._outside = OUTSIDE  # the share of errors that the interval leaves out
+        self._usual_s = RunningMean()
+        self._outside = 1 - COVERAGE  # the share of errors that the interval leaves out
         self._ends: tuple[float, float] | None = None  # of the interval, as scores
         self._errors: PredictionErrors | None = None
 
@@ -41,21 +39,18 @@ class Conformal:
     def errors(self) -> PredictionErrors:
         """The errors until now, as a value; made again only after something was learnt."""
         if self._errors is None:
-            self._errors = PredictionErrors(tuple(self._sorted), self._usual_s)
+            self._errors = PredictionErrors(tuple(self._sorted), self._usual_s.value)
         return self._errors
 
     def learn(self, predicted_s: float, seconds: float) -> None:
         """Learn from a prediction and the time that the task then took."""
-        if self._count:
-            score = (seconds - predicted_s) / unit_s(predicted_s, self._usual_s)
+        if self._usual_s.count:
+            score = (seconds - predicted_s) / unit_s(predicted_s, self._usual_s.value)
             if len(self._sorted) >= ERRORS_MIN:
                 low, high = self._ends or self._interval()
                 self._adapt(missed=not low <= score <= high)
             self._add(score)
-        if self._count < USUAL_FROM:
-            self._count += 1
-        slower_s = seconds if seconds > predicted_s else predicted_s
-        self._usual_s += (slower_s - self._usual_s) * (1 / self._count)
+        self._usual_s.add(max(seconds, predicted_s))
         self._errors = None
 
     def miss(self) -> None:
@@ -69,13 +64,13 @@ class Conformal:
             if spread_s is None:
                 return None
             return max(0.0, predicted_s - SPREADS_90 * spread_s), predicted_s + SPREADS_90 * spread_s
-        unit, (low, high) = unit_s(predicted_s, self._usual_s), self._ends or self._interval()
+        unit, (low, high) = unit_s(predicted_s, self._usual_s.value), self._ends or self._interval()
         low_s = predicted_s + unit * low if low < 0 else predicted_s
         high_s = predicted_s + unit * high if high > 0 else predicted_s
         return (low_s if low_s > 0 else 0.0), (high_s if high_s > 0 else 0.0)
 
     def _adapt(self, *, missed: bool) -> None:
-        outside = self._outside + RATE * (OUTSIDE - missed)
+        outside = self._outside + RATE * (1 - COVERAGE - missed)
         self._outside = min(OUTSIDE_MAX, max(OUTSIDE_MIN, outside))
         self._ends = None
 

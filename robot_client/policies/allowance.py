@@ -9,9 +9,7 @@ from offboard.common.errors import ConfigError
 from offboard.common.token_bucket import Bucket
 
 DUPLICATES = 0.1  # second runs per task
-DUPLICATES_MAX = 6.0  # second runs that can be saved up, and that can be owed
-DUPLICATES_FIRST = 6.0  # second runs at the start: about as many as a warm-up takes
-MINUTE_S = 60.0  # the caps are per minute
+DUPLICATES_MAX = 6.0  # second runs at the start, that can be saved up, and that can be owed: a warm-up takes as many
 
 
 class Allowance:
@@ -30,7 +28,7 @@ class Allowance:
         bytes_a_minute: float | None = None,
         joules_a_minute: float | None = None,
         *,
-        first: float = DUPLICATES_FIRST,
+        first: float = DUPLICATES_MAX,
     ) -> None:
         if not 0 <= duplicates <= 1:
             raise ConfigError(f"duplicates {duplicates}: must be a share of tasks from 0 to 1")
@@ -90,4 +88,4 @@ class Allowance:
 
 
 def _of_a_minute(cap: float | None) -> Bucket | None:
-    return None if cap is None else Bucket(cap / MINUTE_S, cap, cap)
+    return None if cap is None else Bucket(cap / 60.0, cap, cap)

@@ -8,9 +8,8 @@ from functools import partial
 from offboard.common.tasks import show_size
 from offboard.robot_client.policies.decision import Decision
 from offboard.robot_client.policies.forecast import Forecast, Outlook, cheapest, costs_of, home
+from offboard.robot_client.predictors.base import WARM_UP
 from offboard.robot_client.sites.runner import ONBOARD, Condition
-
-WARM_UP = 6  # observations of each site before sites are compared
 
 
 class Greedy:

@@ -6,8 +6,6 @@ When a task counts as late is in `Outlook.overdue_s`; `execution/race.py` starts
 from offboard.robot_client.policies.decision import Decision, Hedge, Policy
 from offboard.robot_client.policies.forecast import Forecast, cheapest
 
-AFTER_MIN_S = 1e-3  # the first site always has this long
-
 
 class WithHedges:
     """Adds a hedge: the second site starts when the first should still need longer than the second would.
@@ -34,5 +32,5 @@ class WithHedges:
         after_s = forecast.sites[decision.site].overdue_s(others[second])
         if after_s is None:
             return decision
-        hedge = Hedge(second, max(after_s, AFTER_MIN_S))
+        hedge = Hedge(second, after_s)
         return Decision(decision.site, decision.why, decision.policy, second=hedge)

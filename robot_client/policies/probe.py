@@ -7,7 +7,6 @@ from offboard.robot_client.policies.decision import Decision, Policy, Probe
 from offboard.robot_client.policies.forecast import Forecast
 
 PROBE_EVERY = 20  # tasks that a site has not run
-RESERVED = 1  # second runs that are left for hedges
 
 
 class WithProbes:
@@ -22,7 +21,7 @@ class WithProbes:
 
     def decide(self, forecast: Forecast) -> Decision:
         decision = self._inner.decide(forecast)
-        if decision.both or decision.second or forecast.duplicates < 1 + RESERVED:
+        if decision.both or decision.second or forecast.duplicates < 2:  # one is left for a hedge
             return decision
         ages = {
             site: one.age

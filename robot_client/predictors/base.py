@@ -6,6 +6,7 @@ Where a task runs is decided in `policies`.
 import math
 from typing import NamedTuple, Protocol
 
+WARM_UP = 6  # runs of a site, after which its predictions are compared with those of others
 SIZE_MIN = 1e-100  # smaller differences of sizes are 0: a steeper line would leave the range of a float
 
 

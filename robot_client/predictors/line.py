@@ -10,12 +10,10 @@ import math
 NOISE = 0.2  # standard deviation of the first times, as a share of the usual time
 PACE = 0.01  # by which a site becomes slower or faster from one task to the next
 SHAPE = 0.003  # the same for intercept and slope apart from each other
-AHEAD_MAX = 20  # tasks without news, after which the uncertainty grows no more: a site is probed by then
 ODD = 3.0  # standard deviations: a time farther from the line is an outlier
 RATE = 0.05  # of the running means, once there are enough times
 TAIL_MAX = 2.0  # usual times: a longer outlier counts as this much in the mean of the outliers
 RATE_AFTER = 4  # further times that the running means seem to have seen at the start
-VARIANCE_MIN = 1e-6  # so that nothing is divided by 0 where all times are equal
 
 
 class Line:
@@ -65,7 +63,7 @@ class Line:
         error = y - self.a - self.b * x
         unit = 0.5 * (max(0.0, self.a + self.b * x + known) + self._usual) or 1.0
         self._usual += rate * (min(y + known, ODD * self._usual) - self._usual)
-        self._loosen(PACE * PACE * min(ahead, AHEAD_MAX), known)
+        self._loosen(PACE * PACE * ahead, known)
         if self._together:
             shape = (SHAPE * (self.a + self.b)) ** 2
             self._paa += shape
@@ -80,7 +78,7 @@ class Line:
         beyond = min(max(0.0, error - reach) / unit, TAIL_MAX)
         self._tail += rate * (beyond - self._tail)
         seen = max(0.0, min(error * error, 0.5 * reach * reach) - variance) / (unit * unit)
-        self._noise = max(VARIANCE_MIN, self._noise + rate * (seen - self._noise))
+        self._noise += rate * (seen - self._noise)
         self._correct(x, max(-reach, min(reach, error)), unit)
 
     def bound(self, x: float, y: float, known: float) -> None:
@@ -117,6 +115,8 @@ class Line:
     def _correct(self, x: float, error: float, unit: float) -> None:
         pa, pb = self._paa + x * self._pab, self._pab + x * self._pbb
         whole = pa + x * pb + self._noise * unit * unit
+        if not whole > 0.0:  # all times were equal
+            return
         ka, kb = pa / whole, pb / whole
         self.a += ka * error
         self.b += kb * error
@@ -128,12 +128,12 @@ class Line:
 class RunningMean:
     """The plain mean of the first values, then a mean in which old values fade."""
 
-    __slots__ = ("_count", "value")
+    __slots__ = ("count", "value")
 
     def __init__(self) -> None:
         self.value = 0.0
-        self._count = 0
+        self.count = 0
 
     def add(self, one: float) -> None:
-        self._count += 1
-        self.value += max(RATE, 1.0 / self._count) * (one - self.value)
+        self.count += 1
+        self.value += max(RATE, 1.0 / self.count) * (one - self.value)

@@ -7,11 +7,10 @@ part is learned with; `learning/site.py` decides which executions say anything.
 import math
 
 from offboard.common.host.load import LOADED
-from offboard.robot_client.predictors.base import Prediction, check_observation
+from offboard.robot_client.predictors.base import WARM_UP, Prediction, check_observation
 from offboard.robot_client.predictors.line import Line, RunningMean
 from offboard.robot_client.sites.runner import UNMEASURED, Condition
 
-FULL_FROM = 6  # runs: the warm-up of a site is over, and a slow run under load says something about the load
 FIRST_BYTES_S = 12.5e6  # bytes a second of a link, until its first answers tell: 100 Mbit/s
 SLOW_RATE = 0.3  # loads are rare and short, so the factor under load is learned from few tasks
 SLOW_MAX = 3.0  # times the factor known: a run that is slower counts as this slow
@@ -42,7 +41,7 @@ class Parts:
 
     @property
     def full(self) -> bool:
-        return self._run.count >= FULL_FROM
+        return self._run.count >= WARM_UP
 
     def __len__(self) -> int:
         return self._run.count

@@ -17,10 +17,8 @@ EARLY_S = (
 )
 SILENT_S = 0.25  # a site is silent if nothing came for longer than this, and longer than round trips vary
 SLACK_S = 0.02  # an answer is late if it takes this much longer than usual, and longer than round trips vary
-UNANSWERED_MAX = 16  # heartbeats that are remembered; while that many have no answer, pauses are longer
-SLOWER = 5  # times as long are those pauses
+UNANSWERED_MAX = 16  # heartbeats that are remembered
 LEAST_OF = 2  # the shortest of that many round trips counts: one stalled segment does not make a slow link
-_SMOOTHING, _VARIATION = 1 / 8, 1 / 4  # RFC 6298
 
 
 class ServerReport(NamedTuple):
@@ -80,7 +78,6 @@ class Heartbeat:
         pause_s = self._every_s * (1 + JITTER * self._random.uniform(-1, 1))
         if len(self._sent) > UNANSWERED_MAX:
             del self._sent[next(iter(self._sent))]
-            pause_s *= SLOWER
         self.due_s = now_s + pause_s
         return self._next_id
 
@@ -140,9 +137,9 @@ class Heartbeat:
             self._back_s = now_s
 
     def _vary(self, round_trip_s: float) -> None:
-        """Learn how much round trips vary: a link that is always slow is not silent."""
+        """Learn how much round trips vary (RFC 6298): a link that is always slow is not silent."""
         if not self._smooth_s:
             self._smooth_s, self._varies_s = round_trip_s, round_trip_s / 2
             return
-        self._varies_s += _VARIATION * (abs(round_trip_s - self._smooth_s) - self._varies_s)
-        self._smooth_s += _SMOOTHING * (round_trip_s - self._smooth_s)
+        self._varies_s += 1 / 4 * (abs(round_trip_s - self._smooth_s) - self._varies_s)
+        self._smooth_s += 1 / 8 * (round_trip_s - self._smooth_s)

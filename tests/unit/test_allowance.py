@@ -5,7 +5,7 @@ import math
 import pytest
 
 from offboard.common.errors import ConfigError
-from offboard.robot_client.policies.allowance import DUPLICATES_FIRST, DUPLICATES_MAX, Allowance
+from offboard.robot_client.policies.allowance import DUPLICATES_MAX, Allowance
 
 
 def begin(allowance: Allowance, tasks: int, every_s: float = 1.0, from_s: float = 0.0) -> None:
@@ -21,7 +21,7 @@ def test_second_runs_are_a_share_of_the_tasks() -> None:
         if allowance.duplicates >= 1:
             allowance.duplicate()
             ran += 1
-    assert ran == pytest.approx(100 + DUPLICATES_FIRST, abs=1)
+    assert ran == pytest.approx(100 + DUPLICATES_MAX, abs=1)
 
 
 def test_saved_second_runs_are_limited() -> None:
@@ -34,7 +34,7 @@ def test_saved_second_runs_are_limited() -> None:
 def test_a_warm_up_is_paid_back() -> None:
     """Second runs beyond the level are owed, and later tasks must pay for them first."""
     allowance = Allowance(0.5)
-    for _ in range(round(DUPLICATES_FIRST) + 3):
+    for _ in range(round(DUPLICATES_MAX) + 3):
         allowance.duplicate()
     begin(allowance, 7)
     assert allowance.duplicates == pytest.approx(0.5)

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from offboard.robot_client.predictors.parts import FIRST_BYTES_S, FULL_FROM, Parts
+from offboard.robot_client.predictors.base import WARM_UP
+from offboard.robot_client.predictors.parts import FIRST_BYTES_S, Parts
 from offboard.robot_client.sites.runner import UNMEASURED, Condition
 
 RUN_S, REST_S, RTT_S = 0.2, 0.05, 0.03  # of a task of size 1 and of 1000 bytes
@@ -60,12 +61,12 @@ def predicted_s(model: Parts, size: float = 1.0, condition: Condition = NEAR, mo
 
 
 def test_nothing_is_known_before_the_first_run() -> None:
-    """There is no prediction, and the warm-up needs FULL_FROM runs."""
+    """There is no prediction, and the warm-up needs WARM_UP runs."""
     model = Parts()
     assert model.predict(1.0) is None
-    for n in range(1, FULL_FROM + 1):
+    for n in range(1, WARM_UP + 1):
         model.learn(1.0, RUN_S)
-        assert (model.full, len(model)) == (n >= FULL_FROM, n)
+        assert (model.full, len(model)) == (n >= WARM_UP, n)
 
 
 @pytest.mark.parametrize("size", [0.5, 1.0, 2.0])
@@ -160,8 +161,8 @@ def test_the_load_of_the_robot_does_not_slow_the_run_of_a_server() -> None:
 
 
 def test_a_warm_up_under_load_still_teaches_the_run() -> None:
-    """The first FULL_FROM runs are learned as they are, because nothing else is known."""
-    model = onboard(FULL_FROM, Condition(load=0.8))
+    """The first WARM_UP runs are learned as they are, because nothing else is known."""
+    model = onboard(WARM_UP, Condition(load=0.8))
     assert model.full
     assert predicted_s(model) == pytest.approx(RUN_S, rel=0.2)
 

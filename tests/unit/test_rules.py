@@ -8,7 +8,7 @@ import pytest
 from offboard.loadgen import rivals
 from offboard.robot_client import policies
 from offboard.robot_client.policies import Outlook, Policy
-from offboard.robot_client.policies.greedy import WARM_UP
+from offboard.robot_client.predictors.base import WARM_UP
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.outlooks import UNKNOWN, decide, known
 from tests.policy_checks import EDGE, SILENT
