@@ -9,7 +9,9 @@ from offboard.common.errors import ConfigError
 from offboard.common.token_bucket import Bucket
 
 DUPLICATES = 0.1  # second runs per task
-DUPLICATES_MAX = 6.0  # second runs at the start, that can be saved up, and that can be owed: a warm-up takes as many
+DUPLICATES_MAX = (
+    6.0  # second runs at the start, that can be saved up, and that can be owed: a warm-up takes as many
+)
 
 
 class Allowance:
