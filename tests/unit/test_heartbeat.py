@@ -7,7 +7,6 @@ from offboard.robot_client.sites.heartbeat import (
     JITTER,
     SILENT_S,
     SLACK_S,
-    SLOWER,
     UNANSWERED_MAX,
     Heartbeat,
     ServerReport,
@@ -166,8 +165,8 @@ def test_a_link_that_is_always_slow_is_not_silent() -> None:
     assert silent == 0, f"{silent} of {asked}"
 
 
-def test_unanswered_heartbeats_are_bounded_and_become_rarer() -> None:
-    """With UNANSWERED_MAX unanswered heartbeats, pauses are SLOWER times as long, and no more are kept."""
+def test_unanswered_heartbeats_are_bounded() -> None:
+    """No more than UNANSWERED_MAX heartbeats without an answer are remembered, and the pauses stay."""
     heartbeat = Heartbeat(EVERY_S, seed=1)
     heartbeat.start(0.0)
     pauses = []
@@ -175,8 +174,7 @@ def test_unanswered_heartbeats_are_bounded_and_become_rarer() -> None:
         now_s = heartbeat.due_s
         heartbeat.beat(now_s)
         pauses.append(heartbeat.due_s - now_s)
-    assert max(pauses[:UNANSWERED_MAX]) <= (1 + JITTER) * EVERY_S
-    assert min(pauses[UNANSWERED_MAX:]) >= SLOWER * (1 - JITTER) * EVERY_S
+    assert max(pauses) <= (1 + JITTER) * EVERY_S
     assert heartbeat.unanswered == UNANSWERED_MAX
     assert heartbeat.condition(heartbeat.due_s).silent
 
