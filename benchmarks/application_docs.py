@@ -34,4 +34,5 @@ def _replaced(page: str, name: str, text: str) -> str:
     marked = re.compile(f"({re.escape(begin)}\n).*?(?={re.escape(end)})", re.DOTALL)
     if not marked.search(page):
         raise ConfigError(f"--publish: {PAGE} has no lines {begin} and {end}")
-    return marked.sub(lambda found: f"{found[1]}\n{text}\n", page, count=1)
+    shown = f"![Response time of each task, onboard and in the cloud]({PICTURES.name}/{name}.svg)"
+    return marked.sub(lambda found: f"{found[1]}\n{shown}\n\n{text}\n", page, count=1)
