@@ -17,9 +17,9 @@ from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 RING: dict[str, Any] = {
     "color": "#222222",
     "marker": "o",
-    "markersize": 7.5,
+    "markersize": 7,
     "markerfacecolor": "none",
-    "markeredgewidth": 0.7,
+    "markeredgewidth": 0.6,
     "linestyle": "",
 }
 
@@ -63,16 +63,17 @@ def picture(name: str, runs: Mapping[str, Run]) -> bytes:
             chosen = np.array([default.known[i].site == site for i in shown], dtype=bool)
             axes.plot(x[chosen], times[site][chosen], **RING, gid=f"chosen-{site}")
         every = np.concatenate(list(times.values()))
-        scale_times(axes.set_yscale, axes.yaxis, every[np.isfinite(every)])
+        if (answered := every[np.isfinite(every)]).size:
+            scale_times(axes.set_yscale, axes.yaxis, answered)
         if axes.get_yscale() == "linear":
             axes.set_ylim(bottom=0)
-        ring = Line2D([], [], **RING, label=f"site that {DEFAULT} chose")
+        ring = Line2D([], [], **RING, label=f"chosen by {DEFAULT}")
         legend(figure, [*(_key(site) for site in (ONBOARD, CLOUD)), ring], columns=3)
 
     return render(paint).svg
 
 
 def _key(site: str) -> Line2D:
-    found = key(LOOKS[site], f"all {site}")
+    found = key(LOOKS[site], f"policy {site}")
     found.set_linestyle("")
     return found

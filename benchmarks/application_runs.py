@@ -75,7 +75,7 @@ class Progress:
         left = ""
         if self._seconds:
             each_s = sum(self._seconds) / len(self._seconds)
-            left = f"; about {each_s * (self.total - self._number + 1) / 60:.0f} minutes left"
+            left = f"; about {each_s * (self.total - self._number + 1) / 60:.0f} min left"
         what = f"{one.scenario.name}, seed {one.scenario.seed}, policy {one.policy}"
         print(f"run {self._number} of {self.total}: {what}{left}", file=sys.stderr, flush=True)
 
