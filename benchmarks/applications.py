@@ -18,7 +18,7 @@ from benchmarks.application_runs import Planned, Progress, find_kind, planned, p
 from benchmarks.application_tables import WORST, Run, faults, table, tasks_csv, worst_tasks
 from benchmarks.measure import processor
 from offboard.common.command_line import CommandParser, add_flags, run_command
-from offboard.common.config import check, resolve, setting
+from offboard.common.config import check, flag_of, resolve, setting, settings_of
 from offboard.common.errors import ConfigError
 from offboard.common.toml_file import unknown
 from offboard.loadgen.compare.compare_settings import SEEDS_MAX
@@ -73,11 +73,11 @@ def _run(argv: Sequence[str]) -> int:
     if config.publish:
         publish(names, config.out)
         return 0
-    return measure(names, config, shlex.join([*PROG.split(), *argv]))
+    return measure(names, config)
 
 
-def measure(names: Sequence[str], config: ApplicationsConfig, command: str) -> int:
-    """Play and write every application; 1 if any answer is not verified. `command` is how this was called."""
+def measure(names: Sequence[str], config: ApplicationsConfig) -> int:
+    """Play and write every application; 1 if any answer is not verified."""
     tasks = {name: find_kind(name) for name in names}  # so that a missing library is named at once
     todo = {
         name: planned(name, config.scenarios, config.seeds, tasks=config.tasks, out=config.out)
@@ -91,7 +91,7 @@ def measure(names: Sequence[str], config: ApplicationsConfig, command: str) -> i
             played.append(play(one, tasks[name]))
             progress.done(one)
         found = faults(played)
-        write(name, played, notes(runs, found, command), config.out)
+        write(name, played, notes(runs, found, command(names, config)), config.out)
         wrong += [text for texts in found.values() for text in texts]
     for text in wrong:
         print(text, file=sys.stderr)
@@ -133,6 +133,16 @@ def notes(runs: Sequence[Planned], found: Mapping[str, Sequence[str]], command: 
     if len(seeds) > 1:
         lines.append("In brackets: 95 % intervals, from blocks of neighbouring tasks.")
     return "\n".join(lines) + "\n"
+
+
+def command(names: Sequence[str], config: ApplicationsConfig) -> str:
+    """The command that measures the same, whether its settings came from flags or from the environment."""
+    words = PROG.split() + [name for name in names if names != NAMES]
+    for one in settings_of(ApplicationsConfig):
+        value = getattr(config, one.name)
+        if value != one.default:
+            words += [f"--{flag_of(one)}", ",".join(value) if isinstance(value, tuple) else str(value)]
+    return shlex.join(words)
 
 
 def commit() -> str:

@@ -179,6 +179,8 @@ def test_a_lost_answer_is_named_and_gives_exit_code_1(
     text = (tmp_path / "apriltags.md").read_text()
     assert f"Of 16 answers: {0 if lost is None else 1} lost, 0 failed, 0 wrong, 0 unverified." in text
     assert "Measured on 25 November 2026 at commit " in text
+    said = f"-m benchmarks.applications apriltags --tasks 4 --scenarios calm --out {tmp_path}"
+    assert f"Seed 1, 4 tasks in each run: `python {said}`." in text
     assert text in out
     assert len((tmp_path / "apriltags-tasks.csv").read_text().splitlines()) == 5
     picture = (tmp_path / "apriltags.svg").read_bytes()
