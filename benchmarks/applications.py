@@ -137,7 +137,7 @@ def notes(runs: Sequence[Planned], found: Mapping[str, Sequence[str]], command: 
 
 def command(names: Sequence[str], config: ApplicationsConfig) -> str:
     """The command that measures the same, whether its settings came from flags or from the environment."""
-    words = PROG.split() + [name for name in names if names != NAMES]
+    words = [*PROG.split(), *(() if tuple(names) == NAMES else names)]
     for one in settings_of(ApplicationsConfig):
         value = getattr(config, one.name)
         if value != one.default:
