@@ -71,7 +71,7 @@ def test_every_check_names_what_it_fails_with(name: str) -> None:
 def test_a_check_fails_with_what_it_names(broken: Callable[..., Played], name: str, wrong: str) -> None:
     """Played with that policy or broken part, the check fails and says by how much."""
     scenario = read_scenario(find_scenario(name))
-    skip_if_unplayable(scenario, "local")
+    skip_if_unplayable(scenario)
     played = broken(scenario, wrong)
     print(*played.verdicts, sep="\n")
     held = {str(verdict.check): verdict.holds for verdict in played.verdicts}
