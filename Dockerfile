@@ -60,7 +60,7 @@ FROM base AS examples
 # pinocchio, of examples/arm.py, needs it.
 RUN apt-get update -qq && apt-get install -qq --no-install-recommends libgomp1 > /dev/null && rm -rf /var/lib/apt/lists/*
 COPY requirements/examples.txt /tmp/all.txt
-# pyroboplan asks for toppra, which has no wheel for this Python. The planner of examples/arm.py does not import it.
+# pyroboplan asks for toppra, which has no wheel. The planner of examples/arm.py does not import it.
 RUN sed '/^toppra==/,/[^\\]$/d' /tmp/all.txt > /tmp/requirements.txt \
  && pip install --quiet --no-cache-dir --no-deps --only-binary :all: --require-hashes -r /tmp/requirements.txt
 COPY --from=wheel /wheels /wheels
