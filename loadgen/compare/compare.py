@@ -17,15 +17,15 @@ from offboard.loadgen.compare.simulated_tables import simulated
 from offboard.loadgen.play.stolen_cpu_time import NOTED_PERCENT
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.scenario import Scenario
-from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
+from offboard.loadgen.scenario.scenario_file import check_calls, find_scenario, read_scenario
 from offboard.loadgen.table.table_formats import Table, render
 
 
 def run_compare(names: Sequence[str], config: CompareConfig) -> int:
     """Play all scenarios, then print one table for each to stdout. Progress lines go to stderr."""
+    paths = [find_scenario(name) for name in names]
     scenarios = [
-        read_scenario(find_scenario(name)).changed(tasks=config.tasks, reference=config.reference)
-        for name in names
+        read_scenario(path).changed(tasks=config.tasks, reference=config.reference) for path in paths
     ]
     for scenario in scenarios:
         if config.from_task >= scenario.workload.tasks:
@@ -34,6 +34,8 @@ def run_compare(names: Sequence[str], config: CompareConfig) -> int:
     if config.simulate:
         sys.stdout.write(simulated(scenarios, config))
     else:
+        for scenario, path in zip(scenarios, paths, strict=True):
+            check_calls(scenario, path)
         sys.stdout.write(render([compare(scenario, config) for scenario in scenarios], config.format))
     return 0
 
