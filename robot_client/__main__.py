@@ -168,7 +168,13 @@ def _run_tasks(
             again = stack.enter_context(_connect(config, states=states, sites=sites))
             path, names = reference_path(config.trace), [ONBOARD, CLOUD, *sites]
             references = References(
-                path, again, names, every=config.reference, tasks=config.tasks_max, seed=config.seed
+                path,
+                again,
+                names,
+                every=config.reference,
+                tasks=config.tasks_max,
+                seed=config.seed,
+                states=states,
             )
             files.append(references)
         for file in files:
