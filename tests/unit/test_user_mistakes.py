@@ -141,7 +141,7 @@ at_most = 1
         (["loadgen", "run", "alone.toml"], "alone.toml: workload.alone: 4 is above workload.tasks 3"),
         (
             ["loadgen", "run", "nope.toml"],
-            "nope.toml:5: workload.inputs: 'camera:nope' is not MODULE:FUNCTION with a function of the seed: ",
+            "nope.toml:5: workload.inputs: 'camera:nope' is not MODULE:FUNCTION with a function of the seed",
         ),
         (
             ["loadgen", "compare", "nope.toml", "half.toml"],
