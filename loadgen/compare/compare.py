@@ -27,15 +27,14 @@ def run_compare(names: Sequence[str], config: CompareConfig) -> int:
     scenarios = [
         read_scenario(path).changed(tasks=config.tasks, reference=config.reference) for path in paths
     ]
-    for scenario in scenarios:
+    for scenario, path in zip(scenarios, paths, strict=True):
+        check_calls(scenario, path)
         if config.from_task >= scenario.workload.tasks:
             wrong = f"--from-task: {config.from_task} is not among the {scenario.workload.tasks} tasks"
             raise ConfigError(f"{wrong} of {scenario.name}")
     if config.simulate:
         sys.stdout.write(simulated(scenarios, config))
     else:
-        for scenario, path in zip(scenarios, paths, strict=True):
-            check_calls(scenario, path)
         sys.stdout.write(render([compare(scenario, config) for scenario in scenarios], config.format))
     return 0
 
