@@ -47,7 +47,8 @@ done
 class Kind:
     """What all parts of one kind share.
 
-    `http` is the port of their HTTP API, `ready` the path that says it is up.
+    `program` and `command` come before the flags of the part. `http` is the port of their HTTP API, `ready`
+    the path that says it is up.
     """
 
     program: str
