@@ -9,12 +9,14 @@ import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from offboard.common.command_line import Command, CommandParser, add_flags, load, run_commands
 from offboard.common.config import as_dict, resolve
 from offboard.common.errors import ConfigError, OffloadError
+from offboard.robot_client.settings import Settings
 from offboard.robot_client.simulated.config import CallConfig, DriveConfig, RobotConfig
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, check_endpoint
 
@@ -194,11 +196,14 @@ def _run_tasks(
         run.run()
 
 
-def _connect(config: RobotConfig, states: "TaskStates", **options: Any) -> "Offloader":
+def _connect(
+    config: RobotConfig, states: "TaskStates", settings: Settings | None = None, **options: Any
+) -> "Offloader":
     from offboard.robot_client.offloader import Offloader
 
+    own = replace(settings or Settings(), states=states)
     return Offloader.connect(
-        config.cloud, timeout_s=config.timeout_s, keys=config.keys, states=states, **options
+        config.cloud, timeout_s=config.timeout_s, keys=config.keys, settings=own, **options
     )
 
 

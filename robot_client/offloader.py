@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
 from offboard.common.errors import ConfigError, Overtaken
-from offboard.common.task_states import TaskStates
 from offboard.common.tasks import Kind, Task, kind_of
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.execution.batch import Batch, Placed, arguments
@@ -110,7 +109,6 @@ class Offloader:
         metrics: str | None = None,
         trace: Path | str | None = None,
         settings: Settings | None = None,
-        states: TaskStates | None = None,
     ) -> Self:
         """An offloader for onboard, a server `cloud` at `endpoint` (tcp://HOST:PORT), and further servers.
 
@@ -122,7 +120,6 @@ class Offloader:
         server.key (None: no encryption).
         `observers`: called with the record of every task. `settings`: options that few robots need.
         `metrics`: HOST:PORT where Prometheus reads `/metrics`. `trace`: the file that gets every record.
-        `states`: what setups make; offloaders of one process that share it load each model once.
         """
         from offboard.robot_client.sites.make_runners import (
             make_runners,  # zmq is loaded only for a connection
@@ -136,7 +133,9 @@ class Offloader:
         with ExitStack() as opened:
             recording = Recording(trace=trace, metrics=metrics)
             opened.callback(recording.close)
-            runners = make_runners(servers, keys=keys, heartbeat_s=heartbeat_s, seed=rare.seed, states=states)
+            runners = make_runners(
+                servers, keys=keys, heartbeat_s=heartbeat_s, seed=rare.seed, states=rare.states
+            )
             for runner in runners:
                 opened.callback(runner.close)
             offload = cls(
