@@ -1,4 +1,5 @@
-# Targets: robot (planning), cloud (planning, server), bench (relay, tables). They share one base; none contains a compiler.
+# Targets: robot (planning), cloud (planning, server), bench (relay, tables), examples (robot and cloud of an application).
+# They share one base; none contains a compiler.
 FROM python:3.13-slim AS base
 ENV PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 PATH=/opt/offboard/bin:$PATH
 # The planner is compiled at the first start, for the CPU that it runs on. Keep the cache in a volume.
@@ -53,6 +54,20 @@ EXPOSE 5555 8001
 HEALTHCHECK --interval=2s --timeout=2s --start-period=20s --retries=3 \
   CMD ["python3", "-c", "import urllib.request as u; u.urlopen('http://127.0.0.1:8001/health', timeout=1)"]
 ENTRYPOINT ["loadgen"]
+
+# Robot and cloud of a scenario whose task is in examples/; it has no entrypoint, because it is either.
+FROM base AS examples
+# pinocchio, of examples/arm.py, needs it.
+RUN apt-get update -qq && apt-get install -qq --no-install-recommends libgomp1 > /dev/null && rm -rf /var/lib/apt/lists/*
+COPY requirements/examples.txt /tmp/all.txt
+# pyroboplan asks for toppra, which has no wheel. The planner of examples/arm.py does not import it.
+RUN sed '/^toppra==/,/[^\\]$/d' /tmp/all.txt > /tmp/requirements.txt \
+ && pip install --quiet --no-cache-dir --no-deps --only-binary :all: --require-hashes -r /tmp/requirements.txt
+COPY --from=wheel /wheels /wheels
+RUN /wheels/install
+COPY --chmod=755 examples /opt/applications/examples
+ENV PYTHONPATH=/opt/applications
+USER offboard
 
 # Runs the unit tests with the Python of the image.
 FROM bench AS test

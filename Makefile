@@ -10,8 +10,11 @@ export NUMBA_CACHE_DIR ?= $(CACHE)/numba
 BENCH_READY := $(VENV)/.bench-ready
 DEV_READY := $(VENV)/.dev-ready
 PEERS_READY := $(VENV)/.peers-ready
+# Some libraries of the applications need older packages than `make install`, so they have an environment of their own.
+EXAMPLES_BIN := .cache/examples/bin
+EXAMPLES_READY := .cache/examples/.ready
 
-.PHONY: help demo install format lint type test unit integration compose chaos bench browser torch up down table lock wheel clean
+.PHONY: help demo install format lint type test unit integration compose chaos bench examples browser torch up down table lock wheel clean
 
 help: ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -56,6 +59,9 @@ chaos: $(DEV_READY) ## run each fault 20 times (3 times in containers), each sce
 
 bench: $(PEERS_READY) ## measure speed next to other libraries; needs an otherwise idle machine
 	$(BIN)/python -m benchmarks
+
+examples: $(EXAMPLES_READY) ## measure the five applications with one seed, FULL=1: with three; needs an otherwise idle machine
+	$(EXAMPLES_BIN)/python -m benchmarks.applications $(if $(FULL),--seeds 3)
 
 browser: $(DEV_READY) ## run the tests in a real browser; needs Chromium
 	$(BIN)/pytest tests/browser
@@ -103,3 +109,9 @@ $(PEERS_READY): requirements/peers.txt pyproject.toml
 	$(BIN)/python -m pip install --quiet --require-hashes -r requirements/peers.txt
 	$(BIN)/python -m pip install --quiet --no-deps --editable .
 	touch $@ $(DEV_READY) $(BENCH_READY)
+
+$(EXAMPLES_READY): requirements/examples.txt pyproject.toml
+	test -x $(EXAMPLES_BIN)/python || $(PYTHON) -m venv .cache/examples
+	$(EXAMPLES_BIN)/python -m pip install --quiet --require-hashes -r requirements/examples.txt
+	$(EXAMPLES_BIN)/python -m pip install --quiet --no-deps --editable .
+	touch $@

@@ -6,7 +6,8 @@ import os
 import platform
 import sys
 from importlib.metadata import version
-from pathlib import Path
+
+from benchmarks.measure import processor
 
 TABLES = ("planner", "decision", "lower_bounds", "round_trip", "server_load", "attacks", "footprint")
 
@@ -20,7 +21,7 @@ def main() -> int:
     for name in chosen:
         if name not in TABLES:
             parser.error(f"table {name!r} is not one of {', '.join(TABLES)}")
-    print(f"{_processor()}, {os.cpu_count()} cores, Python {platform.python_version()}, ", end="")
+    print(f"{processor()}, {os.cpu_count()} cores, Python {platform.python_version()}, ", end="")
     print(", ".join(f"{package} {version(package)}" for package in ("numpy", "numba", "pyzmq")), end="\n\n")
     failed = 0
     for name in chosen:
@@ -29,14 +30,6 @@ def main() -> int:
             failed += sum(not requirement.holds for requirement in table.requirements)
     print(f"requirements that fail: {failed}" if failed else "all requirements hold")
     return 0
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.machine()
 
 
 if __name__ == "__main__":

@@ -1,9 +1,11 @@
 """How benchmarks measure: medians of interleaved cases, tables, and requirements that figures must meet."""
 
+import platform
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 ROUNDS = 15
 
@@ -72,3 +74,12 @@ def each_of(
     """The median seconds of one call of each case; `case(count)` makes `count` calls."""
     found = interleaved({name: lambda case=case: case(count) for name, case in cases.items()}, rounds)
     return {name: seconds / count for name, seconds in found.items()}
+
+
+def processor() -> str:
+    """The model of the CPU, or its architecture if the model is unknown."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.machine()

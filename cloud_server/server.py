@@ -23,7 +23,7 @@ from offboard.cloud_server.scheduler import Refusal, Scheduler
 from offboard.cloud_server.task_run import Outcome
 from offboard.cloud_server.tcp_connections import UnreadLimit, end, other_end
 from offboard.common import VERSION, tasks
-from offboard.common.errors import OffloadError, ProtocolError
+from offboard.common.errors import OffloadError, ProtocolError, TaskFailed, describe
 from offboard.common.host.cgroup import SELF
 from offboard.common.host.load import SERVER_EVERY_S, Load
 from offboard.common.host.load_watch import LoadWatch
@@ -172,8 +172,10 @@ class Server:
         elif not self._scheduler.warm and self._warming.done():
             error = self._warming.exception()
             if error is not None:
+                if isinstance(error, TaskFailed):
+                    log.error("the server cannot start\n%s", error.traceback.rstrip())
                 raise OffloadError(
-                    f"tasks could not be warmed up: {type(error).__name__}: {error}"
+                    str(error) if isinstance(error, OffloadError) else describe(error)
                 ) from error
             self._scheduler.warm = True
             self._on_ready()

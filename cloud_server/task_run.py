@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from offboard.common import tasks
-from offboard.common.errors import ProtocolError, Unwanted, describe
+from offboard.common.errors import ProtocolError, TaskFailed, Unwanted, describe
 from offboard.common.host import cpu_time
 from offboard.common.task_states import TaskStates
 from offboard.common.tracebacks import traceback_of
@@ -75,9 +75,21 @@ def run_task(call: Call, states: TaskStates) -> Outcome:
 
 
 def warm_kinds(states: TaskStates) -> None:
-    """Make the states of each kind, and run its `warm`. Once per process, before its first task."""
+    """Make the states of each kind, and run its `warm`. Once per process, before its first task.
+
+    TaskFailed names the task and the error of its `setup` or `warm`, and has the frames of the user.
+    """
     cpu_time.used_s()  # the first call looks for the cgroup
     for kind in tasks.kinds():
         states.prepare(kind)
-        if kind.warm is not None:
-            kind.warm()
+        _warm(kind)
+
+
+def _warm(kind: tasks.Kind) -> None:
+    if kind.warm is None:
+        return
+    try:
+        kind.warm()
+    except BaseException as error:
+        text = f"warm of task {kind.name}: {describe(error)}"
+        raise TaskFailed(text, traceback_of(error, _warm)) from error

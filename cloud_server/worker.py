@@ -26,7 +26,7 @@ import msgpack
 
 from offboard.cloud_server.task_run import Call, Outcome
 from offboard.cloud_server.worker_process import CHUNK_BYTES, Setup, new_unpacker
-from offboard.common.errors import describe
+from offboard.common.errors import TaskFailed, describe
 from offboard.common.wanted import always
 
 START_S_MAX = 300.0  # until a worker is ready, compilation included
@@ -53,15 +53,23 @@ class Died(Exception):
     """A worker process has ended, or must be ended.
 
     `reason` is one word. `outcome` is the outcome of its task, if the task ended before the process did.
+    `failure`: what a task raised when the process prepared for it, so that the process could not start.
     """
 
     def __init__(
-        self, reason: str, text: str, *, server_fault: bool = False, outcome: Outcome | None = None
+        self,
+        reason: str,
+        text: str,
+        *,
+        server_fault: bool = False,
+        outcome: Outcome | None = None,
+        failure: TaskFailed | None = None,
     ) -> None:
         super().__init__(text)
         self.reason = reason
         self.server_fault = server_fault
         self.outcome = outcome
+        self.failure = failure
 
 
 class Worker:
@@ -118,11 +126,13 @@ class Worker:
             self._closing.wait(max(0.0, next_start - time.monotonic()))
 
     def _start(self, process: "_Process") -> None:
-        error = self._next(process, START_S_MAX)
-        if error is None:
+        answer = self._next(process, START_S_MAX)
+        if answer is None:
             raise Died("start", f"was not ready within {START_S_MAX:g} s")
+        error, frames = answer
         if error:
-            raise Died("start", f"did not start: {error}")
+            failure = TaskFailed(error, frames) if frames else None
+            raise Died("start", f"did not start: {error}", failure=failure)
 
     def _serve(self, process: "_Process") -> NoReturn:
         self._free(self)

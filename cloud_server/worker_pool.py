@@ -121,10 +121,12 @@ class WorkerPool:
             if worker in self._idle:
                 self._idle.remove(worker)
             if not self._started.done():
-                self._started.set_exception(CloudBroken(f"worker processes did not start: one {death}"))
+                text = f"worker processes did not start: one {death}"
+                self._started.set_exception(death.failure or CloudBroken(text))
                 return
         if death.reason != "closed":
-            log.warning("worker %d %s; another worker takes its place", worker.pid, death)
+            frames = f"\n{death.failure.traceback.rstrip()}" if death.failure else ""
+            log.warning("worker %d %s; another worker takes its place%s", worker.pid, death, frames)
             self._changed(death.reason)
 
 

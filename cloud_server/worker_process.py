@@ -22,7 +22,7 @@ import msgpack
 
 from offboard.cloud_server.task_run import Call, Outcome, run_task, warm_kinds
 from offboard.common import tasks
-from offboard.common.errors import describe
+from offboard.common.errors import TaskFailed, describe
 from offboard.common.task_states import TaskStates
 from offboard.common.wire.blobs import BlobStore, StoredBlob
 from offboard.common.wire.messages import ERROR_LENGTH_MAX, byte_count
@@ -47,7 +47,10 @@ class Setup:
 
 
 def work(parent: int, pipe_fd: int, flag: int, setup: Setup) -> None:
-    """Run a worker process: send "" when it is ready, then run the tasks that come through the pipe."""
+    """Run a worker process: load the modules, then run the tasks that come through the pipe.
+
+    Its first message says why it cannot start, and with which traceback; both are empty if it is ready.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
@@ -62,11 +65,14 @@ def work(parent: int, pipe_fd: int, flag: int, setup: Setup) -> None:
     try:
         tasks.load_modules(setup.modules)
         warm_kinds(states)
+    except TaskFailed as failure:
+        pipe.sendall(msgpack.packb([str(failure), failure.traceback], unicode_errors="replace"))
+        return
     except BaseException as error:  # noqa: BLE001 - a user's module may raise anything
         traceback.print_exc()
-        pipe.sendall(msgpack.packb(describe(error), unicode_errors="replace"))
+        pipe.sendall(msgpack.packb([describe(error), ""], unicode_errors="replace"))
         return
-    pipe.sendall(msgpack.packb(""))
+    pipe.sendall(msgpack.packb(["", ""]))
     store, run = BlobStore(setup.blob_bytes_max), partial(run_task, states=states)
     while (call := _receive(pipe)) is not None:
         pipe.sendall(_answer(call, store, Path(setup.folder), wanted=lambda: not stop[0], run=run))

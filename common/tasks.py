@@ -195,10 +195,34 @@ def kinds() -> tuple[Kind, ...]:
 def load_modules(names: Iterable[str]) -> None:
     """Import the modules that register tasks. ConfigError names a module that cannot be imported."""
     for name in names:
+        meant = _meant(name)
+        if meant != name:
+            raise ConfigError(f"task module {name!r} is not the name of a module; did you mean {meant!r}?")
         try:
             importlib.import_module(name)
         except Exception as error:
-            raise ConfigError(f"task module {name!r} cannot be imported: {describe(error)}") from error
+            where = _where(name) if _is_missing(name, error) else ""
+            raise ConfigError(f"task module {name!r} cannot be imported: {describe(error)}{where}") from error
+
+
+def _meant(name: str) -> str:
+    """The module that a file, or MODULE:FUNCTION, stands for; the same name if it is that of a module."""
+    file = name.partition(":")[0].removesuffix(".py")
+    parts = [part for part in file.split("/") if part.strip(".")]
+    if not parts:
+        return name
+    return parts[-1] if file.startswith(("/", "..")) else ".".join(parts)
+
+
+def _is_missing(name: str, error: Exception) -> bool:
+    """Whether the module itself was not found, rather than one that it imports."""
+    return isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}.")
+
+
+def _where(name: str) -> str:
+    if name.startswith("examples."):
+        return "; examples/ is only in a checkout: start the command in the folder of the checkout"
+    return "; it is looked for in this folder and on PYTHONPATH"
 
 
 def _check_first_parameter(name: str, signature: inspect.Signature) -> None:

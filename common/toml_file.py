@@ -46,8 +46,8 @@ def nearest(name: str, known: Sequence[str]) -> str | None:
 
 
 def line_of(lines: Sequence[str], table: str, number: int, key: str) -> int:
-    """The line of `key` in the n-th [[table]]; the line of the table if the key is not found there."""
-    starts = [n for n, text in enumerate(lines, 1) if re.match(rf"\s*\[\[\s*{table}\s*\]\]", text)]
+    """The line of `key` in the n-th [table] or [[table]]; that of the table if the key is not found there."""
+    starts = [n for n, text in enumerate(lines, 1) if re.match(rf"\s*\[\[?\s*{table}\s*\]", text)]
     first = starts[number - 1] if 0 < number <= len(starts) else 1
     tables = [n for n, text in enumerate(lines, 1) if re.match(r"\s*\[", text) and n > first]
     named = re.compile(rf"(?<![\w-])[\"']?{re.escape(key)}[\"']?\s*[=.\]]")

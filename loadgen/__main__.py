@@ -65,7 +65,12 @@ def _demo(argv: Sequence[str]) -> int:
 
 
 def _run(argv: Sequence[str]) -> int:
-    from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario, shipped
+    from offboard.loadgen.scenario.scenario_file import (
+        check_calls,
+        find_scenario,
+        read_scenario,
+        shipped,
+    )
 
     parser = _parser("run", "SCENARIO")
     parser.add_argument("scenario", metavar="SCENARIO", help=f"TOML file, or one of {', '.join(shipped())}")
@@ -75,13 +80,15 @@ def _run(argv: Sequence[str]) -> int:
     from offboard.loadgen.play.play_scenario import play
 
     _find_modules_here()
-    scenario = read_scenario(find_scenario(flags.scenario)).changed(
+    path = find_scenario(flags.scenario)
+    scenario = read_scenario(path).changed(
         seed=config.seed,
         tasks=config.tasks,
         measure_all=config.measure == "both",
         policy=config.policy,
         predictor=config.predictor,
     )
+    check_calls(scenario, path)
     played = play(scenario, config.out, config.testbed)
     played.check_robots()
     played.check_verdicts()

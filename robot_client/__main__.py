@@ -9,16 +9,19 @@ import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from offboard.common.command_line import Command, CommandParser, add_flags, load, run_commands
 from offboard.common.config import as_dict, resolve
 from offboard.common.errors import ConfigError, OffloadError
+from offboard.robot_client.settings import Settings
 from offboard.robot_client.simulated.config import CallConfig, DriveConfig, RobotConfig
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, check_endpoint
 
 if TYPE_CHECKING:
+    from offboard.common.task_states import TaskStates
     from offboard.robot_client.offloader import Offloader
     from offboard.robot_client.records.lines import Lines
     from offboard.robot_client.records.trace import Record
@@ -100,6 +103,7 @@ def _find_modules_here() -> None:
 def _run(config: RobotConfig) -> int:
     """Run the tasks, then measure those of --alone."""
     # These are imported after the flags are read, so that --help compiles nothing.
+    from offboard.common.task_states import TaskStates
     from offboard.robot_client.records.trace import Trace, alone_path
     from offboard.robot_client.simulated.answers import Answers
     from offboard.robot_client.simulated.references import measure_alone
@@ -116,11 +120,11 @@ def _run(config: RobotConfig) -> int:
     files: list[Answers | Lines] = [file for file in (answers, trace) if file]
     try:
         observers: list[Observer] = [*([trace.write] if trace else []), *_metrics(config)]
-        work = make_work(config)
-        _run_tasks(config, work, answers, observers=observers, files=files)
+        work, states = make_work(config), TaskStates(workers=1)  # shared, so that each setup runs once
+        _run_tasks(config, work, states, answers, observers=observers, files=files)
         if alone:
             # With its own offloader: what the run learns, records and counts is about the run only.
-            with _connect(config, observers=[alone.write]) as offload:
+            with _connect(config, states=states, observers=[alone.write]) as offload:
                 _warn_of_absent("measuring", offload.wait_for_sites(work.function, config.connect_s))
                 measure_alone(config, work, offload, print)
     finally:
@@ -136,6 +140,7 @@ def _run(config: RobotConfig) -> int:
 def _run_tasks(
     config: RobotConfig,
     work: "Work",
+    states: "TaskStates",
     answers: "Answers | None",
     *,
     observers: Sequence[Observer],
@@ -151,6 +156,7 @@ def _run_tasks(
         offload = stack.enter_context(
             _connect(
                 config,
+                states=states,
                 sites=sites,
                 policy=config.policy,
                 window=config.window,
@@ -160,17 +166,23 @@ def _run_tasks(
         )
         again, references = None, None
         if config.trace and config.reference:
-            again = stack.enter_context(_connect(config, sites=sites))
+            again = stack.enter_context(_connect(config, states=states, sites=sites))
             path, names = reference_path(config.trace), [ONBOARD, CLOUD, *sites]
             references = References(
-                path, again, names, every=config.reference, tasks=config.tasks, seed=config.seed
+                path,
+                again,
+                names,
+                every=config.reference,
+                tasks=config.tasks_max,
+                seed=config.seed,
+                states=states,
             )
             files.append(references)
         for file in files:
             # Before the sites are closed: tasks that are given up by then have no record.
             stack.callback(file.close)
         run = Run(config, work, offload, own=own, say=print, answers=answers, references=references)
-        with _connect(config, sites=sites) as unseen:
+        with _connect(config, states=states, sites=sites) as unseen:
             absent = unseen.wait_for_sites(work.function, config.connect_s)
             run.warm(unseen)
         absent = absent or offload.wait_for_sites(work.function, config.connect_s)
@@ -183,10 +195,15 @@ def _run_tasks(
         run.run()
 
 
-def _connect(config: RobotConfig, **options: Any) -> "Offloader":
+def _connect(
+    config: RobotConfig, states: "TaskStates", settings: Settings | None = None, **options: Any
+) -> "Offloader":
     from offboard.robot_client.offloader import Offloader
 
-    return Offloader.connect(config.cloud, timeout_s=config.timeout_s, keys=config.keys, **options)
+    own = replace(settings or Settings(), states=states)
+    return Offloader.connect(
+        config.cloud, timeout_s=config.timeout_s, keys=config.keys, settings=own, **options
+    )
 
 
 def _warn_of_absent(doing: str, absent: Mapping[str, str]) -> None:

@@ -130,7 +130,9 @@ class Offloader:
         with ExitStack() as opened:
             recording = Recording(trace=trace, metrics=metrics)
             opened.callback(recording.close)
-            runners = make_runners(servers, keys=keys, heartbeat_s=heartbeat_s, seed=rare.seed)
+            runners = make_runners(
+                servers, keys=keys, heartbeat_s=heartbeat_s, seed=rare.seed, states=rare.states
+            )
             for runner in runners:
                 opened.callback(runner.close)
             offload = cls(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from offboard.common.task_states import TaskStates
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.learning.store import Store
@@ -29,6 +30,7 @@ class Settings:
     `bytes_a_minute`: the most bytes that tasks may send and receive in a minute (None: no cap).
     `joules_a_minute`: the most joules that tasks may take in a minute (None: no cap).
     `memory`: the file in which what was learnt outlives the process (None: a new process knows nothing).
+    `states`: what setups make; offloaders of one process that share it load each model once (None: its own).
     `seed`: for policies and predictors that draw; the same seed draws the same numbers.
     """
 
@@ -40,6 +42,7 @@ class Settings:
     bytes_a_minute: float | None = None
     joules_a_minute: float | None = None
     memory: Path | None = None
+    states: TaskStates | None = None
     seed: int = 0
 
     def allowance(self) -> Allowance:

@@ -62,3 +62,8 @@ def unfit(seed: int) -> Iterator[tuple[Any, ...]]:
 
 def no_seed() -> list[int]:
     return []
+
+
+def nothing(seed: int) -> list[Frame]:  # noqa: ARG001 - a camera that is off
+    """No input."""
+    return []

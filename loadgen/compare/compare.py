@@ -17,19 +17,21 @@ from offboard.loadgen.compare.simulated_tables import simulated
 from offboard.loadgen.play.stolen_cpu_time import NOTED_PERCENT
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.scenario import Scenario
-from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
+from offboard.loadgen.scenario.scenario_file import check_calls, find_scenario, read_scenario
 from offboard.loadgen.table.table_formats import Table, render
 
 
 def run_compare(names: Sequence[str], config: CompareConfig) -> int:
     """Play all scenarios, then print one table for each to stdout. Progress lines go to stderr."""
+    paths = [find_scenario(name) for name in names]
     scenarios = [
-        read_scenario(find_scenario(name)).changed(
+        read_scenario(path).changed(
             tasks=config.tasks, reference=config.reference, heartbeats=config.heartbeats
         )
-        for name in names
+        for path in paths
     ]
-    for scenario in scenarios:
+    for scenario, path in zip(scenarios, paths, strict=True):
+        check_calls(scenario, path)
         if config.from_task >= scenario.workload.tasks:
             wrong = f"--from-task: {config.from_task} is not among the {scenario.workload.tasks} tasks"
             raise ConfigError(f"{wrong} of {scenario.name}")

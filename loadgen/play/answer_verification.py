@@ -4,6 +4,7 @@ A path is checked cell by cell against map and scan. The tasks are made again fr
 answers are taken from the run.
 """
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -21,7 +22,7 @@ from offboard.loadgen.scenario.outcome import Answered
 from offboard.loadgen.scenario.scenario import Workload
 from offboard.robot_client.simulated import answers
 from offboard.robot_client.simulated.calls import Calls
-from offboard.robot_client.simulated.work import Work, make_work
+from offboard.robot_client.simulated.work import make_work
 
 COST_SHARE = 1e-6  # largest relative difference of two sums of the same steps
 
@@ -33,30 +34,55 @@ def verified(answered: Sequence[Answered], workload: Workload, seed: int) -> lis
     """
     if not workload.known()["jump"]:
         return list(answered)
-    work, states, at = make_work(workload.robot(seed)), TaskStates(workers=1), 0
-    found = []
-    for one in sorted(answered, key=lambda one: one.i):
-        while at < one.i:
-            work.advance(None)
-            at += 1
-        found.append(one if one.error is not None else _judged(one, work, states))
-    return found
+    tasks = _repeated(workload, seed)
+    ordered = sorted(answered, key=lambda one: one.i)
+    return [one if one.error is not None else tasks.judged(one) for one in ordered]
 
 
-def _judged(one: Answered, work: Work, states: TaskStates) -> Answered:
-    request = work.request()
-    try:
-        expected = states.call(kind_of(work.function), request)
-    except Exception as error:
-        raise OffloadError(f"task {one.i} fails without Offboard: {describe(error)}") from error
-    if isinstance(expected, Plan):
-        return replace(one, wrong=wrong_plan(one.answer, expected, request))
-    described = work.describe(expected)
-    if one.answer["sha256"] == described["sha256"]:
-        return one
-    if isinstance(work, Calls) and work.same is not None:
-        return _compared(one, work, described)
-    return replace(one, wrong=f"{one.answer}, but {described} was expected")
+class _Repeated:
+    """The tasks of a workload and seed, made again and run without Offboard.
+
+    The right answers of calls are kept, so each call runs once, even if many runs with the same tasks are
+    verified. Plans are not kept, because a path is checked against its whole request.
+    """
+
+    def __init__(self, workload: Workload, seed: int) -> None:
+        self._config = workload.robot(seed)
+        self._states = TaskStates(workers=1)
+        self._work, self._at = make_work(self._config), 0
+        self._right: dict[int, dict[str, Any]] = {}  # described answers, by the number of the task
+
+    def judged(self, one: Answered) -> Answered:
+        """The answer with `wrong` or `unverified` filled in."""
+        if one.i not in self._right:
+            request, expected = self._run(one.i)
+            if isinstance(expected, Plan):
+                return replace(one, wrong=wrong_plan(one.answer, expected, request))
+            self._right[one.i] = self._work.describe(expected)
+        described = self._right[one.i]
+        if one.answer["sha256"] == described["sha256"]:
+            return one
+        if isinstance(self._work, Calls) and self._work.same is not None:
+            return _compared(one, self._work, described)
+        return replace(one, wrong=f"{one.answer}, but {described} was expected")
+
+    def _run(self, i: int) -> tuple[tuple[Any, ...], Any]:
+        """The request of task `i` and its right answer."""
+        if i < self._at:
+            self._work, self._at = make_work(self._config), 0
+        while self._at < i:
+            self._work.advance(None)
+            self._at += 1
+        request = self._work.request()
+        try:
+            return request, self._states.call(kind_of(self._work.function), request)
+        except Exception as error:
+            raise OffloadError(f"task {i} fails without Offboard: {describe(error)}") from error
+
+
+@functools.lru_cache(maxsize=1)  # a comparison plays the same tasks with each policy
+def _repeated(workload: Workload, seed: int) -> _Repeated:
+    return _Repeated(workload, seed)
 
 
 def _compared(one: Answered, work: Calls, expected: dict[str, Any]) -> Answered:

@@ -18,7 +18,7 @@ from offboard.common.config import check, setting
 from offboard.loadgen.play.play_scenario import TESTBEDS, play
 from offboard.loadgen.play.run_files import TRACE
 from offboard.loadgen.scenario.scenario import Scenario, Workload
-from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
+from offboard.loadgen.scenario.scenario_file import check_calls, find_scenario, read_scenario
 from offboard.loadgen.table.measured_rows import write_csv, write_whole
 from offboard.loadgen.table.measurement_notes import disturbance, read_noted
 
@@ -48,8 +48,11 @@ class DatasetConfig:
 
 def run_dataset(name: str, config: DatasetConfig, command: Sequence[str]) -> int:
     """Play the scenario, then write both files. `command` is the command line, recorded in NAME.json."""
-    scenario = read_scenario(find_scenario(name))
-    scenario = scenario.changed(seed=config.seed, tasks=config.rows, measure_all=True, alone=config.alone)
+    path = find_scenario(name)
+    scenario = read_scenario(path).changed(
+        seed=config.seed, tasks=config.rows, measure_all=True, alone=config.alone
+    )
+    check_calls(scenario, path)
     run = config.run / scenario.name
     started_at, commit = datetime.now(UTC), _commit()
     play(scenario, run, config.testbed).check_robots()

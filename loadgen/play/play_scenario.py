@@ -31,7 +31,6 @@ from offboard.loadgen.table.table_two import table_text
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.loadgen.testbed.testbed import Setup, Testbed
 from offboard.robot_client.records.trace import alone_path, reference_path
-from offboard.robot_client.simulated.work import make_work
 
 DEMO_WINDOWS = ("5", "10", "20", "30", "40", "50")
 
@@ -85,8 +84,6 @@ def play(scenario: Scenario, out: Path, testbed: str = "local", *, quiet: bool =
     Unless `quiet`, progress lines and the output of the first robot go to stdout.
     """
     say = _say_nothing if quiet else _say
-    if scenario.workload.inputs is not None:
-        make_work(scenario.workload.robot(scenario.seed))  # so that a missing library is named at once
     started_at, workload = datetime.now(UTC), scenario.workload
     played_from = digests(scenario)  # taken now, because the parts load the software now
     with TESTBEDS[testbed](out, setups(scenario, out, shown=not quiet)) as bed:

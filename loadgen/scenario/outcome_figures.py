@@ -135,7 +135,7 @@ FIGURES: dict[str, Figure] = {
     "mean_ms": Figure("ms", "mean time from when a task is due to its answer", _mean_ms),
     "p95_ms": Figure("ms", "95 % of the tasks are answered within this time", _quantile_ms(95)),
     "p99_ms": Figure("ms", "99 % of the tasks are answered within this time", _quantile_ms(99)),
-    "late_percent": Figure("%", "tasks answered after their deadline", _percent(_late), "deadline"),
+    "late_percent": Figure("%", "tasks answered after their deadline", _percent(_late), "deadline_ms"),
     "cloud_percent": Figure(
         "%", "share of the cloud in the tasks that were sent to one site", _percent(_in_the_cloud)
     ),

@@ -91,11 +91,11 @@ class Workload:
         )
 
     def known(self) -> dict[str, bool]:
-        """The settings that some figures need, and whether this workload has them."""
+        """The keys of `[workload]` that some figures need, and whether this workload has them."""
         return {
             "jump": self.jump or self.map is None,
             "reference": self.reference > 0,
-            "deadline": self.deadline_ms is not None,
+            "deadline_ms": self.deadline_ms is not None,
         }
 
 

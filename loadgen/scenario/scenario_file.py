@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from offboard.common.config import from_table
-from offboard.common.errors import ConfigError, DataError
-from offboard.common.toml_file import read_toml, unknown_key
+from offboard.common.errors import ConfigError, DataError, MissingExtra, OffloadError
+from offboard.common.toml_file import line_of, read_toml, unknown_key
 from offboard.loadgen.relay.link.link_settings import LinkFlags
 from offboard.loadgen.scenario.event_timeline import parse_events
 from offboard.loadgen.scenario.pass_fail_check import parse_checks
@@ -20,6 +20,7 @@ from offboard.loadgen.scenario.scenario import CloudPart, RobotPart, Scenario, W
 
 SHIPPED = Path(__file__).parents[1] / "scenarios"
 NAME = r"[A-Za-z0-9][A-Za-z0-9_-]*"
+WORKLOAD_FLAG = re.compile(rf"--({'|'.join(f.name.replace('_', '-') for f in fields(Workload))})\b")
 LINK_KEYS = tuple(f.name for f in fields(LinkFlags))
 
 
@@ -56,6 +57,20 @@ def read_scenario(path: Path) -> Scenario:
     )
 
 
+def check_calls(scenario: Scenario, path: Path) -> None:
+    """Import the task that a scenario calls, and make its first arguments; DataError names file and line."""
+    if scenario.workload.task is None:
+        return
+    from offboard.robot_client.simulated.work import make_work  # --help does not need it
+
+    try:
+        make_work(scenario.workload.robot(scenario.seed))
+    except MissingExtra:
+        raise
+    except OffloadError as error:
+        raise _workload_error(error, path) from error
+
+
 def find_scenario(name: str) -> Path:
     """The path of a scenario: `name` is a file, or the name of a shipped scenario."""
     for path in (Path(name), SHIPPED / f"{name}.toml"):
@@ -81,7 +96,7 @@ def _workload(table: Mapping[str, Any], path: Path) -> Workload:
     try:
         workload.robot(seed=0)
     except ConfigError as error:
-        raise DataError(f"{path}: workload: {error}") from None
+        raise _workload_error(error, path) from None
     workload = replace(workload, sizes=_sizes(workload.sizes, path))
     if workload.map is None:
         return workload
@@ -89,6 +104,16 @@ def _workload(table: Mapping[str, Any], path: Path) -> Workload:
     if not place.is_file():
         raise DataError(f"{path}: workload.map: {place}: no such file")
     return replace(workload, map=place)
+
+
+def _workload_error(error: OffloadError, path: Path) -> DataError:
+    """An error about flags of the robot, as one about the keys of the scenario that they come from."""
+    keys = [flag.replace("-", "_") for flag in WORKLOAD_FLAG.findall(str(error))]
+    if not keys:
+        return DataError(f"{path}: workload: {error}")
+    text = WORKLOAD_FLAG.sub(lambda flag: "workload." + flag[1].replace("-", "_"), str(error))
+    line = line_of(path.read_text().splitlines(), "workload", 1, keys[0])
+    return DataError(f"{path}:{line}: {text}")
 
 
 def _sizes(texts: tuple[str, ...], path: Path) -> tuple[str, ...]:

@@ -13,9 +13,17 @@ from typing import Any
 from offboard.common.command_line import BROKEN_PIPE_EXIT, INTERRUPTED_EXIT
 from offboard.common.errors import ConfigError
 from offboard.loadgen.testbed.cpu_quota import CGROUP_PERIOD_S, CGROUP_QUOTA_S_MIN, check_cpus
-from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, Usage
+from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, Setup, Usage
 
 NEAR, FAR = "near", "far"
+EXAMPLES = "examples"  # the folder of the applications, and the Compose service of their image
+# The image of each Compose service; docker-compose.yml gives them these names.
+IMAGES: Mapping[str, str] = {
+    CLOUD: "offboard-cloud",
+    WAN: "offboard-bench",
+    ROBOT: "offboard-robot",
+    EXAMPLES: "offboard-examples",
+}
 RESULTS, INPUTS, COMPILED = Path("/out"), Path("/in"), Path("/var/cache/offboard")
 # A shell script. For each line that it reads, it prints the memory pages and the open handles of session 1,
 # which are those of the part and its workers: process 1 is Docker's init, and every `docker exec` has a
@@ -39,10 +47,11 @@ done
 class Kind:
     """What all parts of one kind share.
 
-    `http` is the port of their HTTP API, `ready` the path that says it is up.
+    `program` and `command` come before the flags of the part. `http` is the port of their HTTP API, `ready`
+    the path that says it is up.
     """
 
-    image: str
+    program: str
     command: tuple[str, ...]
     networks: tuple[str, ...]
     http: int | None = None
@@ -53,25 +62,34 @@ class Kind:
 # not the encryption, as on the local testbed. The HTTP APIs are published on 127.0.0.1 only.
 KINDS: Mapping[str, Kind] = {
     CLOUD: Kind(
-        "offboard-cloud",
+        "cloud-server",
         ("--listen", "tcp://*:5555", "--http", "0.0.0.0:8000", "--insecure"),
         (FAR,),
         http=8000,
         ready="/ready",
     ),
     WAN: Kind(
-        "offboard-bench",
+        "loadgen",
         ("wan", "--listen", "0.0.0.0:5555", "--to", "cloud:5555", "--http", "0.0.0.0:8001", "--insecure"),
         (NEAR, FAR),
         http=8001,
         ready="/health",
     ),
-    ROBOT: Kind("offboard-robot", ("--cloud", "tcp://wan:5555"), (NEAR,)),
+    ROBOT: Kind("robot-client", ("--cloud", "tcp://wan:5555"), (NEAR,)),
 }
 
 
 def kind_of(part: str) -> Kind:
     return KINDS[part.partition("-")[0]]
+
+
+def service_of(part: str, setup: Setup) -> str:
+    """The Compose service whose image the part runs in.
+
+    Robot and cloud share one image if the task is in `examples/`, because both need its library.
+    """
+    module = str(setup.flags.get("task") or setup.flags.get("tasks"))  # flags of a robot, and of the cloud
+    return EXAMPLES if module.startswith(f"{EXAMPLES}.") else part.partition("-")[0]
 
 
 def as_seen(part: str, flags: Mapping[str, Any], out: Path) -> tuple[dict[str, Any], dict[Path, Path]]:

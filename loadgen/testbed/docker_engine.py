@@ -56,6 +56,7 @@ class Container:
 
     name: str
     image: str
+    program: str
     command: list[str]
     network: Any
     folders: Mapping[Path, Path]
@@ -105,6 +106,7 @@ class Engine:
         return self._client.containers.create(
             wanted.image,
             wanted.command,
+            entrypoint=[wanted.program],
             name=self._name(wanted.name),
             labels=self._labels(),
             environment=dict(wanted.environment),

@@ -1,14 +1,14 @@
 """The images of the Docker testbed: builds them with Docker Compose, as docker-compose.yml describes them."""
 
 import subprocess
+from collections.abc import Iterable
 from pathlib import Path
 
 from offboard.common.errors import ConfigError, OffloadError
-from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN
 
 FILE = Path("docker-compose.yml")
 VERSION = ("docker", "compose", "version")
-BUILD = ("docker", "compose", "--progress", "quiet", "-f", str(FILE), "build", CLOUD, WAN, ROBOT)
+BUILD = ("docker", "compose", "--progress", "quiet", "-f", str(FILE), "build")
 ASK_S = 30.0
 BUILD_S = 1800.0
 
@@ -26,11 +26,12 @@ def check_compose() -> None:
         raise ConfigError(f"--testbed: docker: `{' '.join(VERSION)}` failed: {message}")
 
 
-def build_images() -> None:
-    """Build the images; Docker skips what has not changed."""
+def build_images(services: Iterable[str]) -> None:
+    """Build the images of these Compose services; Docker skips what has not changed."""
+    build = (*BUILD, *services)
     try:
-        code = subprocess.run(BUILD, timeout=BUILD_S, check=False).returncode
+        code = subprocess.run(build, timeout=BUILD_S, check=False).returncode
     except subprocess.TimeoutExpired as error:
-        raise OffloadError(f"`{' '.join(BUILD)}` has not ended after {BUILD_S:g} s") from error
+        raise OffloadError(f"`{' '.join(build)}` has not ended after {BUILD_S:g} s") from error
     if code != 0:
-        raise OffloadError(f"`{' '.join(BUILD)}` failed with exit code {code}")
+        raise OffloadError(f"`{' '.join(build)}` failed with exit code {code}")

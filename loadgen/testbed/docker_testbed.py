@@ -82,7 +82,7 @@ class DockerTestbed:
         try:
             check_compose()
             self._connected = Engine(self.run)
-            build_images()
+            build_images(sorted({inside.service_of(name, setup) for name, setup in self._setups.items()}))
             with docker_errors(), uninterrupted():
                 self.out.mkdir(parents=True, exist_ok=True)
                 CACHE.mkdir(parents=True, exist_ok=True)
@@ -267,7 +267,8 @@ class DockerTestbed:
         container = self._engine.create(
             Container(
                 name=name,
-                image=kind.image,
+                image=inside.IMAGES[inside.service_of(name, setup)],
+                program=kind.program,
                 command=[*setup.command.split(), *kind.command, *as_flags(flags)],
                 network=self._networks[first],
                 folders=folders,

@@ -20,6 +20,10 @@ SAME = "same"  # function of a task's module: whether two answers are equal with
 Arguments = tuple[Any, ...]
 
 
+class InputsEnded(Exception):
+    """All inputs were used, and the settings do not say how many tasks there must be."""
+
+
 class Calls:
     """Calls of a `@task` function with the `arguments`, of which each is made when it is needed.
 
@@ -114,7 +118,8 @@ def _check_argument(name: str, kind: Kind) -> None:
 
 def _inputs(config: CallConfig, name: str, kind: Kind) -> Iterator[Arguments]:
     """The arguments of each call, from the function of `--inputs`."""
-    flag, needed = f"--inputs: {name!r}", config.tasks + config.alone
+    flag = f"--inputs: {name!r}"
+    needed = None if config.tasks is None and not config.alone else config.tasks_max + config.alone
     try:
         function = _find(name)
         inspect.signature(function).bind(config.seed)
@@ -142,8 +147,8 @@ def _made(flag: str, function: Callable[[int], Any], seed: int) -> Iterator[Any]
         raise OffloadError(f"{flag} failed at input {number}: {describe(error)}") from error
 
 
-def _checked(given: Iterator[Any], flag: str, kind: Kind, needed: int) -> Iterator[Arguments]:
-    """Each input as a tuple of arguments that the task takes."""
+def _checked(given: Iterator[Any], flag: str, kind: Kind, needed: int | None) -> Iterator[Arguments]:
+    """Each input as a tuple of arguments that the task takes. Without `needed`, one input is enough."""
     number = 0
     for one in given:
         arguments = one if isinstance(one, tuple) else (one,)
@@ -155,7 +160,9 @@ def _checked(given: Iterator[Any], flag: str, kind: Kind, needed: int) -> Iterat
         yield arguments
         del arguments
         number += 1
-    raise ConfigError(f"{flag} gave {number} inputs, but --tasks and --alone need {needed}")
+    if needed is None and number:
+        raise InputsEnded
+    raise ConfigError(f"{flag} gave {number} inputs, but --tasks and --alone need {needed or 'at least 1'}")
 
 
 def _find(name: str) -> Callable[..., Any]:

@@ -11,6 +11,8 @@ from random import Random
 from typing import Any
 
 from offboard.common.errors import TaskError
+from offboard.common.task_states import TaskStates
+from offboard.common.tasks import kind_of
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import BOTH
 from offboard.robot_client.records import lines
@@ -29,14 +31,23 @@ _FIELDS = ("i", "waited_s", "used", "chosen", "both", "sites")
 class References(Lines):
     """Measures every `every`-th of `tasks` tasks and writes one line for each.
 
-    `sites` are the sites of `offload`; their order changes from task to task.
+    `sites` are the sites of `offload`; their order changes from task to task. `states` are those of the run.
     """
 
     def __init__(
-        self, path: Path, offload: Offloader, sites: Sequence[str], *, every: int, tasks: int, seed: int
+        self,
+        path: Path,
+        offload: Offloader,
+        sites: Sequence[str],
+        *,
+        every: int,
+        tasks: int,
+        seed: int,
+        states: TaskStates,
     ) -> None:
         super().__init__("reference", path)
         self._offload = offload
+        self._states = states
         self._every = every
         self._orders = orders(tasks // every, seed, sites)
 
@@ -54,6 +65,8 @@ class References(Lines):
         record: Record,
     ) -> None:
         """Run the request again on each site; `record` and `waited_s` say how the run itself fared."""
+        with contextlib.suppress(TaskError), self._states.lend(kind_of(function)):
+            pass  # a run that lost its race may still use the state; no reference must wait for it
         order = self._orders[number // self._every]
         found = {site: self._alone(site, function, request) for site in order}
         fields = {

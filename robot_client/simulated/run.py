@@ -21,9 +21,10 @@ from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import BOTH
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.simulated.answers import Answered, Answers
+from offboard.robot_client.simulated.calls import InputsEnded
 from offboard.robot_client.simulated.config import RobotConfig
 from offboard.robot_client.simulated.references import References
-from offboard.robot_client.simulated.summary import Summary, describe, show_progress
+from offboard.robot_client.simulated.summary import Summary, describe, end_progress, show_progress
 from offboard.robot_client.simulated.work import Work
 from offboard.robot_client.simulated.workload import CLOSED, due_instants
 
@@ -49,7 +50,7 @@ class OwnRecord(threading.local):
 
 
 class Run:
-    """Asks for `config.tasks` tasks of `work`, the first `config.measure` of them on both sites.
+    """Asks for `config.tasks_max` tasks of `work`, the first `config.measure` of them on both sites.
 
     `own` must be an observer of `offload`. With `answers`, each task leaves a line there, tasks that have a
     line already are left out, and a failed task does not end the run.
@@ -74,9 +75,10 @@ class Run:
         self._answers = answers
         self._references = references
         self._done = answers.done if answers else frozenset()
-        self._left = sum(number not in self._done for number in range(config.tasks))
+        self._left = sum(number not in self._done for number in range(config.tasks_max))
         self._summary = Summary(found=work.found, due=config.arrivals != CLOSED)
         self._noted = 0
+        self._inputs: int | None = None  # how many there were, if they have ended
         self._lock = threading.Lock()  # of the summary
         self._stopped = False
         self._start_s: float | None = None
@@ -95,16 +97,29 @@ class Run:
                 offload(self._work.function, *self._work.request(), where=BOTH)
 
     def run(self) -> None:
-        """Ask for all tasks that have no answer yet, then say the summary."""
+        """Ask for all tasks that have no answer yet, then say the summary; after Ctrl-C or a failure, too."""
         if self._done:
-            self._say(
-                f"{self._config.tasks - self._left} of {self._config.tasks} tasks had their answer before"
-            )
-        if self._config.arrivals == CLOSED:
-            self._run_closed()
-        else:
-            self._run_open()
-        for line in self._summary.lines():
+            count = self._config.tasks_max
+            self._say(f"{count - self._left} of {count} tasks had their answer before")
+        try:
+            if self._config.arrivals == CLOSED:
+                self._run_closed()
+            else:
+                self._run_open()
+        except BaseException:
+            if self._noted:
+                self._say_summary()
+            raise
+        self._say_summary()
+
+    def _say_summary(self) -> None:
+        with self._lock:
+            lines = self._summary.lines()
+        if self._noted and self._noted != self._left:
+            end_progress()
+        if self._inputs is not None:
+            self._say(f"the inputs ended after {self._inputs} of {self._config.tasks_max} tasks")
+        for line in lines:
             self._say(line)
 
     def _run_closed(self) -> None:
@@ -122,7 +137,7 @@ class Run:
             for number, request in requests:
                 self._ask(number, request)
             return
-        for number in range(self._config.tasks):
+        for number in range(self._config.tasks_max):
             answer = None
             if number not in self._done:
                 request = self._work.request()
@@ -161,10 +176,14 @@ class Run:
 
     def _requests(self) -> Iterator[tuple[int, tuple[Any, ...]]]:
         """Number and arguments of each task without an answer; no task depends on an earlier answer."""
-        for number in range(self._config.tasks):
-            if number not in self._done:
-                yield number, self._work.request()
-            self._work.advance(None)
+        number = 0
+        try:
+            for number in range(self._config.tasks_max):
+                if number not in self._done:
+                    yield number, self._work.request()
+                self._work.advance(None)
+        except InputsEnded:
+            self._inputs = number
 
     def _due_tasks(self) -> Iterator[tuple[int, tuple[Any, ...], float]]:
         """Number, arguments and due instant of each task without an answer, in s after the first of them."""

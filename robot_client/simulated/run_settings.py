@@ -7,6 +7,7 @@ from offboard.common.config import setting
 from offboard.common.errors import ConfigError
 from offboard.robot_client.simulated.workload import ARRIVALS, CLOSED
 
+TASKS_DEFAULT = 200
 TASKS, ARRIVING, MEASURING, OUTPUT = "tasks", "arrivals", "measurement", "output"
 
 
@@ -14,7 +15,13 @@ TASKS, ARRIVING, MEASURING, OUTPUT = "tasks", "arrivals", "measurement", "output
 class RunSettings:
     """One run of tasks, whatever they are."""
 
-    tasks: int = setting(200, "number of tasks", group=TASKS, minimum=1, maximum=1_000_000)
+    tasks: int | None = setting(
+        None,
+        f"number of tasks (default: {TASKS_DEFAULT}, or all inputs if they end earlier)",
+        group=TASKS,
+        minimum=1,
+        maximum=1_000_000,
+    )
     seed: int = setting(1, "seed of everything that is drawn at random", group=TASKS, minimum=0)
     arrivals: str = setting(
         CLOSED,
@@ -82,13 +89,18 @@ class RunSettings:
         maximum=1_000_000,
     )
 
+    @property
+    def tasks_max(self) -> int:
+        """The number of tasks; without --tasks, inputs may end earlier."""
+        return TASKS_DEFAULT if self.tasks is None else self.tasks
+
     def check_run(self, *, cloud: str | None) -> None:
         """`cloud` is the endpoint of the server that --alone and --reference need."""
         if self.answers is not None and self.answers == self.trace:
             raise ConfigError(f"--answers: {self.answers} is also the file of --trace")
         for flag in ("measure", "alone"):
-            if getattr(self, flag) > self.tasks:
-                raise ConfigError(f"--{flag}: {getattr(self, flag)} is above --tasks {self.tasks}")
+            if getattr(self, flag) > self.tasks_max:
+                raise ConfigError(f"--{flag}: {getattr(self, flag)} is above --tasks {self.tasks_max}")
         for flag in ("alone", "reference"):
             for needed, value in (("trace", self.trace), ("cloud", cloud)):
                 if getattr(self, flag) and value is None:

@@ -105,6 +105,12 @@ def show_progress(done: int, total: int, about: Callable[[], str]) -> None:
         print(f"{done}/{total} {about()}", flush=True)
 
 
+def end_progress() -> None:
+    """Go to a new line, if the last line of `show_progress` still has the cursor."""
+    if sys.stdout.isatty():
+        print()
+
+
 def _p95(values: Sequence[float]) -> float:
     return sorted(values)[min(len(values) - 1, int(0.95 * len(values)))]
 

@@ -32,7 +32,7 @@ class Work(Protocol):
     large: bool
 
     def request(self) -> tuple[Any, ...]:
-        """The arguments of the present task; a second call returns the same."""
+        """The arguments of the present task; a second call returns the same. InputsEnded if there is none."""
 
     def advance(self, answer: Any) -> None:
         """Go on to the next task; `answer` is None if the present task was not asked for, or failed."""

@@ -8,25 +8,32 @@ from pathlib import Path
 
 from offboard.common.errors import ConfigError
 from offboard.common.security.keys import robot_keys
+from offboard.common.task_states import TaskStates
 from offboard.robot_client.sites.cloud import CloudRunner
 from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import Runner
 
 
 def make_runners(
-    servers: Mapping[str, str], *, keys: Path | str | None, heartbeat_s: float, seed: int
+    servers: Mapping[str, str],
+    *,
+    keys: Path | str | None,
+    heartbeat_s: float,
+    seed: int,
+    states: TaskStates | None = None,
 ) -> list[Runner]:
     """Connected runners; `servers` holds the endpoint of each server by name.
 
     `keys`: the folder with the keys (None: no encryption).
     `heartbeat_s`: seconds between heartbeats (0: no heartbeats).
+    `states`: those of the onboard worker (None: states of its own).
     """
     runners: list[Runner] = []
     try:
         for site, endpoint in servers.items():
             own = None if keys is None else robot_keys(Path(keys), site)
             runners.append(CloudRunner(endpoint, site=site, heartbeat_s=heartbeat_s, seed=seed, keys=own))
-        runners.append(OnboardRunner())
+        runners.append(OnboardRunner(states=states))
     except ConfigError:
         for runner in runners:
             runner.close()

@@ -69,19 +69,20 @@ class OnboardRunner:
     it ends or calls `check_wanted`, and a new thread takes its place. But a kind with a setup has one state
     per worker, so its run keeps state and place, and the next task waits until it ends.
 
-    A setup runs when its kind first runs here, or in `prepare`. No time of a task includes it.
+    A setup runs when its kind first runs here, or in `prepare`. No time of a task includes it. Runners that
+    share `states` run it once: a run waits while another runner uses the state.
     """
 
     site = ONBOARD
 
-    def __init__(self, workers: int = 1) -> None:
+    def __init__(self, workers: int = 1, *, states: TaskStates | None = None) -> None:
         self._workers = workers
         self._queue: SimpleQueue[_Run | None] = SimpleQueue()
         self._runs: dict[int, _Run] = {}  # those that have not ended, by task id
         self._threads = 0  # without those of abandoned runs
         self._started: list[threading.Thread] = []  # all that have not ended, and a few that have
         self._abandoned = 0
-        self._states = TaskStates(workers)
+        self._states = states or TaskStates(workers)
         self._preparing: dict[str, Future[None]] = {}  # by kind
         self._closed = False
         self._lock = threading.Lock()

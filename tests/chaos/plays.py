@@ -25,12 +25,10 @@ SOAK_TASKS = 400  # 20 seconds
 LEAK_TASKS = 600
 
 
-def skip_if_unplayable(scenario: Scenario, testbed: str) -> None:
-    """Skip a scenario with inputs if the library of its task is missing, here or in the images."""
+def skip_if_unplayable(scenario: Scenario) -> None:
+    """Skip a scenario with inputs if the library of its task is missing here, where answers are verified."""
     if scenario.workload.inputs is None:
         return
-    if testbed == "docker":
-        pytest.skip(f"{scenario.name}: the images do not hold the library of its task")
     try:
         make_work(scenario.workload.robot(scenario.seed))
     except ConfigError as error:

@@ -14,7 +14,13 @@ from offboard.robot_client import policies
 from tests.breaks import BREAKS, bed_with
 from tests.chaos.plays import ALL, BROKEN, LEAK_TASKS, SCENARIOS, WRONG, skip_if_unplayable
 
-APPLICATIONS = ("apriltags", "registration")  # their answers are compared within a tolerance
+APPLICATIONS = (
+    "apriltags",
+    "registration",
+    "signs",
+    "pose-graph",
+    "arm",
+)  # their answers are compared within a tolerance
 SLOWER = 0.5  # CPU share of a robot that plans onboard: on a fast machine that policy might not fail
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
@@ -71,7 +77,7 @@ def test_every_check_names_what_it_fails_with(name: str) -> None:
 def test_a_check_fails_with_what_it_names(broken: Callable[..., Played], name: str, wrong: str) -> None:
     """Played with that policy or broken part, the check fails and says by how much."""
     scenario = read_scenario(find_scenario(name))
-    skip_if_unplayable(scenario, "local")
+    skip_if_unplayable(scenario)
     played = broken(scenario, wrong)
     print(*played.verdicts, sep="\n")
     held = {str(verdict.check): verdict.holds for verdict in played.verdicts}

@@ -31,7 +31,7 @@ def test_a_scenario_is_played_and_judged(
 ) -> None:
     """With its policy, every check has a value, and no answer is lost or wrong."""
     scenario = read_scenario(find_scenario(name))
-    skip_if_unplayable(scenario, testbed)
+    skip_if_unplayable(scenario)
     if testbed == "docker":
         request.getfixturevalue("engine")
     played = play(scenario, tmp_path, testbed, quiet=True)

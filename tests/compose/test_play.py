@@ -10,8 +10,13 @@ from pathlib import Path
 
 import pytest
 
+from offboard.loadgen.play.play_scenario import figures, play
+from offboard.loadgen.play.run_files import TRACE
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.table.measured_rows import read
 from offboard.loadgen.testbed.docker_engine import PREFIX
+from offboard.robot_client.records import trace
+from tests.chaos.plays import skip_if_unplayable
 from tests.compose.conftest import ROOT, docker, made_by_docker
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600), pytest.mark.usefixtures("engine")]
@@ -48,6 +53,21 @@ def test_a_dataset_is_measured_in_containers(tmp_path: Path) -> None:
     assert about["machine"]["docker"]
     assert about["disturbance"]["plans"] == 3
     assert set(made_by_docker()) <= before
+
+
+def test_an_application_is_played_in_containers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both sites find AprilTags in the image of the applications; no answer is lost, wrong or unverified."""
+    monkeypatch.chdir(ROOT)
+    scenario = read_scenario(find_scenario("apriltags-calm")).changed(tasks=12)
+    skip_if_unplayable(scenario)
+    played = play(scenario, tmp_path, "docker", quiet=True)
+    played.check_robots()
+    found = figures(played.outcome, scenario)
+    assert [found[name] for name in ("lost", "wrong", "unverified")] == [0, 0, 0]
+    both = {
+        one["site"] for record in trace.read(tmp_path / TRACE) for one in record["executions"] if one["ok"]
+    }
+    assert both == {"onboard", "cloud"}
 
 
 def test_an_interrupted_run_leaves_no_container(tmp_path: Path) -> None:

@@ -1,9 +1,11 @@
-"""Scenarios of a user, with a task module next to them, played by the installed command."""
+"""Tasks of a user, with their module in the current folder, run by the installed commands."""
 
+import contextlib
 import json
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -43,6 +45,21 @@ def frames(seed: int):
     while True:
         yield random.integers(0, 255, (200, 300), np.uint8)
 """
+ENGINE = """import os
+from pathlib import Path
+from offboard.common.tasks import task
+
+
+def load():
+    with Path("setups").open("a") as setups:
+        setups.write(f"{os.getpid()}\\n")
+    return 2
+
+
+@task("scaled", setup=load, size=float)
+def scaled(engine, number: int) -> int:
+    return engine * number
+"""
 WATCHING = """name = "watching"
 [workload]
 task = "camera:brightness"
@@ -68,6 +85,35 @@ def run(folder: Path, scenario: str) -> subprocess.CompletedProcess[str]:
         timeout=50,
         cwd=folder,
     )
+
+
+@contextlib.contextmanager
+def server(folder: Path, tasks: str) -> Iterator[tuple[str, int]]:
+    """The endpoint and the process id of a server with one worker."""
+    command = [Path(sys.executable).with_name("cloud-server"), "--tasks", tasks, "--workers", "1"]
+    command += ["--listen", "tcp://127.0.0.1:0", "--http", "127.0.0.1:0"]
+    with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stderr is not None
+            ready = next(line for line in process.stderr if "listening on" in line)
+            yield ready.split("listening on ")[1].split(",")[0], process.pid
+        finally:
+            process.kill()
+
+
+def test_a_model_is_loaded_once_in_each_process(tmp_path: Path) -> None:
+    """Warm-up, run, references and the tasks of --alone share the state of the robot's one worker."""
+    (tmp_path / "engine.py").write_text(ENGINE)
+    flags = "call --task engine:scaled --sizes uniform:1:9 --tasks 6 --reference 2 --alone 2 --trace t.jsonl"
+    with server(tmp_path, "engine") as (endpoint, cloud):
+        command = [Path(sys.executable).with_name("robot-client"), *flags.split(), "--cloud", endpoint]
+        with subprocess.Popen(
+            command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as robot:
+            said, errors = robot.communicate(timeout=50)
+    assert robot.returncode == 0, errors
+    assert "run on each site alone and on both at once: 2 of 2 tasks" in said
+    assert [int(pid) for pid in (tmp_path / "setups").read_text().split()] == [cloud, robot.pid]
 
 
 def test_a_scenario_with_inputs_is_played_and_verified(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from offboard.common.errors import OffloadError
 from offboard.common.planning.planner import plan_path
+from offboard.common.task_states import TaskStates
 from offboard.loadgen.play.answer_verification import verified, wrong_plan
 from offboard.loadgen.scenario.outcome import Answered
 from offboard.loadgen.scenario.scenario import Workload
@@ -80,6 +81,23 @@ def test_an_answer_that_is_too_large_to_compare_is_not_verified() -> None:
     assert [one.wrong for one in judged] == [None, None]
     why = "its bytes differ, and an answer over 16384 bytes is not kept"
     assert [one.unverified for one in judged] == [None, why]
+
+
+def test_each_call_is_repeated_once_for_all_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A later run with the same tasks is judged in the same way, and only calls that are new run."""
+    workload, ran = replace(CALLS, sizes=("uniform:20:2000",)), []
+    found = answered_rightly(workload)
+    call = TaskStates.call
+
+    def counted(states: TaskStates, kind: Any, args: Any) -> Any:
+        ran.append(args)
+        return call(states, kind, args)
+
+    monkeypatch.setattr(TaskStates, "call", counted)
+    verified([found[1], found[3]], workload, SEED)
+    judged = verified([found[0], replace(found[1], answer=found[2].answer), found[3]], workload, SEED)
+    assert [one.wrong is None for one in judged] == [True, False, True]
+    assert len(ran) == 3
 
 
 def test_a_task_that_fails_without_offboard_is_named() -> None:

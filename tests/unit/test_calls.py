@@ -66,7 +66,7 @@ def test_the_seed_decides_the_inputs() -> None:
 def test_what_is_wrong_with_inputs_is_one_line(inputs: str, error: type[OffloadError], said: str) -> None:
     """A wrong use is a ConfigError; an exception of the function is an OffloadError with its cause."""
     with pytest.raises(error) as caught:
-        drawn(calls(inputs), 4)
+        drawn(calls(inputs, tasks=200), 4)
     assert type(caught.value) is error
     assert str(caught.value).startswith(f"--inputs: 'tests.frames:{inputs}'")
     assert said in str(caught.value)
@@ -91,6 +91,22 @@ def test_a_missing_library_is_one_short_line(
 def test_exactly_as_many_inputs_as_tasks_are_enough() -> None:
     """The inputs may end with the last task."""
     assert len(drawn(calls("with_gain", tasks=3), 3)) == 3
+
+
+@pytest.mark.parametrize("arrivals", [{}, {"arrivals": "constant", "rate": 500.0}], ids=["closed", "open"])
+def test_without_a_number_of_tasks_the_inputs_decide(arrivals: dict[str, Any]) -> None:
+    """If the inputs end, the run ends as if they were all; the summary says how many there were."""
+    config = CallConfig(task="tests.frames:brightness", inputs="tests.frames:with_gain", **arrivals)
+    own, said = OwnRecord(), list[str]()
+    with offloader(OnboardRunner(), observers=[own]) as offload:
+        Run(config, make_calls(config), offload, own=own, say=said.append).run()
+    assert said[:2] == ["the inputs ended after 3 of 200 tasks", "3 tasks answered"]
+
+
+def test_no_input_at_all_is_an_error() -> None:
+    """Even if the number of tasks is not given, a function without inputs is a mistake."""
+    with pytest.raises(ConfigError, match="gave 0 inputs, but --tasks and --alone need at least 1"):
+        calls("nothing")
 
 
 class Frame:

@@ -6,10 +6,13 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 from offboard.common.errors import ConfigError
+from offboard.loadgen.play.part_setups import setups
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.testbed.container_output import Output
-from offboard.loadgen.testbed.container_part import as_popen, as_seen, measured, quota
+from offboard.loadgen.testbed.container_part import IMAGES, as_popen, as_seen, measured, quota, service_of
 from offboard.loadgen.testbed.process_owner import is_gone, owner
 
 
@@ -33,6 +36,26 @@ def test_a_missing_folder_is_an_error(tmp_path: Path) -> None:
     """Docker would create the folder; we report it as an error that names part and flag."""
     with pytest.raises(ConfigError, match=r"^robot: --up-samples: .*/no/file: its folder does not exist$"):
         as_seen("robot", {"up_samples": tmp_path / "no" / "file"}, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("scenario", "services"),
+    [
+        ("calm", {"cloud": "cloud", "wan": "wan", "robot": "robot"}),
+        ("nonlinear", {"cloud": "cloud", "wan": "wan", "robot": "robot"}),
+        ("arm-busy", {"cloud": "examples", "wan": "wan", "robot": "examples"}),
+    ],
+)
+def test_an_application_has_its_own_image(tmp_path: Path, scenario: str, services: dict[str, str]) -> None:
+    """Robot and cloud use the image of the applications only if the task is in `examples/`."""
+    parts = setups(read_scenario(find_scenario(scenario)), tmp_path)
+    assert {part: service_of(part, setup) for part, setup in parts.items()} == services
+
+
+def test_compose_builds_every_image() -> None:
+    """Each image has the name that its service has in docker-compose.yml."""
+    described = yaml.safe_load((Path(__file__).parents[2] / "docker-compose.yml").read_text())["services"]
+    assert {service: described[service]["image"] for service in IMAGES} == dict(IMAGES)
 
 
 @pytest.mark.parametrize(

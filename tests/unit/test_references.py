@@ -1,14 +1,17 @@
 """References: which tasks are run again on each site alone, and what is written about them."""
 
 import itertools
+import threading
 from collections import Counter
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from offboard.common.errors import CloudTimeout
-from offboard.common.tasks import Task
+from offboard.common.task_states import TaskStates
+from offboard.common.tasks import Kind, Task, kind_of, task
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.simulated import references as references_file
 from offboard.robot_client.simulated.calls import Calls
@@ -19,6 +22,13 @@ from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.fakes import ScriptedRunner
 from tests.scripted import offloader, script, scripted
+
+WAIT_S = 5.0  # for another thread; a test fails when it is over
+
+
+@task("held", size=abs, setup=dict)
+def held(state: dict[str, int], number: int) -> int:
+    return number + len(state)
 
 
 @pytest.fixture(autouse=True)
@@ -40,12 +50,15 @@ def referenced(
         seed=5,
     )
     path, own, records = folder / "t.reference.jsonl", OwnRecord(), list[Record]()
+    states = TaskStates(workers=1)
     with (
         offloader(ScriptedRunner(CLOUD, lambda one: Execution(CLOUD, 0.25, one.args[0])), OnboardRunner(),
                   observers=[own, records.append]) as offload,
         offloader(cloud, OnboardRunner()) as again,
     ):  # fmt: skip
-        references = References(path, again, [ONBOARD, CLOUD], every=every, tasks=tasks, seed=5)
+        references = References(
+            path, again, [ONBOARD, CLOUD], every=every, tasks=tasks, seed=5, states=states
+        )
         work = Calls(scripted, zip(itertools.count()))
         Run(config, work, offload, own=own, say=lambda _: None, references=references).run()
         references.close()
@@ -91,3 +104,36 @@ def test_a_reference_holds_failures(tmp_path: Path) -> None:
     (tmp_path / "away").mkdir()
     lines, _ = referenced(tmp_path / "away", away, 4, 2)
     assert [list(line["sites"]) for line in lines] == [[ONBOARD]] * 2
+
+
+def test_a_reference_does_not_wait_for_a_run_that_lost_its_race(tmp_path: Path) -> None:
+    """Such a run may still use the one state of the robot; the reference begins when it has ended."""
+    using, may_end, ended, seen = threading.Event(), threading.Event(), threading.Event(), list[bool]()
+
+    class Watched(TaskStates):
+        def lend(self, kind: Kind) -> AbstractContextManager[tuple[Any, ...]]:
+            if threading.current_thread() is threading.main_thread():
+                may_end.set()
+            else:
+                seen.append(ended.is_set())
+            return super().lend(kind)
+
+    states = Watched(workers=1)
+
+    def lose() -> None:
+        with TaskStates.lend(states, kind_of(held)):
+            using.set()
+            may_end.wait(WAIT_S)
+            ended.set()
+
+    with offloader(OnboardRunner(states=states)) as again:
+        again(held, 1)
+        assert again.last is not None
+        references = References(tmp_path / "t", again, [ONBOARD], every=1, tasks=1, seed=1, states=states)
+        loser = threading.Thread(target=lose)
+        loser.start()
+        assert using.wait(WAIT_S)
+        references.measure(0, held, (2,), waited_s=0.1, record=again.last)
+        loser.join(WAIT_S)
+        references.close()
+    assert seen == [False, True]

@@ -241,6 +241,26 @@ def test_an_interrupted_run_writes_no_answer_for_given_up_tasks(tmp_path: Path) 
     assert [line["error"] for line in answers_file.read(path)] == [None, None]
 
 
+def test_an_interrupted_run_says_what_was_done() -> None:
+    """After Ctrl-C, the summary of the tasks that were answered before is said."""
+    closed, said, own = threading.Event(), list[str](), OwnRecord()
+
+    def act(number: int) -> None:
+        if number == 3:
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+            assert closed.wait(WAIT_S)
+
+    script.act = act
+    config = CallConfig(task="m:f", sizes=("constant:0",), tasks=10)
+    with offloader(OnboardRunner(), observers=[own]) as offload:
+        run = Run(config, Calls(scripted, zip(itertools.count())), offload, own=own, say=said.append)
+        with pytest.raises(KeyboardInterrupt):
+            run.run()
+        closed.set()
+    assert said[0] == "3 tasks answered"
+    assert len(said) == 2
+
+
 def test_tasks_are_made_ahead_in_order_and_bounded() -> None:
     """MADE_MAX tasks are made ahead; an error in making a task is raised where the task is asked for."""
     made: list[int] = []

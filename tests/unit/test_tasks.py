@@ -83,6 +83,48 @@ def test_a_module_that_cannot_be_imported_is_named(
         load_modules([name])
 
 
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("myorb.py", "myorb"),
+        ("./myorb", "myorb"),
+        ("./vision/myorb.py", "vision.myorb"),
+        ("../myorb.py", "myorb"),
+        ("/home/robot/myorb.py", "myorb"),
+        ("myorb:detect", "myorb"),
+        ("myorb.py:detect", "myorb"),
+    ],
+)
+def test_a_file_or_a_function_is_not_taken_for_a_module(name: str, meant: str) -> None:
+    """The error says which module was probably meant."""
+    with pytest.raises(ConfigError) as caught:
+        load_modules([name])
+    assert str(caught.value) == (f"task module {name!r} is not the name of a module; did you mean {meant!r}?")
+
+
+@pytest.mark.parametrize(
+    ("name", "end"),
+    [
+        ("no_such_module", "it is looked for in this folder and on PYTHONPATH"),
+        ("no_such_folder.module", "it is looked for in this folder and on PYTHONPATH"),
+        (
+            "examples.no_such",
+            "examples/ is only in a checkout: start the command in the folder of the checkout",
+        ),
+        ("needy", "No module named 'no_such_library'"),
+    ],
+)
+def test_the_places_of_modules_are_named(
+    name: str, end: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If the module was not found, the error says where it was looked for; not if a library is missing."""
+    (tmp_path / "needy.py").write_text("import no_such_library")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ConfigError) as caught:
+        load_modules([name])
+    assert str(caught.value).endswith(end)
+
+
 def test_a_keyword_only_parameter_is_refused() -> None:
     """Arguments are sent by position, so its value would be lost."""
     with pytest.raises(ConfigError, match="'scale' is keyword-only; make it positional"):

@@ -37,6 +37,22 @@ def nothing(seed):
 """,
     "inputs.toml": 'name = "odd"\n[workload]\nmap = "open.map"\ninputs = "camera:few"\n',
     "rows.csv": "size,onboard_s,cloud_s\n1,2,3\n2,3,4\n3,4,5\n",
+    "nope.toml": """name = "nope"
+[workload]
+task = "camera:bright"
+
+inputs = "camera:nope"
+""",
+    "half.toml": 'name = "half"\n[workload]\ntask = "camera"\ninputs = "camera:few"\n',
+    "rate.toml": 'name = "rate"\n[workload]\nmap = "open.map"\njump = true\narrivals = "poisson"\n',
+    "late.toml": """name = "late"
+[workload]
+task = "camera:bright"
+inputs = "camera:few"
+[[check]]
+figure = "late_percent"
+at_most = 1
+""",
     "odd.toml": 'name = "odd"\n[workload]\nmap = "m.yaml"\ntaks = 3\n',
 }
 
@@ -124,6 +140,23 @@ def nothing(seed):
         ),
         (["loadgen", "run", "inputs.toml"], "inputs.toml: workload.inputs: 'camera:few' needs workload.task"),
         (["loadgen", "run", "alone.toml"], "alone.toml: workload.alone: 4 is above workload.tasks 3"),
+        (
+            ["loadgen", "run", "nope.toml"],
+            "nope.toml:5: workload.inputs: 'camera:nope' is not MODULE:FUNCTION with a function of the seed",
+        ),
+        (
+            ["loadgen", "compare", "nope.toml", "half.toml"],
+            "nope.toml:5: workload.inputs: 'camera:nope' is not MODULE:FUNCTION",
+        ),
+        (["loadgen", "run", "half.toml"], "half.toml:3: workload.task: 'camera' is not MODULE:FUNCTION"),
+        (
+            ["loadgen", "run", "rate.toml"],
+            "rate.toml:5: workload.arrivals: poisson needs workload.rate, the tasks per second",
+        ),
+        (
+            ["loadgen", "run", "late.toml"],
+            "late.toml:6: check late_percent at most 1 %: cannot be computed without workload.deadline_ms",
+        ),
         (["cloud_server", "--listen", "localhost"], "--listen: 'localhost'"),
         (["cloud_server", "--tasks", "no.such.module"], "'no.such.module' cannot be imported"),
         (["loadgen", "table", "none.csv"], "none.csv"),

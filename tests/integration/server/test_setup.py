@@ -2,9 +2,12 @@
 
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from pathlib import Path
 from queue import SimpleQueue
 
 import pytest
@@ -26,6 +29,21 @@ pytestmark = pytest.mark.integration
 
 WORKERS = 2
 TASKS = 40
+BROKEN = """from offboard.common.tasks import task
+
+
+def find(path):
+    raise FileNotFoundError(f"no model in {path}")
+
+
+def load():
+    return find("models")
+
+
+@task("find_things", size=float, WHEN=load)
+def find_things(model, number=0):
+    return number
+"""
 SETUP_S = 0.5  # long: a busy machine may delay a task of 2 ms
 
 
@@ -135,3 +153,25 @@ def test_a_setup_that_raises_stops_the_server(name: str, monkeypatch: pytest.Mon
         pytest.raises(OffloadError, match="setup of task engine_twice: RuntimeError: no engine"),
     ):
         executor.warm().result(WAIT_S)
+
+
+@pytest.mark.parametrize("name", sorted(EXECUTORS))
+@pytest.mark.parametrize("when", ["setup", "warm"])
+def test_the_log_shows_where_a_setup_raised(tmp_path: Path, name: str, when: str) -> None:
+    """The last line names task and error; above it are the frames of the user, and none of Offboard."""
+    (tmp_path / "broken.py").write_text(BROKEN.replace("WHEN", when))
+    command = [sys.executable, "-m", "offboard.cloud_server", "--tasks", "broken", "--executor", name]
+    command += ["--workers", "1", "--listen", "tcp://127.0.0.1:0", "--http", "127.0.0.1:0"]
+    done = subprocess.run(
+        [*command, "--log", "error"], capture_output=True, text=True, cwd=tmp_path, timeout=6 * WAIT_S
+    )
+    assert done.returncode == 1, done.stderr
+    first, *shown, last = done.stderr.splitlines()
+    cause = "FileNotFoundError: no model in models"
+    assert last == f"cloud-server: {when} of task find_things: {cause}"
+    assert first.endswith("ERROR the server cannot start")
+    assert shown[0] == "Traceback (most recent call last):"
+    assert shown[-1] == cause
+    files = [line for line in shown if line.startswith("  File ")]
+    assert [line.rpartition(" ")[2] for line in files] == ["load", "find"]
+    assert all("broken.py" in line for line in files)
