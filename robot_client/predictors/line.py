@@ -13,6 +13,7 @@ SHAPE = 0.003  # the same for intercept and slope apart from each other
 ODD = 3.0  # standard deviations: a time farther from the line is an outlier
 RATE = 0.05  # of the running means, once there are enough times
 TAIL_MAX = 2.0  # usual times: a longer outlier counts as this much in the mean of the outliers
+SLOPES = 4.0  # times the expected slope: so uncertain is the first one
 RATE_AFTER = 4  # further times that the running means seem to have seen at the start
 
 
@@ -91,10 +92,12 @@ class Line:
 
     def _begin(self, x: float, y: float, known: float) -> None:
         self._usual = unit = y + known or 1.0
-        half = 0.5 * y if x > 0 else 0.0  # so uncertain is the slope, even if less of it is believed
-        self.b = half if self.slope is None else min(half, self.slope)
+        half = uncertain = 0.5 * y if x > 0 else 0.0
+        if self.slope is not None:
+            half, uncertain = min(half, self.slope), min(half, SLOPES * self.slope)
+        self.b = half
         self.a = y - self.b * x
-        square = half * half
+        square = uncertain * uncertain
         self._paa, self._pab, self._pbb = square * x * x + self._noise * unit * unit, -square * x, square
 
     def _loosen(self, share: float, known: float) -> None:
