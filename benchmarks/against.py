@@ -49,7 +49,10 @@ class Case:
 
     def text(self) -> str:
         """The scenario file."""
-        text = find_scenario(self.scenario).read_text()
+        path = find_scenario(self.scenario)
+        text = re.sub(
+            r'(?m)^map = "(.*)"$', lambda found: f'map = "{(path.parent / found[1]).resolve()}"', path.read_text()
+        )
         if self.bandwidth_mbps is not None:
             text = re.sub(r"(?m)^bandwidth_mbps = .*$", f"bandwidth_mbps = {self.bandwidth_mbps:g}", text)
         if self.robot_cpus is not None:
@@ -59,7 +62,7 @@ class Case:
 
 PLANS = ("calm", "outage", "robot-busy", "throttled", "heavy-tail")
 CASES: dict[str, Case] = {
-    **{name: Case(name, 300) for name in PLANS},
+    **{name: Case(name, 150) for name in PLANS},
     **{
         f"{name}-{mbps}": Case(f"{name}-calm", 60, bandwidth_mbps=mbps)
         for name in ("apriltags", "registration", "signs")
