@@ -259,7 +259,6 @@ class SiteMemory:
                 queue_s=one.queue_s,
                 moved=moved,
                 bound=one.bound,
-                own_cpu_s=one.own_cpu_s,
                 condition=one.condition,
             )
         else:

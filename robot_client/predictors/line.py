@@ -82,6 +82,13 @@ class Line:
         self._noise += rate * (seen - self._noise)
         self._correct(x, max(-reach, min(reach, error)), unit)
 
+    def begin_as(self, other: "Line", x: float, y: float) -> None:
+        """Begin with the shape of another line, through the first time `y` of the amount `x`."""
+        factor = y / other.at(x)
+        self.count, self._usual, self.a, self.b = 1, y, factor * other.a, factor * other.b
+        self._paa = self._noise * y * y + 0.25 * y * y
+        self._pab, self._pbb = 0.0, (0.5 * self.b) ** 2
+
     def bound(self, x: float, y: float, known: float) -> None:
         """The amount `x` takes at most `y` seconds beyond `known`."""
         if not self.count:

@@ -12,9 +12,6 @@ from offboard.robot_client.predictors.line import Line, RunningMean
 from offboard.robot_client.sites.runner import UNMEASURED, Condition
 
 FIRST_BYTES_S = 12.5e6  # bytes a second of a link, until its first answers tell: 100 Mbit/s
-SLOW_RATE = 0.3  # loads are rare and short, so the factor under load is learned from few tasks
-SLOW_MAX = 3.0  # times the factor known: a run that is slower counts as this slow
-CPU_SHARE = 0.5  # of its time that a task must use a CPU, so that its CPU time says how much work it is
 
 
 class Parts:
@@ -30,10 +27,7 @@ class Parts:
         self.remote = remote
         self._run = Line(together=True)
         self._network = Line(together=False)
-        # Times that a run takes longer than its work: usually, and under load (0: unknown).
-        self._usual_slow = RunningMean()
-        self._slow = 0.0
-        self._by_cpu: bool | None = None  # whether the work of a run is its CPU time; None: not known yet
+        self._loaded = Line(together=True)  # runs while other programs take the CPU
         self._usual_run = RunningMean()
         self._usual_delay = RunningMean()
         self._amount = self._bytes = 0.0  # the units
@@ -77,7 +71,6 @@ class Parts:
         queue_s: float | None = None,
         moved: float = 0.0,
         bound: bool = False,
-        own_cpu_s: float | None = None,
         condition: Condition = UNMEASURED,
     ) -> None:
         """A task took `seconds`, of which it waited `queue_s` and ran `run_s` (None: the site did not say).
@@ -91,7 +84,7 @@ class Parts:
         else:
             rest_s = seconds - (queue_s or 0.0) - run_s - rtt_s
             self._learn_network(moved, max(0.0, rest_s), rtt_s, ahead, bound=bound)
-        self._learn_run(size, run_s, condition, ahead, own_cpu_s)
+        self._learn_run(size, run_s, condition, ahead)
 
     def learn_late(
         self, size: float, seconds: float, ahead: int, *, moved: float, condition: Condition
@@ -105,44 +98,33 @@ class Parts:
         self._learn_network(moved, max(0.0, seconds - expected_s - rtt_s), rtt_s, ahead, bound=False)
 
     def _run_s(self, size: float, condition: Condition) -> float:
-        seconds = self._run.at(size / self._amount if self._amount else 0.0) / condition.capacity
-        load, usual = self._load(condition), self._usual_slow.value or 1.0
-        return seconds * (self._slow or usual * (1.0 + load) if load > LOADED else usual)
+        x, load = size / self._amount if self._amount else 0.0, self._load(condition)
+        if load <= LOADED:
+            seconds = self._run.at(x)
+        elif self._loaded.count:
+            seconds = self._loaded.at(x)
+        else:
+            seconds = self._run.at(x) * (1.0 + load)
+        return seconds / condition.capacity
 
     def _load(self, condition: Condition) -> float:
         return condition.server_load if self.remote else condition.load
 
-    def _learn_run(
-        self, size: float, run_s: float, condition: Condition, ahead: int, own_cpu_s: float | None = None
-    ) -> None:
-        """Learn the work of a run, and how much longer than its work it took.
+    def _learn_run(self, size: float, run_s: float, condition: Condition, ahead: int) -> None:
+        """Learn a run, apart from others if other programs take the CPU.
 
-        The work is the CPU time, where the process knows its own and is not waiting for something else;
-        another program does not change it. Otherwise it is the time of a run without load.
+        Under load, a run waits for the CPU several times, which depends little on its work. So the factor
+        between loaded and other runs is not the same for all of them.
         """
         self._usual_run.add(run_s)
         self._amount = self._amount or size
-        x = size / self._amount if self._amount else 0.0
-        alone_s = run_s * condition.capacity
-        loaded = self._load(condition) > LOADED and self.full
-        if self._by_cpu is None:
-            self._by_cpu = own_cpu_s is not None and own_cpu_s >= CPU_SHARE * alone_s
-        if self._by_cpu and own_cpu_s:
-            self._run.learn(x, own_cpu_s, ahead=ahead)
-            self._learn_slow(alone_s / own_cpu_s, loaded=loaded)
-        elif not loaded:
-            self._run.learn(x, alone_s / (self._usual_slow.value or 1.0), ahead=ahead)
-        elif (expected_s := self._run.at(x)) > 0:
-            self._learn_slow(alone_s / expected_s, loaded=loaded)
-
-    def _learn_slow(self, slow: float, *, loaded: bool) -> None:
-        if not loaded:
-            usual = self._usual_slow.value
-            self._usual_slow.add(min(slow, SLOW_MAX * usual) if usual else slow)
-        elif self._slow:
-            self._slow += SLOW_RATE * (min(slow, SLOW_MAX * self._slow) - self._slow)
+        x, alone_s = size / self._amount if self._amount else 0.0, run_s * condition.capacity
+        if self._load(condition) <= LOADED or not self.full:
+            self._run.learn(x, alone_s, ahead=ahead)
+        elif not self._loaded.count and self._run.at(x) > 0:
+            self._loaded.begin_as(self._run, x, alone_s)
         else:
-            self._slow = slow
+            self._loaded.learn(x, alone_s, ahead=ahead)
 
     def _learn_network(self, moved: float, rest_s: float, rtt_s: float, ahead: int, *, bound: bool) -> None:
         if not self._bytes:
