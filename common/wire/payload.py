@@ -13,6 +13,7 @@ from offboard.common.wire.values import BLOB_BYTES_MIN, NESTING_MAX
 
 NUMBER_BYTES = 9  # of a float or a large integer in msgpack
 LOOKS_MAX = 1000  # items that are looked at, in all lists of a value; the others count as the mean of them
+GOLDEN = 0.6180339887498949  # multiples of it are spread evenly, and never in step with a list that repeats
 
 Known = Callable[[memoryview], bool]
 
@@ -44,7 +45,9 @@ def _bytes(value: Any, known: Known, looks: int, depth: int) -> int:
 
 
 def _of_items(items: Sequence[Any], known: Known, looks: int, depth: int) -> int:
-    seen = items[:: max(1, len(items) // looks)]
+    seen = items
+    if len(items) > looks:
+        seen = [items[int(n * GOLDEN % 1.0 * len(items))] for n in range(looks)]
     each = max(1, looks // max(1, len(seen)))
     return sum([_bytes(one, known, each, depth + 1) for one in seen]) * len(items) // max(1, len(seen))
 

@@ -5,17 +5,19 @@ A line on one number is in `least_squares`.
 
 import math
 from collections import deque
-from typing import NamedTuple
-
-import numpy as np
-import numpy.typing as npt
+from typing import TYPE_CHECKING, NamedTuple
 
 from offboard.robot_client.predictors.base import SIZE_MIN, Prediction
+
+if TYPE_CHECKING:  # --help loads every predictor, but not numpy
+    import numpy as np
+    import numpy.typing as npt
+
+    Array = npt.NDArray[np.float64]
 
 CONSTANT = 2.0**-50  # 4 units in the last place: a number that varies by less, of its largest, is constant
 
 Numbers = tuple[float, ...]
-Array = npt.NDArray[np.float64]
 
 
 class Plane:
@@ -50,36 +52,39 @@ class Plane:
         if not self._rows:
             return None
         if self._fit is None:
-            self._fit = _fit(
-                np.array([row for row, _ in self._rows]), np.array([seconds for _, seconds in self._rows])
-            )
-        return self._fit.at(np.array(numbers))
+            self._fit = _fit([row for row, _ in self._rows], [seconds for _, seconds in self._rows])
+        return self._fit.at(numbers)
 
 
 class _Fit(NamedTuple):
     """A fitted plane. `span` is the range of each number, and infinite if it is constant."""
 
-    lowest: Array
-    span: Array
-    mean: Array
-    slopes: Array
+    lowest: "Array"
+    span: "Array"
+    mean: "Array"
+    slopes: "Array"
     intercept: float
     spread_s: float | None
 
-    def at(self, numbers: Array) -> Prediction:
+    def at(self, numbers: Numbers) -> Prediction:
         z = (numbers - self.lowest) / self.span - self.mean
         return Prediction(self.intercept + float(z @ self.slopes), self.spread_s)
 
 
-def _fit(sizes: Array, seconds: Array) -> _Fit:
+def _fit(rows: list[Numbers], times_s: list[float]) -> _Fit:
+    import numpy as np  # not for --help
+
+    sizes, seconds = np.array(rows), np.array(times_s)
     lowest, highest = sizes.min(axis=0), sizes.max(axis=0)
     span = highest - lowest
     span[span <= np.maximum(CONSTANT * highest, SIZE_MIN)] = math.inf
     shares = (sizes - lowest) / span  # before the mean is taken, which would round small differences away
     mean = shares.mean(axis=0)
-    rows = np.column_stack([np.ones(len(seconds)), shares - mean])
-    found, _, rank, _ = np.linalg.lstsq(rows, seconds, rcond=None)
+    known = np.column_stack([np.ones(len(seconds)), shares - mean])
+    found, _, rank, _ = np.linalg.lstsq(known, seconds, rcond=None)
     free = len(seconds) - int(rank)
-    rest = seconds - rows @ found
+    rest = seconds - known @ found
     spread_s = math.sqrt(float(rest @ rest) / free) if free > 0 else None
-    return _Fit(lowest, span, mean, found[1:], float(found[0]), spread_s)
+    return _Fit(
+        lowest=lowest, span=span, mean=mean, slopes=found[1:], intercept=float(found[0]), spread_s=spread_s
+    )

@@ -24,10 +24,15 @@ FOLDERS: dict[str, set[str]] = {
     "common/host": set(),
     "robot_client/sites": set(),
     "robot_client/predictors": {"robot_client/sites"},
-    "robot_client/policies": {"robot_client/sites"},
+    "robot_client/policies": {"robot_client/predictors", "robot_client/sites"},
     "robot_client/learning": {"robot_client/policies", "robot_client/predictors", "robot_client/sites"},
     "robot_client/records": {"robot_client/learning", "robot_client/policies", "robot_client/sites"},
-    "robot_client/execution": {"robot_client/policies", "robot_client/records", "robot_client/sites"},
+    "robot_client/execution": {
+        "robot_client/policies",
+        "robot_client/predictors",
+        "robot_client/records",
+        "robot_client/sites",
+    },
     "robot_client": {  # the offloader
         "robot_client/execution",
         "robot_client/learning",

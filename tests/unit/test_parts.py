@@ -16,7 +16,7 @@ from offboard.robot_client.sites.runner import UNMEASURED, Condition
 RUN_S, REST_S, RTT_S = 0.2, 0.05, 0.03  # of a task of size 1 and of 1000 bytes
 NEAR = Condition(round_trip_s=RTT_S)
 BYTES = 1000.0
-BYTES_S = 1e6  # bytes a second of the link in these tests
+BYTES_S = 4e6  # bytes a second of the link in these tests: a third of FIRST_BYTES_S
 
 
 def run_of(size: float) -> float:
@@ -125,7 +125,8 @@ def test_what_a_server_waited_is_not_learned() -> None:
 @pytest.mark.parametrize("remote", [False, True])
 def test_half_of_the_cpu_doubles_the_run_and_nothing_else(remote: bool) -> None:
     """Times on half a CPU predict those on a whole one, and the other way round."""
-    whole, half = Condition(round_trip_s=RTT_S), Condition(round_trip_s=RTT_S, capacity=0.5)
+    whole = NEAR if remote else UNMEASURED
+    half = whole._replace(capacity=0.5)
     network_s = RTT_S + REST_S if remote else 0.0
     slow_model, fast_model = Parts(remote=remote), Parts(remote=remote)
     for _ in range(20):
@@ -139,15 +140,37 @@ def test_half_of_the_cpu_doubles_the_run_and_nothing_else(remote: bool) -> None:
 @pytest.mark.parametrize("remote", [False, True])
 def test_load_slows_a_run_by_the_factor_that_was_learned(remote: bool) -> None:
     """Before any run under load, the load itself is the guess; after some, it is what they took."""
-    loaded = Condition(round_trip_s=RTT_S, load=0.6, server_load=0.6)
-    model = server() if remote else onboard()
+    model, alone = (server(), NEAR) if remote else (onboard(), UNMEASURED)
+    loaded = alone._replace(load=0.6, server_load=0.6)
     network_s = RTT_S + REST_S if remote else 0.0
     assert predicted_s(model, condition=loaded) == pytest.approx(network_s + 1.6 * RUN_S, rel=0.03)
     for _ in range(8):
         run_s = 2.5 * RUN_S
         model.learn(1.0, network_s + run_s, run_s=run_s, queue_s=0.0, moved=BYTES, condition=loaded)
     assert predicted_s(model, condition=loaded) == pytest.approx(network_s + 2.5 * RUN_S, rel=0.05)
-    assert predicted_s(model) == pytest.approx(network_s + RUN_S, rel=0.03)
+    assert predicted_s(model, condition=alone) == pytest.approx(network_s + RUN_S, rel=0.03)
+
+
+def test_onboard_the_work_of_a_run_is_its_own_cpu_time() -> None:
+    """Runs usually take 1.5 times their CPU time, and 3 times under load; neither changes the work."""
+    rng, model, loaded = Random(1), Parts(), Condition(load=0.6)
+    for condition, slow in ((UNMEASURED, 1.5), (loaded, 3.0)):
+        for _ in range(20):
+            size = rng.uniform(0.5, 2.0)
+            model.learn(size, slow * run_of(size), own_cpu_s=run_of(size), condition=condition)
+    for size in (0.5, 2.0):
+        for condition, slow in ((UNMEASURED, 1.5), (loaded, 3.0)):
+            found_s = predicted_s(model, size, condition)
+            assert found_s == pytest.approx(slow * run_of(size), rel=0.03), condition
+
+
+def test_the_work_of_a_run_that_waits_is_its_time() -> None:
+    """If the first run used the CPU for less than half of its time, CPU times say nothing about the work."""
+    rng, model = Random(1), Parts()
+    for share in (0.4, *[rng.uniform(0.1, 0.9) for _ in range(20)]):
+        size = rng.uniform(0.5, 2.0)
+        model.learn(size, run_of(size), own_cpu_s=share * run_of(size))
+    assert predicted_s(model) == pytest.approx(RUN_S, rel=0.03)
 
 
 def test_the_load_of_the_robot_does_not_slow_the_run_of_a_server() -> None:
@@ -184,7 +207,9 @@ def test_bytes_that_the_server_has_cost_nothing() -> None:
     for _ in range(60):
         moved = rng.choice((1e3, 1e6)) * rng.uniform(0.8, 1.2)
         answer(model, moved=moved, rest_s=0.02 + moved / BYTES_S)
-    assert predicted_s(model, moved=1e6) - predicted_s(model, moved=0.0) == pytest.approx(1.0, rel=0.05)
+    assert predicted_s(model, moved=1e6) - predicted_s(model, moved=0.0) == pytest.approx(
+        1e6 / BYTES_S, rel=0.05
+    )
     assert predicted_s(model, moved=0.0) == pytest.approx(RTT_S + 0.02 + RUN_S, rel=0.1)
 
 
