@@ -70,6 +70,5 @@ class SimulatedOnboard:
                 run_s=now_s - run.begun_s,
                 network_s=0.0,
                 cpu_s=cpu_s,
-                own_cpu_s=cpu_s,
             )
         )

@@ -105,7 +105,6 @@ def _observation(given: Any) -> Observation:
         run_s=_maybe(given["run_s"]),
         queue_s=_maybe(given["queue_s"]),
         bound=_fact(given["bound"]),
-        own_cpu_s=_maybe(given["own_cpu_s"]),
     )
 
 

@@ -32,7 +32,6 @@ class Observation:
     `predicted_s`: the prediction, if the interval learned its error.
     `ahead`: how many tasks after the previous run of the site this one came.
     `run_s`, `queue_s`: what the site measured of them; None: nothing.
-    `own_cpu_s`: CPU seconds of this process during a run onboard.
     `bound`: the robot ran the same task itself and may have received the answer of this site late.
     """
 
@@ -51,7 +50,6 @@ class Observation:
     run_s: float | None = None
     queue_s: float | None = None
     bound: bool = False
-    own_cpu_s: float | None = None
 
 
 class SiteMemory:
@@ -186,7 +184,6 @@ class SiteMemory:
                 run_s=execution.run_s,
                 queue_s=execution.queue_s,
                 bound=beside,
-                own_cpu_s=execution.own_cpu_s,
             )
         )
 

@@ -222,7 +222,7 @@ def _run(run: _Run, states: TaskStates) -> Execution:
 
 
 def _call(run: _Run, state: tuple[Any, ...], states: TaskStates) -> Execution:
-    cpu_before_s, own_before_s, started_s = cpu_time.used_s(), time.process_time(), time.perf_counter()
+    cpu_before_s, started_s = cpu_time.used_s(), time.perf_counter()
     value, failure = None, None
     try:
         value = call_while(lambda: run.wanted, run.task.kind.function, (*state, *run.task.args))
@@ -231,7 +231,7 @@ def _call(run: _Run, state: tuple[Any, ...], states: TaskStates) -> Execution:
         failure.__cause__ = error
         if isinstance(error, Unwanted) and not run.wanted:
             return _overtaken(run, started=True)
-    own_cpu_s, cpu_s = time.process_time() - own_before_s, cpu_time.used_s() - cpu_before_s
+    cpu_s = cpu_time.used_s() - cpu_before_s
     # Reading the CPU time makes the kernel charge this thread. A thread that has used more than its quota is
     # then stopped for a while, and the caller waits for that too.
     ended_s = time.perf_counter()
@@ -245,7 +245,6 @@ def _call(run: _Run, state: tuple[Any, ...], states: TaskStates) -> Execution:
         run_s=ended_s - started_s,
         network_s=0.0,
         cpu_s=cpu_s,
-        own_cpu_s=own_cpu_s,
     )
 
 

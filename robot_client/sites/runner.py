@@ -32,7 +32,6 @@ class Execution:
     censored: the task was given up, so the true time is longer than `seconds`.
     queue_s, run_s: measured by the server, or by the robot onboard; `network_s` is the rest of `seconds`.
     cpu_s: CPU time of the server (onboard: of the robot) during the run, including other tasks that ran.
-    own_cpu_s: CPU time of this process during an onboard run, without other programs; None elsewhere.
     bytes_out, bytes_in: bytes of the messages, without transport headers.
     started: false if the task certainly never ran there.
     """
@@ -46,7 +45,6 @@ class Execution:
     run_s: float | None = None
     network_s: float | None = None
     cpu_s: float | None = None
-    own_cpu_s: float | None = None
     bytes_out: int = 0
     bytes_in: int = 0
     started: bool = True
