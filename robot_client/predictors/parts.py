@@ -91,7 +91,7 @@ class Parts:
         else:
             rest_s = seconds - (queue_s or 0.0) - run_s - rtt_s
             self._learn_network(moved, max(0.0, rest_s), rtt_s, ahead, bound=bound)
-        self._learn_run(size, run_s, condition, ahead, own_cpu_s)
+        self._learn_run(size, run_s, condition, ahead, own_cpu_s=own_cpu_s)
 
     def learn_late(
         self, size: float, seconds: float, ahead: int, *, moved: float, condition: Condition
@@ -113,7 +113,7 @@ class Parts:
         return condition.server_load if self.remote else condition.load
 
     def _learn_run(
-        self, size: float, run_s: float, condition: Condition, ahead: int, own_cpu_s: float | None = None
+        self, size: float, run_s: float, condition: Condition, ahead: int, *, own_cpu_s: float | None = None
     ) -> None:
         """Learn the work of a run, and how much longer than its work it took.
 

@@ -82,4 +82,4 @@ def _fit(sizes: Array, seconds: Array) -> _Fit:
     free = len(seconds) - int(rank)
     rest = seconds - rows @ found
     spread_s = math.sqrt(float(rest @ rest) / free) if free > 0 else None
-    return _Fit(lowest, span, mean, found[1:], float(found[0]), spread_s)
+    return _Fit(lowest, span, mean, slopes=found[1:], intercept=float(found[0]), spread_s=spread_s)
