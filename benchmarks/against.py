@@ -51,7 +51,9 @@ class Case:
         """The scenario file."""
         path = find_scenario(self.scenario)
         text = re.sub(
-            r'(?m)^map = "(.*)"$', lambda found: f'map = "{(path.parent / found[1]).resolve()}"', path.read_text()
+            r'(?m)^map = "(.*)"$',
+            lambda found: f'map = "{(path.parent / found[1]).resolve()}"',
+            path.read_text(),
         )
         if self.bandwidth_mbps is not None:
             text = re.sub(r"(?m)^bandwidth_mbps = .*$", f"bandwidth_mbps = {self.bandwidth_mbps:g}", text)

@@ -135,7 +135,7 @@ class Heartbeat:
         return self._unheard_s(now_s) > max(SILENT_S, self._limit_s)
 
     def _come_back(self, now_s: float) -> None:
-        """A site that is silent again before anything was measured is on a slow link: that is measured then."""
+        """A link that is silent again before anything was measured is slow, and is measured as it is."""
         if self._measured and self._silent(now_s):
             self._back_s, self._measured = now_s, False
 
