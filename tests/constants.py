@@ -91,10 +91,10 @@ def _reason(statement: ast.stmt, following: ast.stmt | None, comments: dict[int,
     """The comment in the lines of a statement, or above it; or the docstring below it."""
     last = statement.end_lineno or statement.lineno
     said = [comments[line][0] for line in range(statement.lineno, last + 1) if line in comments]
-    above = statement.lineno - 1
-    while not said and comments.get(above, ("", False))[1]:
-        said.insert(0, comments[above][0])
-        above -= 1
+    first = statement.lineno
+    while comments.get(first - 1, ("", False))[1]:
+        first -= 1
+    said = said or [comments[line][0] for line in range(first, statement.lineno)]
     if not said and isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant):
         said = [str(following.value.value)]
     return " ".join(said)

@@ -19,6 +19,7 @@ from offboard.loadgen.scenario.pass_fail_check import Check, check_computable
 from offboard.loadgen.scenario.random_faults import Chaos
 from offboard.loadgen.testbed.cpu_quota import CPUS_MAX, CPUS_MIN
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN
+from offboard.robot_client import policies
 from offboard.robot_client.simulated.config import CallConfig, DriveConfig, RobotConfig
 from offboard.robot_client.simulated.workload import ARRIVALS
 
@@ -104,7 +105,7 @@ class RobotPart:
     """`[robot]`: how each robot decides, and its CPU quota."""
 
     cpus: float = setting(0.2, "CPU quota, in CPUs", minimum=CPUS_MIN, maximum=CPUS_MAX)
-    policy: str = setting("paper", f"policy that chooses the site: {rivals.POLICY_HELP}")
+    policy: str = setting(policies.ALIAS, f"policy that chooses the site: {rivals.POLICY_HELP}")
     predictor: str | None = setting(
         None, f"predictor, if not the one that the policy brings: {rivals.PREDICTOR_HELP}"
     )

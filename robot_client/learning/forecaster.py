@@ -27,9 +27,9 @@ class Forecaster:
         """The forecast of one task on these sites, behind all runs that are under way."""
         amount, outlooks = memory.amount(task.size), {}
         for site in sites:
-            in_flight = self._flights.count(site)
-            condition = self._behind(site, in_flight, now_s) if memory.site(site).measured else UNMEASURED
-            outlooks[site] = memory.site(site).outlook(
+            known, in_flight = memory.site(site), self._flights.count(site)
+            condition = self._behind(site, in_flight, now_s) if known.measured else UNMEASURED
+            outlooks[site] = known.outlook(
                 amount,
                 condition,
                 in_flight=in_flight,
@@ -47,8 +47,9 @@ class Forecaster:
         """
         amount, outlooks = memory.amount(task.size), {}
         for site, count in own.items():
-            condition = self._apart_from(site, count) if memory.site(site).measured else UNMEASURED
-            outlooks[site] = memory.site(site).outlook(
+            known = memory.site(site)
+            condition = self._apart_from(site, count) if known.measured else UNMEASURED
+            outlooks[site] = known.outlook(
                 amount,
                 condition,
                 in_flight=count,

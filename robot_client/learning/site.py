@@ -154,7 +154,7 @@ class SiteMemory:
         predicted time says nothing to that model, and a run that failed while the site is `silent` says
         nothing to any. With `beside`, the robot ran the same task itself.
         """
-        expected_s = outlook.predicted_s if outlook else None
+        expected_s, ok = outlook.predicted_s if outlook else None, execution.ok
         overtaken = isinstance(execution.failure, Overtaken)
         if overtaken and execution.seconds <= (expected_s or 0.0):
             return  # stopped before its predicted time: the site may be as fast as predicted
@@ -162,8 +162,8 @@ class SiteMemory:
         if isinstance(execution.failure, TaskError):
             return
         if not overtaken:  # a run that lost a race did not fail
-            self._failures = 0 if execution.ok else self._failures + 1
-        if amount is None or (not execution.ok and not self._is_longer(execution, expected_s, silent=silent)):
+            self._failures = 0 if ok else self._failures + 1
+        if amount is None or (not ok and not self._is_longer(execution, expected_s, silent=silent)):
             return
         waited_s = self._waited_s(execution, outlook)
         to_interval = not beside and self._tells_of_the_interval(execution, outlook)
@@ -173,7 +173,7 @@ class SiteMemory:
                 amount=amount,
                 work=work,
                 seconds=max(0.0, execution.seconds - waited_s),
-                ok=execution.ok,
+                ok=ok,
                 condition=outlook.condition if outlook else UNMEASURED,
                 predicted_s=expected_s if to_interval else None,
                 waited_s=waited_s,

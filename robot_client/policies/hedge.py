@@ -30,7 +30,7 @@ class WithHedges:
             return decision
         second = cheapest(others)
         after_s = forecast.sites[decision.site].overdue_s(others[second])
-        if after_s is None:
+        if after_s is None or after_s <= 0:  # a line below 0 does not say when a task is late
             return decision
         hedge = Hedge(second, after_s)
         return Decision(decision.site, decision.why, decision.policy, second=hedge)

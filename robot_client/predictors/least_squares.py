@@ -27,7 +27,7 @@ class LeastSquares:
         return self.window.full or self._plane.full
 
     def __len__(self) -> int:
-        return len(self.window) + len(self._plane)
+        return len(self.window) or len(self._plane)
 
     def learn(self, size: Size, seconds: float) -> None:
         if isinstance(size, tuple):

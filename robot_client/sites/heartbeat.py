@@ -56,7 +56,8 @@ class Heartbeat:
         self._heard_s = -float("inf")
         self._recent: deque[float] = deque(maxlen=LEAST_OF)
         self._smooth_s = self._varies_s = 0.0
-        self._back_s = -float("inf")  # when the site was last heard again
+        self._back_s = -float("inf")  # when a silence ended
+        self._measured = False  # whether a heartbeat that was sent after that has been answered
         self._report = ServerReport()
         self._usual = self._condition()  # the condition while no heartbeat is unanswered
 
@@ -97,6 +98,7 @@ class Heartbeat:
             self._vary(now_s - sent_s)
             self._recent.append(now_s - sent_s)
             self._round_trip_s = min(self._recent)
+            self._measured = True
         self.hear(now_s, report)
 
     def hear(self, now_s: float, report: ServerReport) -> None:
@@ -133,8 +135,9 @@ class Heartbeat:
         return self._unheard_s(now_s) > max(SILENT_S, self._limit_s)
 
     def _come_back(self, now_s: float) -> None:
-        if self._silent(now_s):
-            self._back_s = now_s
+        """A link that is silent again before anything was measured is slow, and is measured as it is."""
+        if self._measured and self._silent(now_s):
+            self._back_s, self._measured = now_s, False
 
     def _vary(self, round_trip_s: float) -> None:
         """Learn how much round trips vary (RFC 6298): a link that is always slow is not silent."""

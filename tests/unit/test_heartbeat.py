@@ -149,20 +149,22 @@ def test_on_a_slow_link_silence_begins_later() -> None:
     assert heartbeat.condition(at_s + 3.0).silent
 
 
-def test_a_link_that_is_always_slow_is_not_silent() -> None:
-    """A site whose answers all take one second is never silent."""
+@pytest.mark.parametrize("slow_from_s", [0.0, 20.0])
+def test_a_link_that_stays_slow_is_not_silent(slow_from_s: float) -> None:
+    """A site whose answers all take one second is not silent, at once or 10 s after its link became slow."""
     heartbeat, out = Heartbeat(EVERY_S, seed=1), list[tuple[float, int]]()
     heartbeat.start(0.0)
     silent, asked = 0, 0
-    for step in range(4_000):
+    for step in range(6_000):
         now_s = step * 0.01
         while out and out[0][0] <= now_s:
             heartbeat.answer(out.pop(0)[1], now_s, IDLE)
         if heartbeat.due_s <= now_s:
-            out.append((now_s + 1.0, heartbeat.beat(now_s)))
-        if now_s > 5.0:
+            out.append((now_s + (TRIP_S if now_s < slow_from_s else 1.0), heartbeat.beat(now_s)))
+        if now_s > slow_from_s + 10.0:
             asked, silent = asked + 1, silent + heartbeat.condition(now_s).silent
     assert silent == 0, f"{silent} of {asked}"
+    assert heartbeat.condition(60.0).round_trip_s == pytest.approx(1.0)
 
 
 def test_unanswered_heartbeats_are_bounded() -> None:

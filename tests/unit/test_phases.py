@@ -289,7 +289,8 @@ FAULTS: list[Callable[[Random], Run]] = [
 
 
 @pytest.mark.parametrize(
-    "policy", ["hedge:probe:greedy", "probe:hedge:paper-with-heartbeats", "budget:hedge:greedy", "paper"]
+    "policy",
+    ["hedge:probe:greedy", "hedge:probe:paper-with-heartbeats", "budget:hedge:probe:greedy", "paper"],
 )
 @pytest.mark.parametrize("seed", [1, 2])
 def test_no_answer_is_lost_among_random_faults(policy: str, seed: int) -> None:

@@ -65,7 +65,8 @@ def test_the_checks_of_a_scenario_hold_in_simulation(name: str) -> None:
         verdicts = [one.judge(run) for one in played.checks if one.figure not in REAL]
         print(f"{name} with {policy}:", *verdicts, sep="\n  ")
         failed[policy] = [str(one) for one in verdicts if not one.holds]
-        assert [one.i for one in run.answered if one.robot == "robot"] == list(range(played.workload.tasks))
+        answered = sorted(one.i for one in run.answered if one.robot == "robot")  # not in order in a burst
+        assert answered == list(range(played.workload.tasks))
         over = FIGURES["time_over_oracle"].compute(run)
         assert played.workload.arrivals != "closed" or 0.95 < (over or 0.0) < 3, (policy, over)
     assert failed["default"] == []

@@ -69,7 +69,7 @@ def call(number: int) -> Task:
 @pytest.fixture
 def runner(monkeypatch: pytest.MonkeyPatch) -> Iterator[OnboardRunner]:
     bench.__init__()  # type: ignore[misc]
-    clock = SimpleNamespace(perf_counter=lambda: bench.now_s)
+    clock = SimpleNamespace(perf_counter=lambda: bench.now_s, process_time=lambda: 0.0)
     monkeypatch.setattr(onboard, "time", clock)
     monkeypatch.setattr(task_states, "time", clock)
     one = OnboardRunner()

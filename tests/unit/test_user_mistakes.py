@@ -173,7 +173,7 @@ at_most = 1
             "policy 'camera.Such': module 'camera' has no class 'Such'",
         ),
         (
-            ["robot_client", "drive", "--map", "open.map", "--radius", "0", "--policy", "camera.Such"],
+            ["robot_client", "drive", "--map", "open.map", "--obstacles", "0", "--policy", "camera.Such"],
             "policy 'camera.Such': module 'camera' has no class 'Such'",
         ),
         (["loadgen", "run", "odd.toml"], "odd.toml:4: unknown key 'taks'; did you mean 'tasks'?"),
