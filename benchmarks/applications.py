@@ -6,7 +6,6 @@
 import json
 import os
 import shlex
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from offboard.common.config import check, flag_of, resolve, setting, settings_of
 from offboard.common.errors import ConfigError
 from offboard.common.toml_file import unknown
 from offboard.loadgen.compare.compare_settings import SEEDS_MAX
+from offboard.loadgen.play.measure_dataset import commit_here
 from offboard.loadgen.play.run_files import SUMMARY
 from offboard.loadgen.table.measured_rows import write_whole
 
@@ -124,9 +124,10 @@ def notes(runs: Sequence[Planned], found: Mapping[str, Sequence[str]], command: 
     )
     days = " to ".join(dict.fromkeys(f"{day.day} {day:%B %Y}" for day in (began[0], began[-1])))
     spread = " to ".join(dict.fromkeys(str(seed) for seed in (seeds[0], seeds[-1])))
+    commit = commit_here() or "unknown"
     counts = ", ".join(f"{len(texts)} {what}" for what, texts in found.items())
     lines = [
-        f"Measured on {days} at commit {commit()}, on {processor()} with {os.cpu_count()} cores.",
+        f"Measured on {days} at commit {commit}, on {processor()} with {os.cpu_count()} cores.",
         f"Seed{'s' if len(seeds) > 1 else ''} {spread}, {max(tasks)} tasks in each run: `{command}`.",
         f"Of {sum(tasks):,} answers: {counts}.",
     ]
@@ -143,22 +144,6 @@ def command(names: Sequence[str], config: ApplicationsConfig) -> str:
         if value != one.default:
             words += [f"--{flag_of(one)}", ",".join(value) if isinstance(value, tuple) else str(value)]
     return shlex.join(words)
-
-
-def commit() -> str:
-    """The commit of the checkout, and whether files differ from it."""
-    try:
-        return (
-            f"{_git('rev-parse', '--short', 'HEAD')}{' + changes' if _git('status', '--porcelain') else ''}"
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-
-
-def _git(*command: str) -> str:
-    folder = Path(__file__).parent
-    done = subprocess.run(["git", *command], cwd=folder, capture_output=True, text=True, check=True)
-    return done.stdout.strip()
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ def run_dataset(name: str, config: DatasetConfig, command: Sequence[str]) -> int
     )
     check_calls(scenario, path)
     run = config.run / scenario.name
-    started_at, commit = datetime.now(UTC), _commit()
+    started_at, commit = datetime.now(UTC), commit_here()
     play(scenario, run, config.testbed).check_robots()
     rows, disturbed = read_noted(run / TRACE), disturbance(run / TRACE)
     about = {
@@ -124,7 +124,7 @@ def _cpu_model() -> str:
     return next(models, platform.machine())
 
 
-def _commit() -> str | None:
+def commit_here() -> str | None:
     """The commit of the checkout in the current folder, marked `-dirty` if files were changed."""
     return _output_of(("git", "describe", "--always", "--dirty", "--abbrev=12"))
 

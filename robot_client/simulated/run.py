@@ -106,7 +106,7 @@ class Run:
                 self._run_closed()
             else:
                 self._run_open()
-        except BaseException:
+        except BaseException:  # after Ctrl-C, too, the user sees what was done; nothing is swallowed
             if self._noted:
                 self._say_summary()
             raise

@@ -14,13 +14,8 @@ from offboard.robot_client import policies
 from tests.breaks import BREAKS, bed_with
 from tests.chaos.plays import ALL, BROKEN, LEAK_TASKS, SCENARIOS, WRONG, skip_if_unplayable
 
-APPLICATIONS = (
-    "apriltags",
-    "registration",
-    "signs",
-    "pose-graph",
-    "arm",
-)  # their answers are compared within a tolerance
+# Their answers are compared within a tolerance.
+APPLICATIONS = ("apriltags", "registration", "signs", "pose-graph", "arm")
 SLOWER = 0.5  # CPU share of a robot that plans onboard: on a fast machine that policy might not fail
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
