@@ -28,10 +28,11 @@ from offboard.loadgen.table.measured_rows import Column
 HERE = Path(__file__).parents[1]
 RUN_S_MAX = 1800.0
 FROM_TASK = 20  # before it, both sites run most tasks
-BEFORE, AFTER = "before", "after"
+BEFORE, AGAIN, AFTER = "before", "again", "after"
 CONSTANTS = ("onboard", "cloud")
 STRATEGIES = {  # what a line of the table shows: a checkout and a policy
     BEFORE: (BEFORE, "default"),
+    AGAIN: (BEFORE, "default"),  # how much the figures move by themselves
     AFTER: (AFTER, "default"),
     "paper": (AFTER, "paper"),
     **{site: (AFTER, site) for site in CONSTANTS},
