@@ -4,6 +4,7 @@
 """
 
 import threading
+from collections.abc import Callable
 
 from offboard.common.host.load import EVERY_S, HURRIED_S, Load
 
@@ -14,12 +15,15 @@ class LoadWatch:
     A process that asks for its CPU time may have to wait for its quota at that moment. The thread that
     decides where a task runs must therefore not be the one that asks.
 
-    `every_s`: the usual time between two readings.
+    `every_s`: the usual time between two readings. `pause_s`: turns it into the time before the next one.
     """
 
-    def __init__(self, load: Load, every_s: float = EVERY_S) -> None:
+    def __init__(
+        self, load: Load, every_s: float = EVERY_S, pause_s: Callable[[float], float] = float
+    ) -> None:
         self._load = load
         self._every_s = every_s
+        self._pause_s = pause_s
         self._latest = (0.0, 1.0)
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="load", daemon=True)
@@ -47,7 +51,7 @@ class LoadWatch:
         self._closed.set()
 
     def _run(self) -> None:
-        while not self._closed.wait(self._every_s):
+        while not self._closed.wait(self._pause_s(self._every_s)):
             with self._reading:
                 self._read()
 

@@ -48,7 +48,7 @@ class CloudRunner:
     The site is available for a kind once the server has answered `hello` on the present connection with
     the same protocol version and the same source for that kind.
 
-    heartbeat_s: seconds between heartbeats; 0: none are sent, and only tasks are measured.
+    heartbeat: sends heartbeats; None: none are sent, and only tasks are measured.
     keys: encrypt the connection, and connect only to the server of this key.
     """
 
@@ -57,14 +57,13 @@ class CloudRunner:
         endpoint: str,
         *,
         site: str = CLOUD,
-        heartbeat_s: float = 0.0,
-        seed: int = 0,
+        heartbeat: Heartbeat | None = None,
         keys: RobotKeys | None = None,
     ) -> None:
         check_endpoint(site, endpoint)
         self.site = site
         self._connection = Connection(site, endpoint)
-        self._heartbeat = Heartbeat(heartbeat_s, seed)
+        self._heartbeat = heartbeat or Heartbeat(0.0)
         self._heartbeat_wanted = False  # by `hurry`
         self._remote: dict[str, str] = {}  # source hashes at the server, by kind
         self._message_bytes_max = MESSAGE_BYTES_MAX  # what the server takes, once it has said so

@@ -8,6 +8,7 @@ from collections import deque
 from random import Random
 from typing import NamedTuple
 
+from offboard.robot_client.sites.background import Background
 from offboard.robot_client.sites.runner import Condition
 
 EVERY_S = 0.5  # between two heartbeats: an outage is noticed at most this much later
@@ -33,10 +34,12 @@ class Heartbeat:
     """Times the heartbeats of one connection, and measures it.
 
     every_s: usual pause; 0: no heartbeat is sent, and nothing is measured.
+    background: makes pauses longer on a loaded robot.
     """
 
-    def __init__(self, every_s: float, seed: int = 0) -> None:
+    def __init__(self, every_s: float, seed: int = 0, background: Background | None = None) -> None:
         self._every_s = every_s
+        self._background = background or Background()
         self._random = Random(seed)
         self._next_id = 0
         self._round_trip_s: float | None = None
@@ -76,7 +79,7 @@ class Heartbeat:
         self._next_id += 1
         self._sent[self._next_id] = now_s
         self._oldest_s = min(self._oldest_s, now_s)
-        pause_s = self._every_s * (1 + JITTER * self._random.uniform(-1, 1))
+        pause_s = self._background.pause_s(self._every_s) * (1 + JITTER * self._random.uniform(-1, 1))
         if len(self._sent) > UNANSWERED_MAX:
             del self._sent[next(iter(self._sent))]
         self.due_s = now_s + pause_s

@@ -9,7 +9,9 @@ from pathlib import Path
 from offboard.common.errors import ConfigError
 from offboard.common.security.keys import robot_keys
 from offboard.common.task_states import TaskStates
+from offboard.robot_client.sites.background import Background
 from offboard.robot_client.sites.cloud import CloudRunner
+from offboard.robot_client.sites.heartbeat import Heartbeat
 from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import Runner
 
@@ -29,11 +31,13 @@ def make_runners(
     `states`: those of the onboard worker (None: states of its own).
     """
     runners: list[Runner] = []
+    background = Background()
     try:
         for site, endpoint in servers.items():
             own = None if keys is None else robot_keys(Path(keys), site)
-            runners.append(CloudRunner(endpoint, site=site, heartbeat_s=heartbeat_s, seed=seed, keys=own))
-        runners.append(OnboardRunner(states=states))
+            heartbeat = Heartbeat(heartbeat_s, seed, background)
+            runners.append(CloudRunner(endpoint, site=site, heartbeat=heartbeat, keys=own))
+        runners.append(OnboardRunner(states=states, background=background))
     except ConfigError:
         for runner in runners:
             runner.close()

@@ -15,13 +15,14 @@ from typing import Any
 from offboard.common.errors import OffloadError, Overtaken, TaskFailed, Unwanted, describe
 from offboard.common.host import cpu_time
 from offboard.common.host.cgroup import SELF
-from offboard.common.host.load import Load
+from offboard.common.host.load import LOADED, Load
 from offboard.common.host.load_watch import LoadWatch
 from offboard.common.task_states import TaskStates
 from offboard.common.tasks import Kind, Task
 from offboard.common.threads import join_all
 from offboard.common.tracebacks import traceback_of
 from offboard.common.wanted import call_while
+from offboard.robot_client.sites.background import Background
 from offboard.robot_client.sites.runner import ONBOARD, Condition, Execution
 
 ABANDONED_MAX = 4  # cancelled runs that go on at the same time
@@ -75,7 +76,9 @@ class OnboardRunner:
 
     site = ONBOARD
 
-    def __init__(self, workers: int = 1, *, states: TaskStates | None = None) -> None:
+    def __init__(
+        self, workers: int = 1, *, states: TaskStates | None = None, background: Background | None = None
+    ) -> None:
         self._workers = workers
         self._queue: SimpleQueue[_Run | None] = SimpleQueue()
         self._runs: dict[int, _Run] = {}  # those that have not ended, by task id
@@ -86,7 +89,8 @@ class OnboardRunner:
         self._preparing: dict[str, Future[None]] = {}  # by kind
         self._closed = False
         self._lock = threading.Lock()
-        self._load = LoadWatch(Load(SELF))
+        self._background = background or Background()
+        self._load = LoadWatch(Load(SELF), pause_s=self._background.pause_s)
         self._condition = Condition()
 
     def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - onboard always exists
@@ -142,6 +146,7 @@ class OnboardRunner:
 
     def condition(self) -> Condition:
         found, (load, capacity) = self._condition, self._load.latest()
+        self._background.loaded = load > LOADED
         if found.load != load or found.capacity != capacity:
             found = self._condition = Condition(load=load, capacity=capacity)
         return found
