@@ -14,12 +14,11 @@ from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.forecast import Outlook
 from offboard.robot_client.policies.objectives import Expected, Objective
 from offboard.robot_client.predictors import Prediction, Predictor
+from offboard.robot_client.predictors.base import REMEMBERED
 from offboard.robot_client.predictors.least_squares import LeastSquares
 from offboard.robot_client.predictors.line import RunningMean
 from offboard.robot_client.predictors.parts import Parts
 from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Execution
-
-OBSERVATIONS_MAX = 200  # of one site, kept for `store`
 
 
 @dataclass(slots=True)
@@ -72,7 +71,7 @@ class SiteMemory:
         # Like `age`, but for this process only: recalled times are old enough for a probe, but as certain as
         # they were.
         self.tasks_since = 0
-        self.observations: deque[Observation] = deque(maxlen=OBSERVATIONS_MAX)
+        self.observations: deque[Observation] = deque(maxlen=REMEMBERED)
         self.measured = measured
         self._parts = predictor if isinstance(predictor, Parts) else None
         if self._parts is not None:
@@ -146,19 +145,21 @@ class SiteMemory:
         size: Size,
         work: float | None = None,
         beside: bool = False,
+        ahead: int | None = None,
     ) -> None:
         """Learn from an execution; `outlook` is what was expected of it, and `amount` what it was asked for.
 
         A failed run is learned as the time until it was given up: the one addition to Algorithm 1. For the
         parts model such a time only means that the true time is longer. A run that failed before its
         predicted time says nothing to that model, and a run that failed while the site is `silent` says
-        nothing to any. With `beside`, the robot ran the same task itself.
+        nothing to any. With `beside`, the robot ran the same task itself. `ahead`: what `count_run` said, if
+        the run was counted before.
         """
         expected_s, ok = outlook.predicted_s if outlook else None, execution.ok
         overtaken = isinstance(execution.failure, Overtaken)
         if overtaken and execution.seconds <= (expected_s or 0.0):
             return  # stopped before its predicted time: the site may be as fast as predicted
-        ahead = self.count_run()
+        ahead = self.count_run() if ahead is None else ahead
         if isinstance(execution.failure, TaskError):
             return
         if not overtaken:  # a run that lost a race did not fail

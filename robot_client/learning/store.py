@@ -21,11 +21,11 @@ from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.memory_file import PER_SIZE, PER_WORK, KeptKind, KeptSite, Unreadable
 from offboard.robot_client.learning.site import Observation
 from offboard.robot_client.policies.probe import PROBE_EVERY
+from offboard.robot_client.predictors.base import WARM_UP
 
 SAVE_EVERY_S = 30.0  # while tasks run; the file is also saved at the end
 WRITE_WAIT_S = 5.0  # that the end of the process waits for a slow disk
 HALF_LIFE_S = 3600.0  # without the process: after this time, half as many observations are recalled
-OBSERVATIONS_MIN = 5  # of a site; with fewer, the site starts cold
 FILE_BYTES_MAX = 64 * 1024 * 1024  # of a memory file, so that a wrong file does not fill the memory
 
 log = logging.getLogger(__name__)
@@ -123,7 +123,7 @@ class Store:
         """The newest observations of a site: half as many for each HALF_LIFE_S since they were saved."""
         away_s = max(0.0, self._now() - site.saved_at)  # the clock may have been set back
         count = math.ceil(len(site.observations) * 2 ** (-away_s / HALF_LIFE_S))
-        return site.observations[-count:] if count >= OBSERVATIONS_MIN else ()
+        return site.observations[-count:] if count >= WARM_UP else ()
 
     def _write(self, kinds: Mapping[str, KeptKind]) -> None:
         try:

@@ -14,7 +14,7 @@ from offboard.common.tasks import Size
 from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition
 
 ERRORS_MIN = 10  # with fewer errors, only the spread says how far a prediction may be off
-LATE_SPREADS = 2.0  # with fewer errors, a task is late this many spreads after its predicted time
+SPREADS_90 = 1.645  # standard deviations on each side that hold 90 % of the times, and above which 5 % are
 TAIL_SHARE = 0.2  # of the errors, the largest ones: they say how much longer a late task may take
 BEYOND = 0.25  # of the distance from the median to the largest error: later than that, no task has ended
 
@@ -118,7 +118,7 @@ class Outlook(NamedTuple):
         after_s = self.errors.overdue(self.predicted_s, worth_s)
         if after_s is not None:
             return after_s
-        return None if self.spread_s is None else self.predicted_s + LATE_SPREADS * self.spread_s
+        return None if self.spread_s is None else self.predicted_s + SPREADS_90 * self.spread_s
 
 
 class Forecast(NamedTuple):

@@ -7,11 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from offboard.common.errors import ConfigError
-from offboard.robot_client.policies.forecast import PredictionErrors
-
-SPREADS_90 = (
-    1.645  # standard deviations on each side that hold 90 %; 95 % of the times are below the upper end
-)
+from offboard.robot_client.policies.forecast import SPREADS_90, PredictionErrors
 
 
 class Expected(NamedTuple):

@@ -17,8 +17,8 @@ SECONDS_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0,
 
 REGRET = {
     "": "Mean seconds per task that the better site would have saved",
-    "_low": "Lower end of the 95 % interval of robot_regret_seconds",
-    "_high": "Upper end of the 95 % interval of robot_regret_seconds",
+    "_low": "Lower end of the 90 % interval of robot_regret_seconds",
+    "_high": "Upper end of the 90 % interval of robot_regret_seconds",
 }
 
 log = logging.getLogger(__name__)
