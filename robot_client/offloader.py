@@ -214,8 +214,6 @@ class Offloader:
         """Close all runners, trace and metrics, and save what was learnt. Safe to call twice."""
         with self._lock:
             first, self._closed = not self._closed, True
-            if first:
-                self._learner.catch_up()
             last = self._memories.snapshot() if first else None
         for runner in self._runners.values():
             runner.close()
@@ -264,7 +262,6 @@ class Offloader:
         with self._lock:
             self._learn(pending, executions)
             if not self._closed and self._memories.due(self._clock.now_s()):
-                self._learner.catch_up()
                 self._memories.save_soon()
             late, regret = tuple(self._late), self._learner.regret.estimate()
             self._late.clear()
@@ -346,7 +343,6 @@ class Offloader:
             begun=partial(self._begun, pending),
             allowed=self._take_duplicate,
             late=partial(self._ended_late, pending),
-            idle=self._catch_up,
         )
         first: tuple[str, ...] = (decision.site,)
         if decision.both:
@@ -359,11 +355,6 @@ class Offloader:
             with self._lock:
                 self._flights.end_all(pending.task.id)
             raise
-
-    def _catch_up(self) -> None:
-        with self._lock:
-            if not self._closed:
-                self._learner.catch_up()
 
     def _begun(self, pending: PendingTask, site: str) -> None:
         outlook = pending.forecast.sites.get(site)

@@ -37,7 +37,6 @@ class Race:
     `begun`: called with every site that starts.
     `allowed`: asked before a second run starts. A fallback, which replaces failed runs, is always allowed.
     `late`: called in any thread when a run ends after the task was answered.
-    `idle`: called once, after the first sites have started.
     """
 
     def __init__(
@@ -50,7 +49,6 @@ class Race:
         begun: Callable[[str], None],
         allowed: Callable[[], bool],
         late: Callable[[str, Execution], None],
-        idle: Callable[[], None],
     ) -> None:
         self._task = task
         self._runners = runners
@@ -59,14 +57,12 @@ class Race:
         self._begun = begun
         self._allowed = allowed
         self._late = late
-        self._idle = idle
         self._runs: dict[str, tuple[Future[Execution], float]] = {}  # with its start time
 
     def run(self, plan: Plan) -> tuple[Execution, ...]:
         """All executions in the order of their start; runs that are still under way count as overtaken."""
         for site in plan.first:
             self._start(site)
-        self._idle()
         if plan.all:
             self._wait_for_all()
         else:

@@ -1,7 +1,6 @@
-"""What executions teach the memories, and when: surprises at once, an expected time during the next task.
+"""What executions teach the memories, and when: those that have ended at once, the others when they end.
 
-With a tenth of a CPU, every computation between an answer and the next request takes ten times as long. The
-time that was expected would hardly change the next decision. What is learned of one site is in `site`.
+What is learned of one site is in `site`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,50 +38,23 @@ class Learner:
         self.regret = RegretEstimate()
         self._runners = runners
         self._allowance = allowance
-        self._expected: tuple[PendingTask, Execution, float | None, int] | None = None
 
     def learn(self, pending: PendingTask, executions: Sequence[Execution]) -> None:
-        """Learn what had ended when the task was answered; an expected time waits for `catch_up`."""
-        self.catch_up()
+        """Learn what had ended when the task was answered."""
         ended = [one for one in executions if not isinstance(one.failure, Overtaken)]
         work = pending.memory.work_of_any(ended)
         pending.memory.count_task()
-        for execution in ended:
-            self._spend(pending, execution)
-        if len(executions) == 1 and _as_expected(pending, ended[0]):
-            ahead = pending.memory.site(ended[0].site).count_run()
-            self._expected = pending, ended[0].without_value(), work, ahead
-        else:
-            self._learn(pending, ended, work)
-
-    def learn_late(self, pending: PendingTask, execution: Execution) -> None:
-        """Learn a run that ended after another site had answered."""
-        self.catch_up()
-        self._spend(pending, execution)
-        self._learn_one(pending, execution, pending.memory.work_of(execution))
-
-    def catch_up(self) -> None:
-        """Learn the expected time that waits, if one does."""
-        if self._expected is not None:
-            pending, execution, work, ahead = self._expected
-            self._expected = None
-            self._learn(pending, [execution], work, ahead)
-
-    def _learn(
-        self,
-        pending: PendingTask,
-        ended: Sequence[Execution],
-        work: float | None,
-        ahead: int | None = None,
-    ) -> None:
         if work is not None:
             pending.memory.learn_size(pending.task.size, work)
         for execution in ended:
-            self._learn_one(pending, execution, work, ahead)
+            self._learn_one(pending, execution, work)
 
-    def _learn_one(
-        self, pending: PendingTask, execution: Execution, work: float | None, ahead: int | None = None
-    ) -> None:
+    def learn_late(self, pending: PendingTask, execution: Execution) -> None:
+        """Learn a run that ended after another site had answered."""
+        self._learn_one(pending, execution, pending.memory.work_of(execution))
+
+    def _learn_one(self, pending: PendingTask, execution: Execution, work: float | None) -> None:
+        self._spend(pending, execution)
         site, decision = execution.site, pending.decision
         memory = pending.memory.site(site)
         second_here = decision.second is not None and decision.second.site == site
@@ -94,7 +66,6 @@ class Learner:
             size=pending.task.size,
             work=work,
             beside=site != ONBOARD and decision.site == ONBOARD and (decision.both or second_here),
-            ahead=ahead,
         )
         if execution.ok and isinstance(decision.second, Probe):
             pending.seconds[site] = execution.seconds
@@ -111,20 +82,3 @@ class Learner:
             site = execution.site
             moved = 0 if site == ONBOARD else execution.bytes_out + execution.bytes_in
             self._allowance.spend(moved, pending.memory.site(site).joules(execution))
-
-
-def _as_expected(pending: PendingTask, execution: Execution) -> bool:
-    """Whether the time of a known site was inside its interval.
-
-    The windows of the published rule hold each time before the next task.
-    """
-    outlook = pending.forecast.sites.get(execution.site)
-    return (
-        execution.ok
-        and outlook is not None
-        and outlook.full
-        and outlook.low_s is not None
-        and outlook.high_s is not None
-        and outlook.low_s <= execution.seconds <= outlook.high_s
-        and pending.memory.site(execution.site).measured
-    )

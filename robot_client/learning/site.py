@@ -145,21 +145,19 @@ class SiteMemory:
         size: Size,
         work: float | None = None,
         beside: bool = False,
-        ahead: int | None = None,
     ) -> None:
         """Learn from an execution; `outlook` is what was expected of it, and `amount` what it was asked for.
 
         A failed run is learned as the time until it was given up: the one addition to Algorithm 1. For the
         parts model such a time only means that the true time is longer. A run that failed before its
         predicted time says nothing to that model, and a run that failed while the site is `silent` says
-        nothing to any. With `beside`, the robot ran the same task itself. `ahead`: what `count_run` said, if
-        the run was counted before.
+        nothing to any. With `beside`, the robot ran the same task itself.
         """
         expected_s, ok = outlook.predicted_s if outlook else None, execution.ok
         overtaken = isinstance(execution.failure, Overtaken)
         if overtaken and execution.seconds <= (expected_s or 0.0):
             return  # stopped before its predicted time: the site may be as fast as predicted
-        ahead = self.count_run() if ahead is None else ahead
+        ahead = self.count_run()
         if isinstance(execution.failure, TaskError):
             return
         if not overtaken:  # a run that lost a race did not fail

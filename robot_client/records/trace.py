@@ -19,7 +19,7 @@ from offboard.robot_client.records import lines
 from offboard.robot_client.records.lines import VERSION, Lines
 from offboard.robot_client.sites.runner import UNMEASURED, Condition, Execution
 
-WRITE_EVERY_S = 0.2
+WRITE_EVERY_S = 0.5
 WAITING_MAX = 1000  # records in memory; the thread that adds one more writes them all
 
 _FIELDS = (

@@ -26,6 +26,7 @@ from offboard.common.security.keys import RobotKeys
 from offboard.common.tasks import Kind, Task, kinds
 from offboard.common.wire import messages as wire
 from offboard.common.wire.payload import payload_bytes
+from offboard.robot_client.sites.background import Background
 from offboard.robot_client.sites.blob_uploads import BlobUploads
 from offboard.robot_client.sites.cloud_socket import MESSAGE_BYTES_MAX, CloudSocket, SocketEvent
 from offboard.robot_client.sites.connection import Action, Connection, HandshakeFailure
@@ -48,7 +49,7 @@ class CloudRunner:
     The site is available for a kind once the server has answered `hello` on the present connection with
     the same protocol version and the same source for that kind.
 
-    heartbeat: sends heartbeats; None: none are sent, and only tasks are measured.
+    heartbeat_s: seconds between heartbeats; 0: none are sent, and only tasks are measured.
     keys: encrypt the connection, and connect only to the server of this key.
     """
 
@@ -57,13 +58,16 @@ class CloudRunner:
         endpoint: str,
         *,
         site: str = CLOUD,
-        heartbeat: Heartbeat | None = None,
+        heartbeat_s: float = 0.0,
+        seed: int = 0,
         keys: RobotKeys | None = None,
+        background: Background | None = None,
     ) -> None:
         check_endpoint(site, endpoint)
         self.site = site
         self._connection = Connection(site, endpoint)
-        self._heartbeat = heartbeat or Heartbeat(0.0)
+        background = background or Background()
+        self._heartbeat = Heartbeat(heartbeat_s, seed, background)
         self._heartbeat_wanted = False  # by `hurry`
         self._remote: dict[str, str] = {}  # source hashes at the server, by kind
         self._message_bytes_max = MESSAGE_BYTES_MAX  # what the server takes, once it has said so
@@ -76,6 +80,7 @@ class CloudRunner:
             unanswered=self._pending.__len__,
             expects_message=self._expects_message,
             wake=self._wake,
+            pause_s=background.pause_s,
         )
         self._reader_wakes_s: float | None = None  # when a waiting reader wakes by itself; None: none waits
         self._messages = 0

@@ -11,7 +11,6 @@ from offboard.common.security.keys import robot_keys
 from offboard.common.task_states import TaskStates
 from offboard.robot_client.sites.background import Background
 from offboard.robot_client.sites.cloud import CloudRunner
-from offboard.robot_client.sites.heartbeat import Heartbeat
 from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import Runner
 
@@ -35,8 +34,10 @@ def make_runners(
     try:
         for site, endpoint in servers.items():
             own = None if keys is None else robot_keys(Path(keys), site)
-            heartbeat = Heartbeat(heartbeat_s, seed, background)
-            runners.append(CloudRunner(endpoint, site=site, heartbeat=heartbeat, keys=own))
+            server = CloudRunner(
+                endpoint, site=site, heartbeat_s=heartbeat_s, seed=seed, keys=own, background=background
+            )
+            runners.append(server)
         runners.append(OnboardRunner(states=states, background=background))
     except ConfigError:
         for runner in runners:

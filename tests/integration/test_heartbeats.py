@@ -14,7 +14,7 @@ from offboard.common.wire import messages as wire
 from offboard.common.wire.messages import Hello, Message, Ping, Pong, Reply, Request
 from offboard.robot_client.sites import cloud
 from offboard.robot_client.sites.cloud import CloudRunner
-from offboard.robot_client.sites.heartbeat import EVERY_S, Heartbeat
+from offboard.robot_client.sites.heartbeat import EVERY_S
 from offboard.robot_client.sites.shared_reader import LINGER_S
 
 pytestmark = pytest.mark.integration
@@ -69,7 +69,7 @@ def met(heartbeat_s: float) -> Iterator[tuple[CloudRunner, Peer]]:
     with zmq.Context() as context, context.socket(zmq.ROUTER) as socket:
         socket.linger = 0
         peer = Peer(socket)
-        with closing(CloudRunner(peer.endpoint, heartbeat=Heartbeat(heartbeat_s))) as runner:
+        with closing(CloudRunner(peer.endpoint, heartbeat_s=heartbeat_s)) as runner:
             assert isinstance(peer.hear(), Hello)
             peer.say(Hello({kind.name: kind.source_hash for kind in kinds()}, "0", 2**20))
             first = peer.hear()

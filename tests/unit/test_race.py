@@ -55,7 +55,6 @@ class Course:
             begun=lambda site: self.begun.append((site, self.clock.now_s())),
             allowed=lambda: self.allowed,
             late=lambda site, execution: self.late.append((site, execution)),
-            idle=lambda: None,
         )
         return race.run(plan)
 

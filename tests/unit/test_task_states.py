@@ -204,7 +204,6 @@ def test_a_site_that_wins_during_a_setup_leaves_no_time_of_it(runner: OnboardRun
         begun=lambda _: None,
         allowed=lambda: True,
         late=lambda _, execution: late.append(execution),
-        idle=lambda: None,
     )
     executions = race.run(Plan((ONBOARD, CLOUD)))
     assert [one.seconds for one in executions] == [0.0, SETUP_S / 2]
