@@ -9,11 +9,10 @@ from bisect import bisect_left, insort
 from collections import deque
 
 from offboard.robot_client.policies.forecast import ERRORS_MIN, SPREADS_90, PredictionErrors, unit_s
-from offboard.robot_client.predictors.line import RunningMean
+from offboard.robot_client.predictors.line import RATE, RunningMean
 
 COVERAGE = 0.9  # share of the times that an interval should hold
 ERRORS_MAX = 100  # the last ones
-RATE = 0.03  # of the adaptation
 
 
 class Conformal:
