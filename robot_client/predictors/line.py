@@ -14,7 +14,6 @@ ODD = 3.0  # standard deviations: a time farther from the line is an outlier
 RATE = 0.05  # of the running means, once there are enough times
 TAIL_MAX = 2.0  # usual times: a longer outlier counts as this much in the mean of the outliers
 SLOPES = 4.0  # times the expected slope: so uncertain is the first one
-RATE_AFTER = 4  # further times that the running means seem to have seen at the start
 
 
 class Line:
@@ -60,7 +59,7 @@ class Line:
         if self.count == 1:
             self._begin(x, y, known)
             return
-        rate = max(RATE, 1.0 / (self.count + RATE_AFTER))
+        rate = max(RATE, 1.0 / self.count)
         error = y - self.a - self.b * x
         unit = 0.5 * (max(0.0, self.a + self.b * x + known) + self._usual) or 1.0
         self._usual += rate * (min(y + known, ODD * self._usual) - self._usual)
