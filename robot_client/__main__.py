@@ -16,17 +16,17 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 from offboard.common.command_line import Command, CommandParser, add_flags, load, run_commands
 from offboard.common.config import as_dict, resolve
 from offboard.common.errors import ConfigError, OffloadError
+from offboard.loadgen.robot.config import CallConfig, DriveConfig, RobotConfig
 from offboard.robot_client.settings import Settings
-from offboard.robot_client.simulated.config import CallConfig, DriveConfig, RobotConfig
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, check_endpoint
 
 if TYPE_CHECKING:
     from offboard.common.task_states import TaskStates
+    from offboard.loadgen.robot.answers import Answers
+    from offboard.loadgen.robot.work import Work
     from offboard.robot_client.offloader import Offloader
     from offboard.robot_client.records.lines import Lines
     from offboard.robot_client.records.trace import Record
-    from offboard.robot_client.simulated.answers import Answers
-    from offboard.robot_client.simulated.work import Work
 
 C = TypeVar("C", bound=RobotConfig)
 Observer = Callable[["Record"], None]
@@ -104,10 +104,10 @@ def _run(config: RobotConfig) -> int:
     """Run the tasks, then measure those of --alone."""
     # These are imported after the flags are read, so that --help compiles nothing.
     from offboard.common.task_states import TaskStates
+    from offboard.loadgen.robot.answers import Answers
+    from offboard.loadgen.robot.references import measure_alone
+    from offboard.loadgen.robot.work import make_work
     from offboard.robot_client.records.trace import Trace, alone_path
-    from offboard.robot_client.simulated.answers import Answers
-    from offboard.robot_client.simulated.references import measure_alone
-    from offboard.robot_client.simulated.work import make_work
 
     _find_modules_here()
     answers = Answers(config.answers) if config.answers else None
@@ -147,9 +147,9 @@ def _run_tasks(
     files: "list[Answers | Lines]",
 ) -> None:
     """Run the tasks of `work`, then close `files`, to which the file of --reference is added."""
+    from offboard.loadgen.robot.references import References
+    from offboard.loadgen.robot.run import OwnRecord, Run
     from offboard.robot_client.records.trace import reference_path
-    from offboard.robot_client.simulated.references import References
-    from offboard.robot_client.simulated.run import OwnRecord, Run
 
     own, sites = OwnRecord(), config.sites()
     with ExitStack() as stack:

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
+from offboard.loadgen.robot import answers, references
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.robot_client.policies import PINNED
 from offboard.robot_client.records import trace
-from offboard.robot_client.simulated import answers, references
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]

@@ -42,7 +42,7 @@ FOLDERS: dict[str, set[str]] = {
         "robot_client/sites",
     },
     "robot_client/check": {"robot_client/sites"},
-    "robot_client/simulated": {
+    "loadgen/robot": {
         "robot_client",
         "robot_client/policies",
         "robot_client/predictors",

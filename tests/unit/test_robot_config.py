@@ -9,13 +9,13 @@ import pytest
 
 from offboard.common.command_line import load
 from offboard.common.errors import ConfigError
+from offboard.loadgen.robot.config import CallConfig, DriveConfig, RobotConfig
 from offboard.robot_client import policies
 from offboard.robot_client.policies.allowance import DUPLICATES_MAX
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.objectives import Mean, TimeAndEnergy
 from offboard.robot_client.policies.probe import PROBE_EVERY
 from offboard.robot_client.records import trace
-from offboard.robot_client.simulated.config import CallConfig, DriveConfig, RobotConfig
 
 MAP, TASK = {"map": Path("m.yaml")}, {"task": "m:f", "sizes": ("constant:1",)}
 OPEN = {"arrivals": "poisson", "rate": 5.0}

@@ -10,11 +10,11 @@ import pytest
 from offboard.common.errors import ConfigError, DataError
 from offboard.common.planning.planner import Plan, plan_path, size_of_plan
 from offboard.common.planning.planner_names import PLANNERS
+from offboard.loadgen.robot.answers import cells_of
+from offboard.loadgen.robot.config import CallConfig, DriveConfig
+from offboard.loadgen.robot.work import Work, make_work
 from offboard.loadgen.scenario.hash_tasks import MUCH, RARE, hash_rarely_long, hash_rounds, rounds_on
 from offboard.loadgen.testbed.testbed import PART
-from offboard.robot_client.simulated.answers import cells_of
-from offboard.robot_client.simulated.config import CallConfig, DriveConfig
-from offboard.robot_client.simulated.work import Work, make_work
 from tests import probes
 from tests.mazes import warm
 

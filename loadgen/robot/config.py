@@ -6,10 +6,10 @@ from pathlib import Path
 from offboard.common.config import REQUIRED, check, setting
 from offboard.common.errors import ConfigError
 from offboard.common.planning.planner_names import DIJKSTRA, PLANNERS
-from offboard.robot_client.simulated.decision_settings import DecisionSettings
-from offboard.robot_client.simulated.run_settings import RunSettings
-from offboard.robot_client.simulated.server_settings import ServerSettings
-from offboard.robot_client.simulated.workload import CLOSED, SIZES_ALLOWED, parse_sizes
+from offboard.loadgen.robot.decision_settings import DecisionSettings
+from offboard.loadgen.robot.run_settings import RunSettings
+from offboard.loadgen.robot.server_settings import ServerSettings
+from offboard.loadgen.robot.workload import CLOSED, SIZES_ALLOWED, parse_sizes
 
 PLANS, CALLS = "map and robot", "task"
 
