@@ -45,7 +45,7 @@ class Workload:
     )
     planner: str = setting(DIJKSTRA, "search algorithm", choices=PLANNERS)
     tasks: int = setting(200, "number of tasks of each robot", minimum=1, maximum=AT_TASK_MAX)
-    sizes: tuple[str, ...] = setting((), "input sizes, written as for `robot-client --sizes`")
+    sizes: tuple[str, ...] = setting((), "input sizes, written as for `loadgen call --sizes`")
     arrivals: str = setting("closed", "when the next task is due", choices=ARRIVALS)
     rate: float | None = setting(None, "tasks per second of each robot; not for closed arrivals")
     burst: int = setting(10, "tasks in each burst, if arrivals are bursts", minimum=1)

@@ -178,7 +178,7 @@ def _read_trace(path: Path, kind: str | None, least: int) -> Rows:
     if len(found) < least:
         raise DataError(
             f"{path}: no {kind or 'task'} was answered by both sites; measure some with "
-            "`loadgen run SCENARIO --measure both` or `robot-client drive --measure K`"
+            "`loadgen run SCENARIO --measure both` or `loadgen drive --measure K`"
         )
     _check_one_kind(path, first_lines)
     return _rows(found, left_out)

@@ -1,6 +1,6 @@
 """Disturbance between the sites: how much slower a task is on one site while it also runs on the other one.
 
-It is computed from the trace of `robot-client drive --alone`, in which each plan ran onboard alone, in the
+It is computed from the trace of `loadgen drive --alone`, in which each plan ran onboard alone, in the
 cloud alone, and on both sites at once.
 """
 
@@ -95,7 +95,7 @@ class Disturbance:
 
 
 def measure(path: Path, *, seed: int = SEED) -> Disturbance | None:
-    """The disturbance in a trace of `robot-client drive --alone`.
+    """The disturbance in a trace of `loadgen drive --alone`.
 
     None if no plan succeeded in all three ways.
     """

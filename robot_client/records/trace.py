@@ -138,12 +138,12 @@ class Trace(Lines):
 
 
 def alone_path(path: Path) -> Path:
-    """The trace of the plans that `robot-client drive --alone` measures, next to the trace of the run."""
+    """The trace of the plans that `loadgen drive --alone` measures, next to the trace of the run."""
     return path.with_name(f"{path.stem}.alone.jsonl")
 
 
 def reference_path(path: Path) -> Path:
-    """The lines of `robot-client drive --reference`, next to the trace of the run."""
+    """The lines of `loadgen drive --reference`, next to the trace of the run."""
     return path.with_name(f"{path.stem}.reference.jsonl")
 
 

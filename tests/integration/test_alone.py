@@ -110,7 +110,7 @@ def test_an_absent_cloud_is_a_warning(tmp_path: Path) -> None:
     flags += ["--cloud", nowhere, "--connect", "0.1", "--trace", trace]
     for runs in (1, 2):
         done = subprocess.run(
-            [sys.executable, "-m", "offboard.robot_client", *map(str, flags)],
+            [sys.executable, "-m", "offboard.loadgen", *map(str, flags)],
             capture_output=True,
             text=True,
             timeout=50,

@@ -109,7 +109,7 @@ def test_an_interrupted_run_leaves_nothing_behind(tmp_path: Path, number: signal
 def test_a_killed_robot_fails_the_run(tmp_path: Path) -> None:
     """After kill -9 of the robot: exit code 1, one line that says why, and no process is left."""
     with running_demo(tmp_path) as host:
-        (robot,) = (pid for pid, command in marked_processes().items() if "robot_client" in command)
+        (robot,) = (pid for pid, command in marked_processes().items() if " drive " in command)
         os.kill(robot, signal.SIGKILL)
         assert host.wait(30) == 1
         assert host.stderr.read() == "loadgen run: robot was ended by signal 9\n"

@@ -1,4 +1,4 @@
-"""`robot-client drive` and `call` against a real server: answers, references and open arrivals."""
+"""`loadgen drive` and `call` against a real server: answers, references and open arrivals."""
 
 import signal
 import subprocess
@@ -26,7 +26,7 @@ WAIT_S = 60.0
 
 
 def command(*flags: object) -> list[str]:
-    return [sys.executable, "-m", "offboard.robot_client", *map(str, flags)]
+    return [sys.executable, "-m", "offboard.loadgen", *map(str, flags)]
 
 
 def robot(*flags: object, code: int = 0) -> str:
@@ -111,7 +111,7 @@ def test_an_interrupted_run_keeps_its_answers(testbed: Callable[..., LocalTestbe
         assert time.monotonic() < until
         time.sleep(0.005)
     run.send_signal(signal.SIGINT)
-    assert run.communicate(timeout=WAIT_S)[1] == "robot-client call: interrupted\n"
+    assert run.communicate(timeout=WAIT_S)[1] == "loadgen call: interrupted\n"
     assert run.returncode == 130
     lines, records = list(answers.read(path)), list(trace.read(kept))
     assert len(lines) >= KILL_AFTER
@@ -226,4 +226,4 @@ def test_inputs_that_end_early_end_the_run(inputs: str, code: int, said: str) ->
         command("call", *flags), capture_output=True, text=True, timeout=WAIT_S, cwd=ROOT, check=False
     )
     assert done.returncode == code, done.stderr
-    assert done.stderr == f"robot-client call: {said}\n"
+    assert done.stderr == f"loadgen call: {said}\n"

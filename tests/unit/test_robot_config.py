@@ -1,4 +1,4 @@
-"""The settings of `robot-client drive` and `call`: which go together, and what is made from them."""
+"""The settings of `loadgen drive` and `call`: which go together, and what is made from them."""
 
 import subprocess
 import sys
@@ -163,7 +163,7 @@ def test_a_second_run_starts_with_what_the_first_one_learnt(tmp_path: Path) -> N
     )
     flags = "--task mine:mine --sizes uniform:1:9 --window 5 --memory memory.json --trace trace.jsonl --tasks"
     for tasks in ("8", "1"):
-        command = [sys.executable, "-m", "offboard.robot_client", "call", *flags.split(), tasks]
+        command = [sys.executable, "-m", "offboard.loadgen", "call", *flags.split(), tasks]
         done = subprocess.run(command, capture_output=True, text=True, timeout=30, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
     records = list(trace.read(tmp_path / "trace.jsonl"))
@@ -173,10 +173,10 @@ def test_a_second_run_starts_with_what_the_first_one_learnt(tmp_path: Path) -> N
     command = [
         sys.executable,
         "-m",
-        "offboard.robot_client",
+        "offboard.loadgen",
         "call",
         *flags.replace("memory.json", ".").split(),
         "1",
     ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=30, cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (2, "robot-client call: memory .: is a folder\n")
+    assert (done.returncode, done.stderr) == (2, "loadgen call: memory .: is a folder\n")

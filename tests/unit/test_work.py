@@ -134,7 +134,7 @@ def test_calls_get_whole_sizes() -> None:
 
 
 def test_a_task_with_a_setup_is_called_with_its_size_alone() -> None:
-    """Its first parameter is not for callers, so `robot-client call` takes it as a task of one number."""
+    """Its first parameter is not for callers, so `loadgen call` takes it as a task of one number."""
     assert calls("constant:2", task="tests.stateful_tasks:engine_twice").request() == (2,)
 
 
