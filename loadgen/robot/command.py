@@ -18,9 +18,10 @@ from offboard.loadgen.robot.config import DriveConfig, RobotConfig
 from offboard.loadgen.robot.references import References, measure_alone
 from offboard.loadgen.robot.run import OwnRecord, Run
 from offboard.loadgen.robot.work import Work, make_work
+from offboard.loadgen.robot_files import alone_path, reference_path
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.records.lines import Lines
-from offboard.robot_client.records.trace import Record, Trace, alone_path, reference_path
+from offboard.robot_client.records.trace import Record, Trace
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 

@@ -10,12 +10,12 @@ import pytest
 from offboard.common.command_line import load
 from offboard.common.errors import ConfigError
 from offboard.loadgen.robot.config import CallConfig, DriveConfig, RobotConfig
+from offboard.loadgen.robot_files import read_trace
 from offboard.robot_client import policies
 from offboard.robot_client.policies.allowance import DUPLICATES_MAX
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.objectives import Mean, TimeAndEnergy
 from offboard.robot_client.policies.probe import PROBE_EVERY
-from offboard.robot_client.records import trace
 
 MAP, TASK = {"map": Path("m.yaml")}, {"task": "m:f", "sizes": ("constant:1",)}
 OPEN = {"arrivals": "poisson", "rate": 5.0}
@@ -166,7 +166,7 @@ def test_a_second_run_starts_with_what_the_first_one_learnt(tmp_path: Path) -> N
         command = [sys.executable, "-m", "offboard.loadgen", "call", *flags.split(), tasks]
         done = subprocess.run(command, capture_output=True, text=True, timeout=30, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
-    records = list(trace.read(tmp_path / "trace.jsonl"))
+    records = list(read_trace(tmp_path / "trace.jsonl"))
     assert records[0]["sites"]["onboard"]["predicted_s"] is None
     assert records[8]["sites"]["onboard"]["predicted_s"] is not None
     assert (records[8]["i"], records[8]["sites"]["onboard"]["age"]) == (0, PROBE_EVERY)
