@@ -9,11 +9,11 @@ import json
 import logging
 import os
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from offboard.common.errors import ConfigError, DataError
+from offboard.common.errors import ConfigError
 
 VERSION = 1
 LINE_START = b'{"v":'
@@ -76,38 +76,6 @@ class Lines:
         if kept < self.path.stat().st_size:
             log.warning("%s %s: cut off a torn last line", self._what, self.path)
             os.truncate(self.path, kept)
-
-
-def read(path: Path, names: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """The fields of each line, which must include `names`.
-
-    A torn last line is skipped with a warning. Any other bad line raises DataError.
-    """
-    try:
-        file = path.open("rb")
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror}") from error
-    with file:
-        for number, line in enumerate(file, 1):
-            if not line.endswith(b"\n"):
-                log.warning("%s:%d: torn last line skipped", path, number)
-                return
-            yield _parse(f"{path}:{number}", line, names)
-
-
-def _parse(where: str, line: bytes, names: Sequence[str]) -> dict[str, Any]:
-    try:
-        fields = json.loads(line)
-    except ValueError as error:
-        raise DataError(f"{where}: not a JSON line: {error}") from None
-    if not isinstance(fields, dict):
-        raise DataError(f"{where}: {type(fields).__name__} where an object was expected")
-    if fields.get("v") != VERSION:
-        raise DataError(f"{where}: v = {fields.get('v')!r}; this version reads {VERSION}")
-    missing = [name for name in names if name not in fields]
-    if missing:
-        raise DataError(f"{where}: no field {missing[0]!r}")
-    return fields
 
 
 def _end_of_last_line(path: Path) -> int:

@@ -6,7 +6,7 @@ Writing lines so that they survive a crash is left to `lines`.
 import atexit
 import threading
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,27 +15,12 @@ from typing import Any, Self
 from offboard.common.tasks import Size
 from offboard.robot_client.learning.regret import Regret
 from offboard.robot_client.policies import Decision, Hedge, Outlook
-from offboard.robot_client.records import lines
 from offboard.robot_client.records.lines import VERSION, Lines
 from offboard.robot_client.sites.runner import UNMEASURED, Condition, Execution
 
 WRITE_EVERY_S = 0.5
 WAITING_MAX = 1000  # records in memory; the thread that adds one more writes them all
 
-_FIELDS = (
-    "v",
-    "i",
-    "id",
-    "kind",
-    "started_at",
-    "size",
-    "features",
-    "sites",
-    "decision",
-    "executions",
-    "used",
-    "waited_s",
-)
 _OUTLOOK_FIELDS = ("predicted_s", "spread_s", "low_s", "high_s", "age", "failures")
 _EXECUTION_FIELDS = (
     "site",
@@ -137,16 +122,6 @@ class Trace(Lines):
             self.flush()
 
 
-def alone_path(path: Path) -> Path:
-    """The trace of the plans that `robot-client drive --alone` measures, next to the trace of the run."""
-    return path.with_name(f"{path.stem}.alone.jsonl")
-
-
-def reference_path(path: Path) -> Path:
-    """The lines of `robot-client drive --reference`, next to the trace of the run."""
-    return path.with_name(f"{path.stem}.reference.jsonl")
-
-
 def as_dict(record: Record) -> dict[str, Any]:
     """The fields of the JSON line (docs/formats.md)."""
     return {
@@ -179,11 +154,6 @@ def features(record: Record) -> dict[str, float]:
                 if value is not None:
                     found[f"{site}.{name}"] = value
     return found
-
-
-def read(path: Path) -> Iterator[dict[str, Any]]:
-    """The fields of each line. A torn last line is skipped with a warning; any other raises DataError."""
-    return lines.read(path, _FIELDS)
 
 
 def _decision(decision: Decision) -> dict[str, Any]:

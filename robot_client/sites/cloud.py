@@ -74,18 +74,18 @@ class CloudRunner:
         self._warned: set[str] = set()  # kinds
         self._pending: dict[int, PendingRequest] = {}
         self._cancelled: deque[int] = deque()
+        self._socket = CloudSocket(site, endpoint, keys)
         self._reader = SharedReader(
             self._tend,
             self._receive,
             unanswered=self._pending.__len__,
             expects_message=self._expects_message,
-            wake=self._wake,
+            wake=self._socket.wake,
             pause_s=background.pause_s,
         )
         self._reader_wakes_s: float | None = None  # when a waiting reader wakes by itself; None: none waits
         self._messages = 0
         self._uploads = BlobUploads()
-        self._socket = CloudSocket(site, endpoint, keys)
         self._thread = threading.Thread(target=self._run, name=f"site-{site}", daemon=True)
         self._thread.start()
 
@@ -163,9 +163,6 @@ class CloudRunner:
 
     def _expects_message(self) -> bool:
         return bool(self._pending or self._heartbeat.unanswered)
-
-    def _wake(self) -> None:
-        self._socket.wake()
 
     def _run(self) -> None:
         try:

@@ -12,7 +12,7 @@ from offboard.common.errors import BadValue, ConfigError, DataError
 from offboard.common.planning import planner
 from offboard.common.planning.maps import GridMap
 from offboard.common.planning.planner import Plan, Point, Pose, plan_path
-from offboard.robot_client.simulated.answers import (
+from offboard.loadgen.robot.answers import (
     STEPS,
     Answered,
     Answers,

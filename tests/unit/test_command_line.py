@@ -17,10 +17,10 @@ from offboard.loadgen.compare.compare_settings import CompareConfig
 from offboard.loadgen.play.measure_dataset import DatasetConfig
 from offboard.loadgen.relay.wan import WanConfig
 from offboard.loadgen.report.report import ReportConfig
+from offboard.loadgen.robot.config import CallConfig, DriveConfig
 from offboard.loadgen.table.export_dataset import ExportConfig
 from offboard.loadgen.table.replay import ReplayConfig
 from offboard.loadgen.table.table_settings import TableConfig
-from offboard.robot_client.simulated.config import CallConfig, DriveConfig
 
 SHOWN_MAX = 16  # flags in --help, --help itself included
 CONFIGS = (

@@ -60,82 +60,82 @@ at_most = 1
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        (["robot_client", "drive"], "--map is missing"),
-        (["robot_client", "call"], "--task is missing"),
-        (["robot_client", "call", "--map", "open.map"], "unrecognized arguments: --map open.map"),
-        (["robot_client", "drive", "--task", "m:f"], "unrecognized arguments: --task m:f"),
-        (["robot_client", "drive", "--map", "none.yaml"], "none.yaml"),
+        (["loadgen", "drive"], "--map is missing"),
+        (["loadgen", "call"], "--task is missing"),
+        (["loadgen", "call", "--map", "open.map"], "unrecognized arguments: --map open.map"),
+        (["loadgen", "drive", "--task", "m:f"], "unrecognized arguments: --task m:f"),
+        (["loadgen", "drive", "--map", "none.yaml"], "none.yaml"),
         (
-            ["robot_client", "call", "--task", "m:f", "--sizes", "constant:1"],
+            ["loadgen", "call", "--task", "m:f", "--sizes", "constant:1"],
             "--task: 'm:f' is not MODULE:FUNCTION",
         ),
-        (["robot_client", "drive", "--map", "open.map", "--sizes", "none.csv"], "--sizes: 'none.csv' is not"),
+        (["loadgen", "drive", "--map", "open.map", "--sizes", "none.csv"], "--sizes: 'none.csv' is not"),
         (
-            ["robot_client", "drive", "--map", "open.map", "--radius", "0", "--answers", "answers.jsonl"],
+            ["loadgen", "drive", "--map", "open.map", "--radius", "0", "--answers", "answers.jsonl"],
             "--answers: answers.jsonl holds 1 answers; going on after them needs --jump",
         ),
-        (["robot_client", "drive", "--map", "no-resolution.yaml"], "no-resolution.yaml: resolution"),
-        (["robot_client", "drive", "--map", "text-image.yaml"], "words.txt"),
+        (["loadgen", "drive", "--map", "no-resolution.yaml"], "no-resolution.yaml: resolution"),
+        (["loadgen", "drive", "--map", "text-image.yaml"], "words.txt"),
         (
-            ["robot_client", "drive", "--map", "open.map", "--radius", "9"],
+            ["loadgen", "drive", "--map", "open.map", "--radius", "9"],
             "no room for a robot of radius 9 m",
         ),
         (
-            ["robot_client", "drive", "--map", "open.map", "--metrics", "127.0.0.1:99999"],
+            ["loadgen", "drive", "--map", "open.map", "--metrics", "127.0.0.1:99999"],
             "--metrics: '127.0.0.1:99999'",
         ),
         (
-            ["robot_client", "drive", "--map", "open.map", "--policy", "paper", "--objective", "p95"],
+            ["loadgen", "drive", "--map", "open.map", "--policy", "paper", "--objective", "p95"],
             "--objective: p95 changes nothing with",
         ),
         (
-            ["robot_client", "drive", "--map", "open.map", "--trace", "words.txt"],
+            ["loadgen", "drive", "--map", "open.map", "--trace", "words.txt"],
             "words.txt: the file exists and is no",
         ),
-        (["robot_client", "drive", "--map", "m.yaml", "--window", "0"], "--window: 0 is below 2"),
+        (["loadgen", "drive", "--map", "m.yaml", "--window", "0"], "--window: 0 is below 2"),
         (
-            ["robot_client", "drive", "--map", "m.yaml", "--policy", "x"],
+            ["loadgen", "drive", "--map", "m.yaml", "--policy", "x"],
             "'x' is not one of paper, paper-with-heartbeats, onboard, cloud",
         ),
         (
-            ["robot_client", "drive", "--map", "m.yaml", "--cloud", "tcp:/x"],
+            ["loadgen", "drive", "--map", "m.yaml", "--cloud", "tcp:/x"],
             "--cloud: 'tcp:/x' is not tcp://HOST:PORT",
         ),
         (
-            ["robot_client", "drive", "--map", "m.yaml", "--site", "edge"],
+            ["loadgen", "drive", "--map", "m.yaml", "--site", "edge"],
             "--site: 'edge' is not NAME=tcp://HOST:PORT",
         ),
         (
-            ["robot_client", "drive", "--map", "m.yaml", "--trace", "t", "--alone", "3"],
+            ["loadgen", "drive", "--map", "m.yaml", "--trace", "t", "--alone", "3"],
             "--alone: 3 needs --cloud",
         ),
         (
-            ["robot_client", "drive", "--map", "m.yaml", "--cloud", "tcp://h:1", "--alone", "3"],
+            ["loadgen", "drive", "--map", "m.yaml", "--cloud", "tcp://h:1", "--alone", "3"],
             "--alone: 3 needs --trace",
         ),
         (
-            ["robot_client", "drive", "--map", "m.yaml", "--tasks", "3", "--alone", "4"],
+            ["loadgen", "drive", "--map", "m.yaml", "--tasks", "3", "--alone", "4"],
             "--alone: 4 is above --tasks 3",
         ),
         (
-            ["robot_client", "call", "--task", "camera:bright", "--sizes", "constant:1"],
+            ["loadgen", "call", "--task", "camera:bright", "--sizes", "constant:1"],
             "--sizes: 'constant:1': the size function of task bright does not take the first argument: "
             "AttributeError: 'int' object has no attribute 'size'; use --inputs",
         ),
         (
-            ["robot_client", "call", "--task", "camera:bright", "--inputs", "camera:few"],
+            ["loadgen", "call", "--task", "camera:bright", "--inputs", "camera:few"],
             "--inputs: 'camera:few': the size function of task bright does not take the first argument: ",
         ),
         (
-            ["robot_client", "call", "--task", "camera:bright", "--inputs", "camera:none"],
+            ["loadgen", "call", "--task", "camera:bright", "--inputs", "camera:none"],
             "camera has no function 'none'",
         ),
         (
-            ["robot_client", "call", "--task", "camera:bright", "--inputs", "m:f"],
+            ["loadgen", "call", "--task", "camera:bright", "--inputs", "m:f"],
             "--inputs: 'm:f' is not MODULE:FUNCTION",
         ),
         (
-            ["robot_client", "call", "--task", "camera:bright", "--inputs", "camera:nothing"],
+            ["loadgen", "call", "--task", "camera:bright", "--inputs", "camera:nothing"],
             "returned NoneType, which is not",
         ),
         (["loadgen", "run", "inputs.toml"], "inputs.toml: workload.inputs: 'camera:few' needs workload.task"),
@@ -173,7 +173,7 @@ at_most = 1
             "policy 'camera.Such': module 'camera' has no class 'Such'",
         ),
         (
-            ["robot_client", "drive", "--map", "open.map", "--obstacles", "0", "--policy", "camera.Such"],
+            ["loadgen", "drive", "--map", "open.map", "--obstacles", "0", "--policy", "camera.Such"],
             "policy 'camera.Such': module 'camera' has no class 'Such'",
         ),
         (["loadgen", "run", "odd.toml"], "odd.toml:4: unknown key 'taks'; did you mean 'tasks'?"),

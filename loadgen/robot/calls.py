@@ -10,9 +10,9 @@ from typing import Any
 
 from offboard.common.errors import ConfigError, MissingExtra, OffloadError, describe
 from offboard.common.tasks import Kind, kind_of, load_modules
-from offboard.robot_client.simulated import answers
-from offboard.robot_client.simulated.config import CallConfig
-from offboard.robot_client.simulated.workload import parse_sizes, sizes
+from offboard.loadgen.robot import answers
+from offboard.loadgen.robot.config import CallConfig
+from offboard.loadgen.robot.workload import parse_sizes, sizes
 
 NAMED = "MODULE:FUNCTION"
 SAME = "same"  # function of a task's module: whether two answers are equal within its tolerance

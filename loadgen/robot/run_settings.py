@@ -5,7 +5,7 @@ from pathlib import Path
 
 from offboard.common.config import setting
 from offboard.common.errors import ConfigError
-from offboard.robot_client.simulated.workload import ARRIVALS, CLOSED
+from offboard.loadgen.robot.workload import ARRIVALS, CLOSED
 
 TASKS_DEFAULT = 200
 TASKS, ARRIVING, MEASURING, OUTPUT = "tasks", "arrivals", "measurement", "output"
