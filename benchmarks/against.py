@@ -226,7 +226,7 @@ def ratio(times_s: Column, before: Column) -> str:
     ends: tuple[Any, ...] = Blocks(len(before)).intervals(
         lambda picks: {"r": times_s[picks].sum(axis=-1) / before[picks].sum(axis=-1)}
     )
-    bounds = f" [{ends[0]['r']:.3f}, {ends[1]['r']:.3f}]" if ends else ""
+    bounds = f" [{ends[0]['r']:.3f}, {ends[1]['r']:.3f}]" if ends[0] else ""
     return f"{times_s.sum() / before.sum():.3f}{bounds}"
 
 

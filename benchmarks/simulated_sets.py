@@ -117,7 +117,7 @@ def differences(of: Figures, base: Figures) -> tuple[str, str]:
     """The mean difference with its 95 % interval, and that of the scenario where it is largest."""
     pairs = np.array([of[pair] - base[pair] for pair in base])
     ends = Blocks(len(pairs), length=1).intervals(lambda picks: {"mean": pairs[picks].mean(axis=-1)})
-    bounds = f" [{ends[0]['mean']:+.4f}, {ends[1]['mean']:+.4f}]" if ends else ""
+    bounds = f" [{ends[0]['mean']:+.4f}, {ends[1]['mean']:+.4f}]" if ends[0] else ""
     each = by_scenario({pair: of[pair] - base[pair] for pair in base})
     far = max(each, key=lambda name: abs(each[name]))
     return f"{pairs.mean():+.4f}{bounds}", f"{each[far]:+.3f} ({far})"
