@@ -69,11 +69,11 @@ class Settings:
         """
         name = self.predictor_for(policy)
         make = partial(predictors.make, name, window, self.seed)
-        make()
+        made = make()
         return Memories(
             make,
             measured=name == predictors.PARTS or self.beats(policy),
-            shared_work=name == predictors.PARTS,
+            shared_work=getattr(made, "per_work", False),
             objective=self.objective,
             energy=self.energy,
             store=None if self.memory is None else Store(self.memory),
