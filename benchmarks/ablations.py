@@ -68,7 +68,6 @@ LEFT_OUT: dict[str, LeftOut] = {
     "PACE": _predictor("Pace"),
     "SHAPE": _predictor("Shape"),
     "first slope": _predictor("FirstSlope"),
-    "RATE_AFTER": _predictor("RateAfter"),
 }
 
 

@@ -12,7 +12,6 @@ from offboard.robot_client.predictors.line import (
     ODD,
     PACE,
     RATE,
-    RATE_AFTER,
     SHAPE,
     TAIL_MAX,
     Line,
@@ -26,7 +25,6 @@ class Switched(Line):
 
     pace = PACE
     shape = SHAPE
-    rate_after = RATE_AFTER
     outliers = True  # a time beyond the reach counts only up to it
     good_news = True  # one outlier below the line is a change
     bad_news = True  # two outliers above it are one
@@ -37,7 +35,7 @@ class Switched(Line):
         if self.count == 1:
             self._begin(x, y, known)
             return
-        rate = max(RATE, 1.0 / (self.count + self.rate_after))
+        rate = max(RATE, 1.0 / self.count)
         error = y - self.a - self.b * x
         unit = 0.5 * (max(0.0, self.a + self.b * x + known) + self._usual) or 1.0
         self._usual += rate * (min(y + known, ODD * self._usual) - self._usual)
@@ -74,10 +72,6 @@ class _WithoutPace(Switched):
 
 class _WithoutShape(Switched):
     shape = 0.0
-
-
-class _WithoutRateAfter(Switched):
-    rate_after = 0
 
 
 class _WithoutOutliers(Switched):
@@ -132,12 +126,6 @@ class Shape(Parts):
     """Intercept and slope of a run do not change apart from each other."""
 
     LINE = _WithoutShape
-
-
-class RateAfter(Parts):
-    """The running means of a line start with the plain mean of the first times."""
-
-    LINE = _WithoutRateAfter
 
 
 class Outliers(Parts):
