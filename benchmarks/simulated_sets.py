@@ -18,10 +18,10 @@ import numpy as np
 from benchmarks.against import FROM_TASK, HERE
 from benchmarks.measure import Table
 from offboard.common.errors import ConfigError
+from offboard.loadgen.robot.workload import CLOSED
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario, shipped
 from offboard.loadgen.simulation.simulated_testbed import check_simulated
 from offboard.loadgen.table.confidence_intervals import Blocks
-from offboard.robot_client.simulated.workload import CLOSED
 
 UNSEEN = HERE / "benchmarks" / "unseen"
 FRESH_SEED = 1001
