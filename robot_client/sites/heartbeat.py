@@ -34,7 +34,7 @@ class Heartbeat:
     """Times the heartbeats of one connection, and measures it.
 
     every_s: usual pause; 0: no heartbeat is sent, and nothing is measured.
-    background: makes pauses longer on a loaded robot.
+    background: makes pauses longer on a loaded robot, and knows when the robot hears late.
     """
 
     def __init__(self, every_s: float, seed: int = 0, background: Background | None = None) -> None:
@@ -98,11 +98,18 @@ class Heartbeat:
         if sent_s < self._back_s:
             self.hurry(now_s)  # the silence delayed this answer, so it does not measure the link as it is now
         else:
-            self._vary(now_s - sent_s)
-            self._recent.append(now_s - sent_s)
-            self._round_trip_s = min(self._recent)
-            self._measured = True
+            self._measure(now_s - sent_s, at_most=self._background.computed_since(sent_s))
         self.hear(now_s, report)
+
+    def _measure(self, round_trip_s: float, *, at_most: bool) -> None:
+        """With `at_most`, the robot computed at that time and may have read the answer late."""
+        self._vary(round_trip_s)
+        self._measured = True
+        if at_most and self._round_trip_s is not None:
+            self._round_trip_s = min(round_trip_s, self._round_trip_s)
+        else:
+            self._recent.append(round_trip_s)
+            self._round_trip_s = min(self._recent)
 
     def hear(self, now_s: float, report: ServerReport) -> None:
         """Any message from the server shows that it is there."""

@@ -206,8 +206,10 @@ class OnboardRunner:
                 if self._runs.get(run.task.id) is not run:  # cancelled, or closed
                     continue
                 run.thread = threading.get_native_id()
+                self._background.begin()
             execution = _run(run, self._states)
             with self._lock:
+                self._background.end()
                 del self._runs[run.task.id]
                 if run.abandoned:
                     self._abandoned -= 1
