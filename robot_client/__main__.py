@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from offboard.common.task_states import TaskStates
     from offboard.robot_client.offloader import Offloader
     from offboard.robot_client.records.lines import Lines
-    from offboard.robot_client.records.trace import Record
+    from offboard.robot_client.records.trace import Record, Trace
     from offboard.robot_client.simulated.answers import Answers
     from offboard.robot_client.simulated.work import Work
 
@@ -119,7 +119,7 @@ def _run(config: RobotConfig) -> int:
     alone = Trace(alone_path(config.trace)) if config.trace and config.alone else None
     files: list[Answers | Lines] = [file for file in (answers, trace) if file]
     try:
-        observers: list[Observer] = [*([trace.write] if trace else []), *_metrics(config)]
+        observers: list[Observer] = [*([trace.write] if trace else []), *_metrics(config, trace)]
         work, states = make_work(config), TaskStates(workers=1)  # shared, so that each setup runs once
         _run_tasks(config, work, states, answers, observers=observers, files=files)
         if alone:
@@ -214,13 +214,16 @@ def _warn_of_absent(doing: str, absent: Mapping[str, str]) -> None:
         logging.getLogger("offboard.robot_client").warning("%s without %s: %s; %s", doing, site, why, instead)
 
 
-def _metrics(config: RobotConfig) -> list[Observer]:
+def _metrics(config: RobotConfig, trace: "Trace | None") -> list[Observer]:
     """The observer that serves metrics until the process ends, if an address is given for it."""
     if config.metrics is None:
         return []
     from offboard.robot_client.records.metrics import serve_metrics
 
-    return [serve_metrics(config.metrics, "--metrics")]
+    metrics = serve_metrics(config.metrics, "--metrics")
+    if trace:
+        metrics.watch(trace)
+    return [metrics]
 
 
 def _interrupt(*_: object) -> NoReturn:
