@@ -201,7 +201,7 @@ def load_modules(names: Iterable[str]) -> None:
             raise ConfigError(f"task module {name!r} is not the name of a module; did you mean {meant!r}?")
         try:
             importlib.import_module(name)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             where = _where(name) if _is_missing(name, error) else ""
             raise ConfigError(f"task module {name!r} cannot be imported: {describe(error)}{where}") from error
 
@@ -215,7 +215,7 @@ def _meant(name: str) -> str:
     return parts[-1] if file.startswith(("/", "..")) else ".".join(parts)
 
 
-def _is_missing(name: str, error: Exception) -> bool:
+def _is_missing(name: str, error: BaseException) -> bool:
     """Whether the module itself was not found, rather than one that it imports."""
     return isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}.")
 

@@ -43,7 +43,7 @@ def run_robot(config: RobotConfig) -> int:
     alone = Trace(alone_path(config.trace)) if config.trace and config.alone else None
     files: list[Answers | Lines] = [file for file in (answers, trace) if file]
     try:
-        observers: list[Observer] = [*([trace.write] if trace else []), *_metrics(config)]
+        observers: list[Observer] = [*([trace.write] if trace else []), *_metrics(config, trace)]
         work, states = make_work(config), TaskStates(workers=1)  # shared, so that each setup runs once
         _run_tasks(config, work, states, answers, observers=observers, files=files)
         if alone:
@@ -130,10 +130,13 @@ def _warn_of_absent(doing: str, absent: Mapping[str, str]) -> None:
         log.warning("%s without %s: %s; %s", doing, site, why, instead)
 
 
-def _metrics(config: RobotConfig) -> list[Observer]:
+def _metrics(config: RobotConfig, trace: Trace | None) -> list[Observer]:
     """The observer that serves metrics until the process ends, if an address is given for it."""
     if config.metrics is None:
         return []
     from offboard.robot_client.records.metrics import serve_metrics  # its library takes long to load
 
-    return [serve_metrics(config.metrics, "--metrics")]
+    metrics = serve_metrics(config.metrics, "--metrics")
+    if trace:
+        metrics.watch(trace)
+    return [metrics]

@@ -59,6 +59,8 @@ class ServerSettings:
     def check_servers(self) -> None:
         if self.cloud is not None:
             check_endpoint("--cloud", self.cloud)
+        if self.keys is not None and self.cloud is None and not self.site:
+            raise ConfigError(f"--keys: {self.keys} needs --cloud, the server to use")
         self.sites()
 
     def sites(self) -> dict[str, str]:

@@ -107,6 +107,8 @@ class RunSettings:
                     raise ConfigError(f"--{flag}: {getattr(self, flag)} needs --{needed}")
         if self.arrivals != CLOSED:
             self._check_open()
+        elif self.rate is not None:
+            raise ConfigError(f"--rate: {self.rate:g} needs --arrivals, which is {CLOSED} otherwise")
 
     def _check_open(self) -> None:
         if self.rate is None:

@@ -3,7 +3,6 @@
 `predictor_evaluation` and `replay` compute figures from them.
 """
 
-import contextlib
 import csv
 import io
 import math
@@ -16,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from offboard.common.errors import ConfigError, DataError
+from offboard.common.security.plain_files import replace_file
 from offboard.loadgen.robot_files import read_trace
 from offboard.robot_client.policies import PINNED
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
@@ -102,14 +102,10 @@ def write_csv(path: Path, rows: Rows) -> None:
 
 def write_whole(path: Path, text: str) -> None:
     """Write a file completely; if that fails, leave the old one as it was."""
-    part = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
+        replace_file(path, text.encode())
     except OSError as error:
-        with contextlib.suppress(OSError):
-            part.unlink()
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
 
 

@@ -25,8 +25,8 @@ class Recording:
     def __init__(self, *, trace: Path | str | None, metrics: str | None) -> None:
         self.observers: tuple[Observer, ...] = ()
         with ExitStack() as opened:
-            if trace is not None:
-                file = Trace(Path(trace))
+            file = None if trace is None else Trace(Path(trace))
+            if file is not None:
                 opened.callback(file.close)
                 self.observers += (file.write,)
             if metrics is not None:
@@ -34,6 +34,8 @@ class Recording:
 
                 served = serve_metrics(metrics, "metrics")
                 opened.callback(served.close)
+                if file is not None:
+                    served.watch(file)
                 self.observers += (served,)
             self._opened = opened.pop_all()
 

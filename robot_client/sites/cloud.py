@@ -5,6 +5,7 @@ server can be used is `connection`.
 """
 
 import logging
+import math
 import threading
 import time
 from collections import deque
@@ -39,6 +40,7 @@ PENDING_MAX = 1024
 ATTEMPTS_MAX = 4  # sends of one request: the first, and one after each `need_blob`
 CLOSE_WAIT_S = 2.0
 IDLE_WAIT_S = 1.0
+LOG_PAUSE_S = 10.0  # at least, between two warnings about bad messages
 
 log = logging.getLogger(__name__)
 
@@ -85,6 +87,7 @@ class CloudRunner:
         )
         self._reader_wakes_s: float | None = None  # when a waiting reader wakes by itself; None: none waits
         self._messages = 0
+        self._warned_s = -math.inf  # when a bad message was last logged
         self._uploads = BlobUploads()
         self._thread = threading.Thread(target=self._run, name=f"site-{site}", daemon=True)
         self._thread.start()
@@ -274,7 +277,14 @@ class CloudRunner:
         except wire.VersionMismatch as error:
             self._connection.other_version(str(error))
         except ProtocolError as error:
-            log.warning("%s: message dropped: %s", self.site, error)
+            if received_s - self._warned_s >= LOG_PAUSE_S:
+                self._warned_s = received_s
+                log.warning(
+                    "%s: message dropped: %s (others within %g s are not logged)",
+                    self.site,
+                    error,
+                    LOG_PAUSE_S,
+                )
 
     def _take(self, message: wire.Message, received_s: float, bytes_in: int) -> None:
         if isinstance(message, wire.Hello):

@@ -36,6 +36,8 @@ def config(settings: dict[str, Any]) -> RobotConfig:
         (MAP | {"arrivals": "often"}, "--arrivals: 'often' is not one of closed, constant, poisson, bursts"),
         (TASK | {"arrivals": "bursts"}, "--arrivals: bursts needs --rate"),
         (MAP | {"planner": "theta"}, "--planner: 'theta' is not one of dijkstra, astar, jps"),
+        (TASK | {"rate": 5.0}, "--rate: 5 needs --arrivals, which is closed otherwise"),
+        (TASK | {"keys": Path("keys")}, "--keys: keys needs --cloud, the server to use"),
         (TASK | OPEN | {"rate": 0.0}, "--rate: 0.0 is below 0.001"),
         (TASK | OPEN | {"burst": 0}, "--burst: 0 is below 1"),
         (TASK | OPEN | {"in_flight": 0}, "--in-flight: 0 is below 1"),
@@ -179,4 +181,4 @@ def test_a_second_run_starts_with_what_the_first_one_learnt(tmp_path: Path) -> N
         "1",
     ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=30, cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (2, "loadgen call: memory .: is a folder\n")
+    assert (done.returncode, done.stderr) == (2, "loadgen call: memory .: is a folder, not a plain file\n")
