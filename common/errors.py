@@ -48,7 +48,7 @@ class TaskFailed(TaskError):
 
 
 class BadValue(TaskError):
-    """An argument or result cannot be sent."""
+    """A value cannot be sent, or an input size is none. A call raises it for the size only."""
 
 
 class CloudError(OffloadError):
@@ -69,6 +69,10 @@ class Overtaken(CloudError):
 
 class CloudBroken(CloudError):
     """The connection was lost, or the server cannot run this task."""
+
+
+class CannotCross(CloudBroken):
+    """The arguments or the result of this task cannot be sent, or not be read on the other side."""
 
 
 class Unwanted(OffloadError):

@@ -75,6 +75,8 @@ class Offloader:
         if ONBOARD not in self._runners or len(self._runners) != len(runners):
             given = [runner.site for runner in runners]
             raise ConfigError(f"sites {given}: each site once, and {ONBOARD!r} among them")
+        if BOTH in self._runners:
+            raise ConfigError(f"a site cannot be named {BOTH!r}: where={BOTH!r} means all sites")
         self._policy = policy
         self._memories = memories
         self._allowance = allowance or Allowance()
@@ -237,6 +239,8 @@ class Offloader:
         answer, record = self._offload(task, where, budget_s, placed)
         self.last = record
         tell(self._observers, record)
+        if len(record.executions) > 1:
+            self._crossing.hear(task.kind, record.executions)
         if len(self._runners) > 1 and answer.failure is None:
             self._crossing.check_result(task.kind, answer.value)
         return answer, record

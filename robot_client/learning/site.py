@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from offboard.common.errors import Overtaken, TaskError
+from offboard.common.errors import CannotCross, Overtaken, TaskError
 from offboard.common.tasks import Size, first_number
 from offboard.robot_client.learning.conformal import Conformal
 from offboard.robot_client.policies.energy import Energy
@@ -158,7 +158,7 @@ class SiteMemory:
         if overtaken and execution.seconds <= (expected_s or 0.0):
             return  # stopped before its predicted time: the site may be as fast as predicted
         ahead = self.count_run()
-        if isinstance(execution.failure, TaskError):
+        if isinstance(execution.failure, TaskError | CannotCross):
             return
         if not overtaken:  # a run that lost a race did not fail
             self._failures = 0 if ok else self._failures + 1

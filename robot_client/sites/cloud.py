@@ -15,6 +15,7 @@ from concurrent.futures import Future
 from offboard.common import VERSION as SOFTWARE
 from offboard.common.errors import (
     BadValue,
+    CannotCross,
     CloudBroken,
     CloudBusy,
     CloudError,
@@ -22,11 +23,13 @@ from offboard.common.errors import (
     OffloadError,
     Overtaken,
     ProtocolError,
+    describe,
 )
 from offboard.common.security.keys import RobotKeys
 from offboard.common.tasks import Kind, Task, kinds
 from offboard.common.wire import messages as wire
 from offboard.common.wire.payload import payload_bytes
+from offboard.robot_client.sites.absence import CrossingPauses
 from offboard.robot_client.sites.background import Background
 from offboard.robot_client.sites.blob_uploads import BlobUploads
 from offboard.robot_client.sites.cloud_socket import MESSAGE_BYTES_MAX, CloudSocket, SocketEvent
@@ -89,6 +92,7 @@ class CloudRunner:
         self._messages = 0
         self._warned_s = -math.inf  # when a bad message was last logged
         self._uploads = BlobUploads()
+        self._pauses = CrossingPauses()
         self._thread = threading.Thread(target=self._run, name=f"site-{site}", daemon=True)
         self._thread.start()
 
@@ -97,7 +101,7 @@ class CloudRunner:
         if absent is not None:
             return absent
         if self._remote.get(kind.name) == kind.source_hash != "":
-            return None
+            return self._pauses.why_absent(kind.name)
         why = (
             f"the source of task {kind.name} differs on the server"
             if kind.name in self._remote
@@ -112,13 +116,14 @@ class CloudRunner:
         published_s = time.perf_counter()
         try:
             inline = self._uploads.inline_rule(task.kind.name, self._message_bytes_max)
-            body = wire.encode(list(task.args), task.kind.types, blobs=True, along=inline)
-        except BadValue as error:
-            return self._refused(BadValue(f"task {task.kind.name}: {error}"))
+            body = wire.encode(list(task.args), task.kind.types, name="arguments", blobs=True, along=inline)
+        except Exception as error:  # noqa: BLE001 - whatever cannot be sent, onboard can answer
+            why = str(error) if isinstance(error, BadValue) else f"arguments: {describe(error)}"
+            return self._cannot_cross(task, why)
         largest = max([wire.byte_count(body.frames), *(raw.nbytes for raw in body.blobs.values())])
         if largest > self._message_bytes_max - wire.HEADER_BYTES_MAX:
-            failure = f"{largest} bytes of arguments; the server takes messages of {self._message_bytes_max}"
-            return self._refused(CloudBroken(failure))
+            why = f"arguments of {largest} bytes; the server takes messages of {self._message_bytes_max}"
+            return self._cannot_cross(task, why)
         if len(self._pending) >= PENDING_MAX:
             return self._refused(CloudBusy(f"{PENDING_MAX} tasks are in flight"))
         pending = PendingRequest(
@@ -158,6 +163,11 @@ class CloudRunner:
     def close(self) -> None:
         self._reader.close()
         self._thread.join(CLOSE_WAIT_S)
+
+    def _cannot_cross(self, task: Task, why: str) -> "Future[Execution]":
+        failure = CannotCross(why)
+        self._pauses.note(task.kind.name, failure, time.perf_counter())
+        return self._refused(failure)
 
     def _refused(self, failure: OffloadError) -> "Future[Execution]":
         future: Future[Execution] = Future()
@@ -308,6 +318,7 @@ class CloudRunner:
             if pending.doubtful and message.status in ("ok", "failed"):
                 self._uploads.found(pending.task.kind.name, new=False)
             execution = pending.answered(message, received_s, bytes_in)
+            self._pauses.note(pending.task.kind.name, execution.failure, received_s)
             del self._pending[message.id]
             pending.future.set_result(execution)
 

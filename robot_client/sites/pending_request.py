@@ -8,6 +8,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 
 from offboard.common.errors import (
+    CannotCross,
     CloudBroken,
     CloudBusy,
     CloudError,
@@ -58,7 +59,7 @@ class PendingRequest:
             try:
                 value = wire.decode(reply.body, self.task.kind.types, {})
             except ProtocolError as error:
-                failure = CloudBroken(f"the answer cannot be read: {error}")
+                failure = CannotCross(f"result: {error}")
         seconds = received_s - self.published_s
         return Execution(
             self.site,
@@ -100,4 +101,7 @@ def _failure(reply: wire.Reply) -> OffloadError | None:
     text = reply.error or reply.status
     if reply.status == "failed" and not reply.server_fault:
         return TaskFailed(text, reply.traceback)
-    return (CloudBroken if reply.server_fault else _FAILURES[reply.status])(text)
+    if reply.server_fault:
+        of_value = text.startswith(("BadValue: ", "ProtocolError: "))
+        return (CannotCross if of_value else CloudBroken)(text.removeprefix("BadValue: "))
+    return _FAILURES[reply.status](text)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from offboard.common.errors import (
-    BadValue,
+    CannotCross,
     CloudBroken,
     CloudBusy,
     CloudError,
@@ -192,31 +192,51 @@ def test_a_lost_answer_is_raised_if_the_task_may_have_run(make: Make, started: b
                 offload(write_once)
 
 
-def test_a_value_that_cannot_be_sent_is_one_clear_error(make: Make) -> None:
-    """BadValue reaches the caller even if onboard could have answered."""
-    with (
-        make(cloud_answers(failure=BadValue("a set cannot cross the wire")), OnboardRunner()) as offload,
-        pytest.raises(BadValue, match="set"),
-    ):
-        offload(add_one, 1, where="both")
-
-
 @task("unique", size=lambda items: len(items))
 def unique(items: list[int]) -> object:
     return set(items) if items else None
 
 
+@pytest.mark.parametrize("where", [None, CLOUD, "both"])
+def test_what_cannot_be_sent_is_answered_onboard(
+    make: Make, where: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    """No call raises because of it, and the reason is logged once, also if a later call has it first."""
+    refused = "arguments[0]: a set cannot be sent"
+    cloud = cloud_answers()
+    with make(cloud, OnboardRunner()) as offload:
+        assert offload(add_one, 1, where=where) == 2
+        assert caplog.messages == []
+        cloud.script = cloud_answers(0.0, CannotCross(refused), started=False).script
+        for number in range(3):
+            assert offload(add_one, number, where=where) == number + 1
+            assert offload.last is not None
+            assert offload.last.used == ONBOARD
+    assert caplog.messages == [f"add_one: only onboard can answer such a call: {refused}"]
+
+
 @pytest.mark.parametrize("where", [None, ONBOARD, CLOUD])
-def test_the_first_call_says_which_value_cannot_be_sent(make: Make, where: str | None) -> None:
-    """BadValue is raised at once for arguments and results, on every site, also without the server."""
+def test_the_first_call_says_which_value_cannot_be_sent(
+    make: Make, where: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Arguments and results are checked at once, on every site, also without the server."""
     cloud = cloud_answers()
     cloud.absent = "not connected"
     with make(cloud, OnboardRunner()) as offload:
-        with pytest.raises(BadValue, match=r"arguments of task unique: .*set"):
-            offload(unique, {1, 2}, where=where)
-        with pytest.raises(BadValue, match=r"result of task unique: .*set"):
-            offload(unique, [1, 2], where=where)
-        assert offload(unique, [], where=where) is None
+        assert offload(unique, {1, 2}, where=where) == {1, 2}
+        assert offload(unique, [1, 2], where=where) == {1, 2}
+        assert offload(unique, {3}, where=where) == {3}
+    start = "unique: only onboard can answer such a call: "
+    assert [text.partition(" cannot be sent")[0] for text in caplog.messages] == [
+        f"{start}arguments[0]: a value of type builtins.set",
+        f"{start}result: a value of type builtins.set",
+    ]
+
+
+def test_a_site_cannot_be_named_both() -> None:
+    """`where="both"` would mean two things."""
+    with pytest.raises(ConfigError, match="a site cannot be named 'both'"):
+        Offloader.connect("tcp://127.0.0.1:9", sites={"both": "tcp://127.0.0.1:9"})
 
 
 def test_a_robot_without_servers_takes_any_value(make: Make) -> None:

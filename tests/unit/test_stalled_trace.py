@@ -46,7 +46,7 @@ class Disk:
         """What was written while the disk was stalled is gone."""
         with contextlib.suppress(OSError):
             os.dup2(self._file, self._trace._file.fileno())
-        while os.read_trace(self._unread, 1 << 20):
+        while os.read(self._unread, 1 << 20):
             pass
 
     def close(self) -> None:
