@@ -20,9 +20,9 @@ import pytest
 from prometheus_client import CollectorRegistry
 
 from offboard import Offloader
+from offboard.loadgen.robot_files import read_trace
 from offboard.robot_client.records import trace as trace_module
 from offboard.robot_client.records.metrics import Metrics
-from offboard.loadgen.robot_files import read_trace
 from offboard.robot_client.records.trace import ROOM_WAIT_S, WAITING_MAX, Trace
 from tests.probes import echo
 from tests.unit.test_trace import record
