@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from offboard.common.dataclass_types import check_types, field_names
-from offboard.common.errors import BadValue, ConfigError, UnknownTask, describe
+from offboard.common.errors import BadValue, ConfigError, UnknownTask, describe, is_interrupt
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -63,8 +63,7 @@ class Kind:
 
     def size_of(self, args: tuple[Any, ...]) -> Size:
         """The input size d of a call. BadValue unless it is finite, not negative and as long as before."""
-        given: Any = self.size(*args)
-        numbers = self._numbers(given) if isinstance(given, tuple | list) else (float(given),)
+        numbers = self._numbers(args)
         for number in numbers:
             if not (math.isfinite(number) and number >= 0):
                 raise BadValue(f"task {self.name}: input size {number} is not a finite number >= 0")
@@ -77,14 +76,20 @@ class Kind:
         """How many numbers a size has; None before the first one."""
         return self._counts[0] if self._counts else None
 
-    def _numbers(self, given: Sequence[Any]) -> tuple[float, ...]:
-        if not 1 <= len(given) <= SIZE_NUMBERS_MAX:
-            allowed = f"1 to {SIZE_NUMBERS_MAX} are allowed"
-            raise BadValue(f"task {self.name}: input size has {len(given)} numbers; {allowed}")
+    def _numbers(self, args: tuple[Any, ...]) -> tuple[float, ...]:
         try:
-            return tuple(map(float, given))
-        except (TypeError, ValueError, OverflowError) as error:
+            given: Any = self.size(*args)
+            if not isinstance(given, tuple | list):
+                return (float(given),)
+            numbers = tuple(map(float, given))
+        except BaseException as error:  # the function is the user's own
+            if is_interrupt(error):
+                raise
             raise BadValue(f"task {self.name}: input size: {describe(error)}") from error
+        if not 1 <= len(numbers) <= SIZE_NUMBERS_MAX:
+            allowed = f"1 to {SIZE_NUMBERS_MAX} are allowed"
+            raise BadValue(f"task {self.name}: input size has {len(numbers)} numbers; {allowed}")
+        return numbers
 
     def _check_count(self, count: int) -> None:
         if not self._counts:

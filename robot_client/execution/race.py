@@ -152,8 +152,8 @@ def _finished(site: str, future: "Future[Execution]") -> Execution:
 
 
 def _is_answer(execution: Execution) -> bool:
-    """Whether the race is over: if the task itself fails, it fails on every site."""
-    return execution.ok or isinstance(execution.failure, TaskError)
+    """Whether the race is over: if the task itself fails, it fails on every site; its setup may not."""
+    return execution.ok or (isinstance(execution.failure, TaskError) and execution.started)
 
 
 def _may_fall_back(execution: Execution, kind: Kind) -> bool:

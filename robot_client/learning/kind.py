@@ -7,6 +7,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterable
 
+from offboard.common.errors import is_interrupt
 from offboard.common.tasks import Kind, Size, first_number
 from offboard.robot_client.learning.shared_work import SharedWork
 from offboard.robot_client.learning.site import SiteMemory
@@ -73,7 +74,9 @@ class KindMemory:
             return None
         try:
             return self.kind.work_of(execution.value)
-        except Exception:  # the function is the user's own
+        except BaseException as error:  # the function is the user's own
+            if is_interrupt(error):
+                raise
             log.exception("cannot read the work of task %s from its result", self.kind.name)
             return None
 

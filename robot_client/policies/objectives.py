@@ -4,7 +4,7 @@ The joules that an objective weighs are estimated in `energy`.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from offboard.common.errors import ConfigError
 from offboard.robot_client.policies.forecast import SPREADS_90, PredictionErrors
@@ -18,6 +18,7 @@ class Expected(NamedTuple):
     joules: float
 
 
+@runtime_checkable
 class Objective(Protocol):
     """Called once for each site that a task could run on."""
 

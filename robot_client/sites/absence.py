@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from offboard.common.errors import CannotCross, OffloadError
 from offboard.common.tasks import Kind
 from offboard.robot_client.sites.onboard import OnboardRunner
-from offboard.robot_client.sites.runner import Runner
+from offboard.robot_client.sites.runner import Lasting, Runner
 
 POLL_S = 0.01
 PAUSE_AFTER = 3  # calls of a kind in a row whose values could not cross: a rare large value makes no pause
@@ -59,14 +59,18 @@ def absent_sites(runners: Mapping[str, Runner], kind: Kind) -> Absent:
 
 
 def wait_for_sites(runners: Mapping[str, Runner], kind: Kind, timeout_s: float) -> Absent:
-    """Begin the setup of the kind onboard, and wait until it is made and every site can take the kind."""
+    """Begin the setup of the kind onboard, and wait until it is made and every site can take the kind.
+
+    A site whose reason is a `Lasting` one is not waited for.
+    """
     until_s = time.monotonic() + timeout_s
     setups = {
         site: runner.prepare(kind) for site, runner in runners.items() if isinstance(runner, OnboardRunner)
     }
     while True:
         absent = absent_sites(runners, kind)
-        waits = bool(absent) or not all(setup.done() for setup in setups.values())
+        waits = [site for site, why in absent.items() if not isinstance(why, Lasting)]
+        waits += [site for site, setup in setups.items() if not setup.done()]
         if not waits or time.monotonic() >= until_s:
             break
         time.sleep(POLL_S)

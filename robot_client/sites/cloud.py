@@ -36,7 +36,7 @@ from offboard.robot_client.sites.cloud_socket import MESSAGE_BYTES_MAX, CloudSoc
 from offboard.robot_client.sites.connection import Action, Connection, HandshakeFailure
 from offboard.robot_client.sites.heartbeat import EARLY_S, Heartbeat, ServerReport
 from offboard.robot_client.sites.pending_request import PendingRequest
-from offboard.robot_client.sites.runner import CLOUD, Condition, Execution, check_endpoint
+from offboard.robot_client.sites.runner import CLOUD, Condition, Execution, Lasting, check_endpoint
 from offboard.robot_client.sites.shared_reader import Answer, SharedReader
 
 PENDING_MAX = 1024
@@ -110,7 +110,7 @@ class CloudRunner:
         if kind.name not in self._warned:
             self._warned.add(kind.name)
             log.warning("%s: %s: this task stays onboard", self.site, why)
-        return why
+        return Lasting(why)
 
     def submit(self, task: Task, budget_s: float) -> "Future[Execution]":
         published_s = time.perf_counter()

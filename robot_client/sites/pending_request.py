@@ -15,6 +15,7 @@ from offboard.common.errors import (
     OffloadError,
     ProtocolError,
     TaskFailed,
+    of_task,
 )
 from offboard.common.tasks import Task
 from offboard.common.wire import messages as wire
@@ -54,7 +55,7 @@ class PendingRequest:
         )
 
     def answered(self, reply: wire.Reply, received_s: float, bytes_in: int) -> Execution:
-        value, failure = None, _failure(reply)
+        value, failure = None, _failure(self.task.kind.name, reply)
         if failure is None:
             try:
                 value = wire.decode(reply.body, self.task.kind.types, {})
@@ -95,12 +96,12 @@ _FAILURES: dict[str, Callable[[str], OffloadError]] = {
 }
 
 
-def _failure(reply: wire.Reply) -> OffloadError | None:
+def _failure(kind: str, reply: wire.Reply) -> OffloadError | None:
     if reply.status == "ok":
         return None
     text = reply.error or reply.status
     if reply.status == "failed" and not reply.server_fault:
-        return TaskFailed(text, reply.traceback)
+        return TaskFailed(of_task(kind, text), reply.traceback)
     if reply.server_fault:
         of_value = text.startswith(("BadValue: ", "ProtocolError: "))
         return (CannotCross if of_value else CloudBroken)(text.removeprefix("BadValue: "))

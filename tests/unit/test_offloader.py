@@ -106,11 +106,11 @@ def test_the_warm_up_ends_with_the_smallest_window_too(make: Make) -> None:
 
 
 def test_an_exception_of_the_task_is_raised_from_every_site_in_the_same_way(make: Make) -> None:
-    """The caller gets TaskFailed with the type and text of the exception, and the task ran once."""
-    cloud = cloud_answers(failure=TaskFailed("ValueError: negative"))
+    """TaskFailed has the names of task and exception, and its text; the task ran once."""
+    cloud = cloud_answers(failure=TaskFailed("task add_one: ValueError: negative"))
     with make(cloud, OnboardRunner()) as offload:
         for where in (ONBOARD, CLOUD):
-            with pytest.raises(TaskFailed, match=r"^ValueError: negative$"):
+            with pytest.raises(TaskFailed, match=r"^task add_one: ValueError: negative$"):
                 offload(add_one, -1, where=where)
             assert offload.last is not None
             assert len(offload.last.executions) == 1
@@ -304,7 +304,7 @@ def test_onboard_must_be_among_the_sites() -> None:
             )  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("timeout_s", [0.0, -1.0, float("nan"), float("inf"), 1e9])
+@pytest.mark.parametrize("timeout_s", [0.0, -1.0, float("nan"), float("inf"), 1e9, "3", [1.0]])
 def test_a_timeout_is_above_zero_and_bounded(make: Make, timeout_s: float) -> None:
     """The timeout of an offloader and the timeout of a call must both be finite."""
     with pytest.raises(ConfigError, match="must be above 0 and at most"):

@@ -156,7 +156,7 @@ def test_a_failing_task_does_not_end_the_run(tmp_path: Path, settings: dict[str,
     lines, said = answered(tmp_path, tasks=10, **settings)
     lines.sort(key=lambda line: int(line["i"]))
     assert [line["i"] for line in lines] == list(range(10))
-    assert lines[3]["error"] == "TaskFailed: ValueError: three"
+    assert lines[3]["error"] == "TaskFailed: task scripted: ValueError: three"
     assert lines[5]["error"].startswith("BadValue: a value of type builtins.object")
     assert [line["answer"] is None for line in lines] == [n in (3, 5) for n in range(10)]
     assert all(line["id"] for line in lines)

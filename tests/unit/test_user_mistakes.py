@@ -122,12 +122,12 @@ at_most = 1
         ),
         (
             ["loadgen", "call", "--task", "camera:bright", "--sizes", "constant:1"],
-            "--sizes: 'constant:1': the size function of task bright does not take the first argument: "
-            "AttributeError: 'int' object has no attribute 'size'; use --inputs",
+            "--sizes: 'constant:1': task bright: input size: AttributeError: 'int' object "
+            "has no attribute 'size'; use --inputs",
         ),
         (
             ["loadgen", "call", "--task", "camera:bright", "--inputs", "camera:few"],
-            "--inputs: 'camera:few': the size function of task bright does not take the first argument: ",
+            "--inputs: 'camera:few': task bright: input size: AttributeError: 'str' object has no attribute",
         ),
         (
             ["loadgen", "call", "--task", "camera:bright", "--inputs", "camera:none"],
