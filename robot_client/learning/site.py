@@ -159,7 +159,8 @@ class SiteMemory:
             return  # stopped before its predicted time: the site may be as fast as predicted
         ahead = self.count_run()
         if isinstance(execution.failure, TaskError | CannotCross):
-            self._failures += not execution.started  # its setup failed: the site is at fault, not the task
+            if isinstance(execution.failure, TaskError) and not execution.started:
+                self._failures += 1  # its setup failed: the site is at fault, not the task
             return
         if not overtaken:  # a run that lost a race did not fail
             self._failures = 0 if ok else self._failures + 1
