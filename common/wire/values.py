@@ -13,7 +13,7 @@ import msgpack
 import numpy as np
 
 from offboard.common.dataclass_types import field_names, fields_of, rebuilt
-from offboard.common.errors import BadValue, ProtocolError
+from offboard.common.errors import BadValue, ProtocolError, describe
 from offboard.common.wire.blobs import (
     DTYPES,
     Array,
@@ -265,7 +265,10 @@ class _Decoder:
             raise ProtocolError(f"no dataclass {name!r:.80} is registered with this task")
         if fields.keys() != field_names(cls):
             raise ProtocolError(f"the fields of dataclass {name} differ from those on this side")
-        return rebuilt(cls, fields)
+        try:
+            return rebuilt(cls, fields)
+        except Exception as error:
+            raise ProtocolError(f"dataclass {name} refused its fields: {describe(error)}") from error
 
 
 def _shape(shape: Any) -> tuple[int, ...]:

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Iterable
 from typing import Any
 
-from offboard.common.errors import BadValue, CannotCross
+from offboard.common.errors import BadValue, CannotCross, describe
 from offboard.common.tasks import Kind, Task
 from offboard.common.wire.values import encode
 from offboard.robot_client.sites.runner import Execution
@@ -42,6 +42,8 @@ class CrossingCheck:
             encode(value, kind.types, name="result" if ran else "arguments")
         except BadValue as error:
             self._log(kind, str(error), ran=ran)
+        except Exception as error:  # noqa: BLE001 - such as a dict that another thread changes meanwhile
+            self._log(kind, describe(error), ran=ran)
 
     def _log(self, kind: Kind, why: str, *, ran: bool) -> None:
         if (kind.name, ran) not in self._logged:

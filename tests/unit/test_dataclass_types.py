@@ -246,6 +246,23 @@ def covered(number: float) -> float:
     return number
 
 
+@dataclass
+class Locked:
+    x: int = 0
+
+    def x_is(self) -> int:
+        return 5
+
+
+Locked.x = property(Locked.x_is)  # type: ignore[assignment]
+
+
+def test_a_class_that_refuses_a_field_is_an_error_of_the_message() -> None:
+    """No other exception reaches the thread that reads messages."""
+    with pytest.raises(ProtocolError, match="dataclass Locked refused its fields: AttributeError"):
+        decode(encode(Locked.__new__(Locked), [Locked]).frames, [Locked], {})
+
+
 def test_the_source_hash_covers_dataclasses() -> None:
     """Another class, or another field in its base, is another source."""
 

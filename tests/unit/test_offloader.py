@@ -233,6 +233,21 @@ def test_the_first_call_says_which_value_cannot_be_sent(
     ]
 
 
+def test_a_value_that_changes_while_it_is_checked_breaks_no_call(
+    make: Make, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The check of the first call logs whatever encoding raises."""
+
+    def changing(*_: object, **__: object) -> None:
+        raise RuntimeError("dictionary changed size during iteration")
+
+    monkeypatch.setattr("offboard.robot_client.execution.crossing_check.encode", changing)
+    with make(cloud_answers(), OnboardRunner()) as offload:
+        assert offload(unique, [1, 2]) == {1, 2}
+    assert all("dictionary changed size" in text for text in caplog.messages)
+    assert len(caplog.messages) == 2
+
+
 def test_a_site_cannot_be_named_both() -> None:
     """`where="both"` would mean two things."""
     with pytest.raises(ConfigError, match="a site cannot be named 'both'"):
