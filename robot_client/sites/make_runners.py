@@ -6,7 +6,6 @@ What a runner does is in the other files of this folder.
 from collections.abc import Mapping
 from pathlib import Path
 
-from offboard.common.errors import ConfigError
 from offboard.common.security.keys import robot_keys
 from offboard.common.task_states import TaskStates
 from offboard.robot_client.sites.cloud import CloudRunner
@@ -34,7 +33,7 @@ def make_runners(
             own = None if keys is None else robot_keys(Path(keys), site)
             runners.append(CloudRunner(endpoint, site=site, heartbeat_s=heartbeat_s, seed=seed, keys=own))
         runners.append(OnboardRunner(states=states))
-    except ConfigError:
+    except BaseException:
         for runner in runners:
             runner.close()
         raise
