@@ -6,7 +6,6 @@ What a runner does is in the other files of this folder.
 from collections.abc import Mapping
 from pathlib import Path
 
-from offboard.common.errors import ConfigError
 from offboard.common.security.keys import robot_keys
 from offboard.common.task_states import TaskStates
 from offboard.robot_client.sites.background import Background
@@ -39,7 +38,7 @@ def make_runners(
             )
             runners.append(server)
         runners.append(OnboardRunner(states=states, background=background))
-    except ConfigError:
+    except BaseException:
         for runner in runners:
             runner.close()
         raise
