@@ -46,15 +46,17 @@ class Switched(Line):
             self._pbb += shape
         variance, reach = self._reach(x, unit)
         side = math.copysign(1.0, error) if abs(error) > reach else 0.0
-        if self._is_change(side):
+        changed = self._is_change(side)
+        if changed:
             error = min(error, unit) if self.doubling else error
             self._loosen(min(1.0, (error / unit) ** 2), known)
             variance, reach = self._reach(x, unit)
         self._side = side
         beyond = min(max(0.0, error - reach) / unit, TAIL_MAX)
         self._tail += rate * (beyond - self._tail)
-        seen = max(0.0, min(error * error, 0.5 * reach * reach) - variance) / (unit * unit)
-        self._noise += rate * (seen - self._noise)
+        if not changed:
+            seen = max(0.0, min(error * error, 0.5 * reach * reach) - variance) / (unit * unit)
+            self._noise += rate * (seen - self._noise)
         self._correct(x, max(-reach, min(reach, error)), unit)
 
     def _is_change(self, side: float) -> bool:

@@ -70,15 +70,17 @@ class Line:
             self._pbb += shape
         variance, reach = self._reach(x, unit)
         side = math.copysign(1.0, error) if abs(error) > reach else 0.0
-        if side < 0 or (side != 0 and side == self._side):
+        changed = side < 0 or (side != 0 and side == self._side)
+        if changed:
             error = min(error, unit)  # a change at most doubles the time, until the next one confirms it
             self._loosen(min(1.0, (error / unit) ** 2), known)
             variance, reach = self._reach(x, unit)
         self._side = side
         beyond = min(max(0.0, error - reach) / unit, TAIL_MAX)
         self._tail += rate * (beyond - self._tail)
-        seen = max(0.0, min(error * error, 0.5 * reach * reach) - variance) / (unit * unit)
-        self._noise += rate * (seen - self._noise)
+        if not changed:  # a change is no noise
+            seen = max(0.0, min(error * error, 0.5 * reach * reach) - variance) / (unit * unit)
+            self._noise += rate * (seen - self._noise)
         self._correct(x, max(-reach, min(reach, error)), unit)
 
     def begin_as(self, other: "Line", x: float, y: float) -> None:
@@ -132,6 +134,10 @@ class Line:
         self._paa -= ka * pa
         self._pab -= ka * pb
         self._pbb -= kb * pb
+        if self.a < 0.0 and not self._together and self._paa > 0.0:
+            # No delay is negative, so the slope was too steep: take the likeliest one for a delay of 0.
+            self.b -= self.a * self._pab / self._paa
+            self.a = 0.0
 
 
 class RunningMean:
