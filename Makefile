@@ -14,7 +14,7 @@ PEERS_READY := $(VENV)/.peers-ready
 EXAMPLES_BIN := .cache/examples/bin
 EXAMPLES_READY := .cache/examples/.ready
 
-.PHONY: help demo install format lint type test unit integration compose chaos bench examples browser torch up down table lock wheel clean
+.PHONY: help demo install format lint type test unit integration compose chaos state bench examples browser torch up down table lock wheel clean
 
 help: ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -39,7 +39,7 @@ type: $(DEV_READY) ## check types with mypy, strict, on the unpacked wheel
 	cd $(CACHE)/typed && $(BIN_ABS)/python -m zipfile -e offboard-*.whl . && $(BIN_ABS)/mypy --config-file $(CURDIR)/pyproject.toml --cache-dir $(CACHE)/mypy -p offboard
 
 # Tests that may run in parallel with others.
-CROWDED := tests/unit tests/integration/executors tests/integration/keys tests/integration/toxiproxy $(addprefix tests/integration/test_,$(addsuffix .py,alone attacks blobs channel check compare cpu_time crashes dataset demo fuzz own_task local_testbed robot_workload wheel))
+CROWDED := tests/unit tests/integration/executors tests/integration/keys tests/integration/toxiproxy $(addprefix tests/integration/test_,$(addsuffix .py,alone attacks blobs channel check compare cpu_time crashes dataset demo fuzz own_task local_testbed robot_workload values_cross wheel))
 test: $(DEV_READY) ## run every test that this machine can run; skipped tests say why
 	$(BIN)/pytest --numprocesses 2 $(CROWDED)
 	$(BIN)/pytest $(addprefix --ignore ,$(CROWDED))
@@ -56,6 +56,9 @@ compose: $(DEV_READY) ## run the tests with real containers; needs a Docker engi
 chaos: $(DEV_READY) ## run each fault 20 times (3 times in containers), each scenario, and half an hour of faults
 	CHAOS=1 $(BIN)/pytest tests/chaos
 	$(BIN)/loadgen run soak --out out/soak
+
+state: $(DEV_READY) ## abuse a robot for ten minutes and count lost, wrong and hung calls, SEED=N: the same steps again
+	CHAOS=1 $(BIN)/pytest -s tests/state $(if $(SEED),--hypothesis-seed=$(SEED))
 
 bench: $(PEERS_READY) ## measure speed next to other libraries; needs an otherwise idle machine
 	$(BIN)/python -m benchmarks
