@@ -79,8 +79,7 @@ class Offloader:
             raise ConfigError(f"sites {given}: each site once, and {ONBOARD!r} among them")
         if BOTH in self._runners:
             raise ConfigError(f"a site cannot be named {BOTH!r}: where={BOTH!r} means all sites")
-        self._policy = policy
-        self._memories = memories
+        self._policy, self._memories = policy, memories
         self._allowance = allowance or Allowance()
         self._timeout_s = checked_timeout(timeout_s)
         self._observers = tuple(observers)
@@ -92,8 +91,7 @@ class Offloader:
         self._crossing = CrossingCheck()
         self._lock = threading.Lock()
         self._life = Lifetime(self._runners.values(), memories, self._lock)
-        self._numbers = itertools.count()
-        self._session = secrets.token_hex(4)
+        self._numbers, self._session = itertools.count(), secrets.token_hex(4)
         self.last: Record | None = None
 
     @classmethod

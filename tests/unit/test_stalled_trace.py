@@ -174,8 +174,8 @@ def test_an_offloader_answers_and_closes_on_a_stalled_disk(
 ) -> None:
     """Every task is answered, and `close` returns."""
     offload = Offloader.connect(trace=tmp_path / "trace.jsonl")
-    assert offload._recording is not None
-    trace = offload._recording.observers[0].__self__  # type: ignore[attr-defined]
+    assert offload._life.recording is not None
+    trace = offload._life.recording.observers[0].__self__  # type: ignore[attr-defined]
     stall(trace)
     count = WAITING_MAX + 200
     assert [offload(echo, number) for number in range(count)] == list(range(count))

@@ -25,7 +25,8 @@ def test_a_restart_at_once_predicts_the_same(robot: Robot, name: str) -> None:
     with robot.started(name) as offload:
         robot.ask(offload, 150, store_worked)
         before = robot.outlooks(offload, store_worked)
-    after = robot.outlooks(robot.started(name), store_worked)
+    with robot.started(name) as again:
+        after = robot.outlooks(again, store_worked)
     for site in (ONBOARD, CLOUD):
         for field in (
             "predicted_s",
