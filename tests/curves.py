@@ -15,6 +15,7 @@ import zmq
 import zmq.utils.monitor
 
 from offboard.common.wire import messages as wire
+from tests.flags import completed
 
 ROOT = Path(__file__).parents[1]
 WAIT_S = 20.0
@@ -37,11 +38,12 @@ class Served:
     """
 
     def __init__(self, *flags: str, files: int | None = None) -> None:
-        command = [sys.executable, "-W", "error", "-m", "offboard.cloud_server", "--tasks", "tests.probes"]
-        free = ["--listen", "tcp://127.0.0.1:0", "--http", "127.0.0.1:0", "--workers", "2"]
+        command = [sys.executable, "-W", "error", "-m", "offboard.cloud_server"]
+        free = {"listen": "tcp://127.0.0.1:0", "http": "127.0.0.1:0"}
+        command += completed(flags, tasks="tests.probes", workers="2", **free)
         limit = [] if files is None else ["prlimit", f"--nofile={files}:", "--"]
         self.process = subprocess.Popen(
-            [*limit, *command, *free, *flags],
+            [*limit, *command],
             stderr=subprocess.PIPE,
             text=True,
             cwd=ROOT,

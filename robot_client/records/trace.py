@@ -23,7 +23,7 @@ from offboard.robot_client.sites.runner import UNMEASURED, Condition, Execution
 
 WRITE_EVERY_S = 0.5
 WAITING_MAX = 1000  # records in memory
-ROOM_WAIT_S, ROOM_POLL_S = 0.1, 0.001  # for which the first task without room waits for the disk
+ROOM_WAIT_S, ROOM_POLL_S = 0.5, 0.001  # for which the first task without room waits for the disk
 CLOSE_WAIT_S = 5.0  # that `close` waits for the disk
 
 _OUTLOOK_FIELDS = ("predicted_s", "spread_s", "low_s", "high_s", "age", "failures")

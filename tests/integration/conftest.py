@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from tests.flags import completed
 from tests.relays import WAIT_S, WAN, Wan
 
 
@@ -54,8 +55,8 @@ def wan() -> Iterator[Callable[..., Wan]]:
     with contextlib.ExitStack() as stack:
 
         def start(to: int, *flags: str) -> Wan:
-            command = [sys.executable, "-c", WAN, "--to", f"127.0.0.1:{to}", "--listen", "127.0.0.1:0"]
-            command += ["--http", "127.0.0.1:0", *flags]
+            command = [sys.executable, "-c", WAN, "--to", f"127.0.0.1:{to}"]
+            command += completed(flags, listen="127.0.0.1:0", http="127.0.0.1:0")
             process = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
             stack.callback(process.kill)
             assert process.stdout is not None

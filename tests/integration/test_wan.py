@@ -17,6 +17,7 @@ from offboard.loadgen.relay.control_api import BODY_BYTES_MAX
 from offboard.loadgen.relay.link.delay_samples import SAMPLES_MAX
 from offboard.loadgen.relay.link_schedule import EVENTS_MAX
 from offboard.loadgen.relay.wan import WanConfig
+from tests.flags import completed
 from tests.relays import QUIET_S, WAIT_S, WAN, echo, quietest, receive, round_trip_s, silent, wait_until
 
 pytestmark = pytest.mark.integration
@@ -288,17 +289,8 @@ def test_a_port_in_use_is_a_mistake_of_the_user(flag: str) -> None:
     """A port that is in use gives exit code 2 and one line that names the flag and the port."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         endpoint = f"127.0.0.1:{taken.getsockname()[1]}"
-        command = [
-            sys.executable,
-            "-c",
-            WAN,
-            "--listen",
-            "127.0.0.1:0",
-            "--http",
-            "127.0.0.1:0",
-            flag,
-            endpoint,
-        ]
+        command = [sys.executable, "-c", WAN]
+        command += completed([flag, endpoint], listen="127.0.0.1:0", http="127.0.0.1:0")
         done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S)
     assert done.returncode == 2
     assert done.stderr == f"wan: {flag}: cannot listen on {endpoint}: Address already in use\n"

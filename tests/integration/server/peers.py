@@ -16,6 +16,7 @@ from offboard.cloud_server.metrics import Metrics
 from offboard.cloud_server.server import Limits, Server
 from offboard.common.wire import messages as wire
 from offboard.common.wire.messages import Reply, Request
+from tests.flags import completed
 
 ROOT = Path(__file__).parents[3]
 WAIT_S = 8.0
@@ -144,7 +145,7 @@ class Command:
     """`python -m offboard.cloud_server` as a child process. It is ready once it is constructed."""
 
     def __init__(self, folder: Path, *flags: str) -> None:
-        self.process = start(folder, "--listen", "tcp://127.0.0.1:0", "--http", "127.0.0.1:0", *flags)
+        self.process = start(folder, *flags)
         self.lines: list[str] = []
         assert self.process.stderr is not None
         for line in self.process.stderr:
@@ -159,8 +160,10 @@ class Command:
 
 
 def start(folder: Path, *flags: str) -> "subprocess.Popen[str]":
+    free = {"listen": "tcp://127.0.0.1:0", "http": "127.0.0.1:0"}
+    command = [sys.executable, "-W", "error", "-m", "offboard.cloud_server"]
     return subprocess.Popen(
-        [sys.executable, "-W", "error", "-m", "offboard.cloud_server", "--tasks", "served_tasks", *flags],
+        [*command, *completed(flags, tasks="served_tasks", **free)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

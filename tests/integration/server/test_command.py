@@ -40,8 +40,7 @@ def test_a_wrong_flag_is_one_line_and_exit_code_2(
         "zmq": running.server.endpoint,
         "http": web.address.rpartition(":")[2],
     }
-    free = ["--listen", "tcp://127.0.0.1:0", "--http", "127.0.0.1:0", "--log", "error"]
-    process = start(folder, *free, *(flag.format(**ports) for flag in flags))
+    process = start(folder, "--log", "error", *(flag.format(**ports) for flag in flags))
     _, text = process.communicate(timeout=WAIT_S)
     web.close()
     assert process.returncode == 2, text
