@@ -22,7 +22,7 @@ RUN pip wheel --quiet --no-deps --wheel-dir /wheels .
 # All images get the same file times: containers share the cache of the compiled planner, and numba compares file times.
 RUN printf '%s\n' '#!/bin/sh' 'set -e' 'pip install --quiet --no-cache-dir --no-deps /wheels/*.whl' \
       'find /opt/offboard/lib -path "*/common/*.py" -exec touch -r /wheels/install {} +' \
-      'find /opt/offboard/lib -path "*/robot_client/*.py" -exec touch -r /wheels/install {} +' > /wheels/install \
+      'find /opt/offboard/lib -path "*/loadgen/robot/*.py" -exec touch -r /wheels/install {} +' > /wheels/install \
  && chmod +x /wheels/install
 
 FROM base AS robot

@@ -130,13 +130,23 @@ def main() -> int:
     return 0
 
 
-def play(checkout: Path, file: Path, out: Path, *, policy: str, seed: int, tasks: int) -> None:
+def play(
+    checkout: Path,
+    file: Path,
+    out: Path,
+    *,
+    policy: str,
+    seed: int,
+    tasks: int,
+    predictor: str | None = None,
+) -> None:
     """Play one run, unless it was played before."""
     if (out / SUMMARY).is_file():
         return
     print(f"{file.stem}: {out.name}", file=sys.stderr, flush=True)
     command = [sys.executable, "-m", "offboard.loadgen", "run", str(file), "--policy", policy]
     command += ["--seed", str(seed), "--tasks", str(tasks), "--out", str(out)]
+    command += [] if predictor is None else ["--predictor", predictor]
     done = subprocess.run(
         command,
         cwd=checkout,
@@ -167,9 +177,9 @@ def read(out: Path) -> Played:
     return Played(times, predicted, 100 * float(np.mean(chosen)) if chosen else 0.0)
 
 
-def table(name: str, runs: Mapping[str, Sequence[Played]]) -> Table:
+def table(name: str, runs: Mapping[str, Sequence[Played]], base: str = BEFORE) -> Table:
     """The figures of one case; ratios are those of the sums over the tasks of all seeds."""
-    before = together(runs[BEFORE]) if BEFORE in runs else None
+    before = together(runs[base]) if base in runs else None
     constants = [together(runs[site]).mean() for site in CONSTANTS if site in runs]
     rows = []
     for strategy, played in runs.items():
@@ -185,7 +195,7 @@ def table(name: str, runs: Mapping[str, Sequence[Played]]) -> Table:
                 *(bias(played, site) for site in CONSTANTS),
             ]
         )
-    columns = ["", "mean ms", "P95 ms", f"/ {BEFORE}", "/ better constant", "cloud %"]
+    columns = ["", "mean ms", "P95 ms", f"/ {base}", "/ better constant", "cloud %"]
     columns += [f"predicted / true {site}" for site in CONSTANTS]
     seeds = len(next(iter(runs.values())))
     return Table(f"{name}, {seeds} seeds, from task {FROM_TASK}", columns, rows)
@@ -216,7 +226,7 @@ def ratio(times_s: Column, before: Column) -> str:
     ends: tuple[Any, ...] = Blocks(len(before)).intervals(
         lambda picks: {"r": times_s[picks].sum(axis=-1) / before[picks].sum(axis=-1)}
     )
-    bounds = f" [{ends[0]['r']:.3f}, {ends[1]['r']:.3f}]" if ends else ""
+    bounds = f" [{ends[0]['r']:.3f}, {ends[1]['r']:.3f}]" if ends[0] else ""
     return f"{times_s.sum() / before.sum():.3f}{bounds}"
 
 

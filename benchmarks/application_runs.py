@@ -16,11 +16,11 @@ from offboard.common.tasks import Kind, kinds
 from offboard.loadgen.compare.compare import rotated
 from offboard.loadgen.compare.resume import play_once
 from offboard.loadgen.play.run_files import ANSWERS, SUMMARY, TRACE
+from offboard.loadgen.robot.answers import value_of
+from offboard.loadgen.robot_files import read_trace
 from offboard.loadgen.scenario.outcome_files import read_lines
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
-from offboard.robot_client.records import trace
-from offboard.robot_client.simulated.answers import value_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,7 @@ class Progress:
 
 
 def _known(out: Path, kind: Kind) -> Iterator[tuple[int, Known]]:
-    by_id = {record["id"]: record for record in trace.read(out / TRACE)}
+    by_id = {record["id"]: record for record in read_trace(out / TRACE)}
     for line in read_lines(out / ANSWERS):
         if (record := by_id.get(line["id"])) is not None:
             decision = record["decision"]

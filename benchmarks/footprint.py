@@ -15,7 +15,7 @@ from benchmarks.measure import Requirement, Table, interleaved
 from benchmarks.servers import READY_S, Server, cloud_server, running
 from offboard.common.wire import messages as wire
 
-COMMANDS = {"robot-client drive": "robot_client drive", "cloud-server": "cloud_server", "loadgen": "loadgen"}
+COMMANDS = {"robot-client check": "robot_client check", "cloud-server": "cloud_server", "loadgen": "loadgen"}
 ROBOTS = 500  # connected and idle
 REST_S = 10.0
 HEAVY = ("zmq", "numba")

@@ -3,6 +3,7 @@
 libzmq asks at each handshake only. If a robot is removed later, this file closes its connection.
 """
 
+import errno
 import logging
 import threading
 import time
@@ -26,6 +27,7 @@ RELOAD_S = 1.0  # between two checks of the folder
 SETTLED_NS = 2_000_000_000  # from this age on, the time stamp of a file shows every later change
 ROBOTS_MAX = 10_000  # key files; those beyond it, in the order of their names, are ignored
 CUT_KEPT = 4096  # connections remembered as cut off, so that their waiting tasks do not run
+NO_FILE = (errno.EMFILE, errno.ENFILE)  # connections have taken all files
 LOG_PAUSE_S = 10.0  # at least, between two warnings about refused robots
 
 log = logging.getLogger("offboard.cloud_server")
@@ -166,6 +168,8 @@ class Authorisation:
                 if path.suffix == PUBLIC and not path.name.startswith(".")
             )
         except OSError as error:
+            if error.errno in NO_FILE:
+                return [f"{self._folder}: {error.strerror}; the robots stay as they are"]
             files = []
             problems.append(f"{self._folder}: {error.strerror}; it must hold the public key of each robot")
         seen = [(path, _state(path)) for path in files]
@@ -178,6 +182,8 @@ class Authorisation:
             try:
                 known[read_public(path).decode()] = path.stem
             except ConfigError as error:
+                if isinstance(error.__cause__, OSError) and error.__cause__.errno in NO_FILE:
+                    return [str(error)]
                 problems.append(str(error))
         # A recently changed file may change again without a later time stamp: then read it again.
         recent_ns = time.time_ns() - SETTLED_NS

@@ -137,6 +137,7 @@ class HttpServer:
         config = uvicorn.Config(
             app,
             http=PacedHttp,
+            ws="none",
             log_level="error",  # otherwise an attacker could fill the log with bad requests
             log_config=None,
             access_log=False,

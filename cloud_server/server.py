@@ -29,7 +29,7 @@ from offboard.common.host.load import SERVER_EVERY_S, Load
 from offboard.common.host.load_watch import LoadWatch
 from offboard.common.security.keys import KeyPair
 from offboard.common.wire.blobs import BlobStore, Buffer
-from offboard.common.wire.channel import Channel
+from offboard.common.wire.channel import Channel, make_context
 from offboard.common.wire.messages import (
     Blob,
     Cancel,
@@ -89,7 +89,7 @@ class Server:
         self._closed = False
         self._started = self._last_turn = time.monotonic()
         self._last_warning = -float("inf")
-        self._context = zmq.Context()
+        self._context = make_context(f"--listen: {listen!r}")
         self._access: Access = Everyone()
         if keys is not None and robots is not None:
             self._access = Authorisation(self._context, robots, metrics)

@@ -57,7 +57,8 @@ class Outcome:
 def run_task(call: Call, states: TaskStates) -> Outcome:
     """Decode the arguments, call the task, encode its result. Every exception becomes the outcome."""
     cpu_before_s, started = cpu_time.used_s(), time.perf_counter()
-    status, failure, unwanted, traceback = "ok", "", False, ""
+    status, failure, traceback = "ok", "", ""
+    in_task = server_fault = False
     result: list[Buffer] = []
     try:
         kind = tasks.kind_named(call.kind)
@@ -65,13 +66,18 @@ def run_task(call: Call, states: TaskStates) -> Outcome:
         if not isinstance(args, list):
             raise ProtocolError("the body is not a list of arguments")
         with states.lend(kind) as state:
+            in_task = True
             value = call_while(call.wanted, kind.function, (*state, *args))
-        result = encode(value, kind.types).frames
+            in_task = False
+        result = encode(value, kind.types, name="result").frames
     except BaseException as error:  # noqa: BLE001 - a task may raise anything
-        status, failure, unwanted = "failed", describe(error), isinstance(error, Unwanted)
-        traceback = "" if unwanted else traceback_of(error)
+        status, failure = "failed", describe(error)
+        server_fault = not in_task or isinstance(error, Unwanted)
+        traceback = "" if server_fault else traceback_of(error)
     run_s, cpu_s = time.perf_counter() - started, cpu_time.used_s() - cpu_before_s
-    return Outcome(status, failure, run_s, cpu_s, frames=result, server_fault=unwanted, traceback=traceback)
+    return Outcome(
+        status, failure, run_s, cpu_s, frames=result, server_fault=server_fault, traceback=traceback
+    )
 
 
 def warm_kinds(states: TaskStates) -> None:

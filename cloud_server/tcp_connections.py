@@ -82,7 +82,8 @@ class UnreadLimit:
             self._lowest = now if grows else min(self._lowest, now)
             pause_s = LOOK_AGAIN_S if grows else LOOK_S
             if grows:
-                self.look()
+                with contextlib.suppress(OSError):  # no file is free; look again after the pause
+                    self.look()
         os.close(self._statm)
 
     def _resident_bytes(self) -> int:
@@ -118,10 +119,15 @@ class UnreadLimit:
 def other_end(file: int) -> Any:
     """The address at the other end of this connection; None if the file is no open connection."""
     try:
-        with socket.socket(fileno=os.dup(file)) as held:
-            return held.getpeername()
+        borrowed = socket.socket(fileno=file)  # not a duplicate: connections may have taken all files
     except OSError:
         return None
+    try:
+        return borrowed.getpeername()
+    except OSError:
+        return None
+    finally:
+        borrowed.detach()
 
 
 def end(file: int, expected: Any) -> None:

@@ -32,7 +32,7 @@ ANSWER_BYTES_MAX = (1 << 31) - (1 << 20)  # no message is larger
 PR_SET_PDEATHSIG = 1
 # Prepared in advance, for the case that no memory is left to build an answer.
 NOTHING_LEFT: bytes = msgpack.packb(
-    ["failed", "MemoryError: too little memory is left for an answer", 0.0, None, [], False, False, "", True]
+    ["failed", "MemoryError: too little memory is left for an answer", 0.0, None, [], True, False, "", True]
 )
 
 
@@ -129,7 +129,7 @@ def _message(outcome: Outcome) -> bytes:
     size = byte_count(outcome.frames)
     if size > ANSWER_BYTES_MAX:
         error = f"BadValue: the result takes {size} bytes, at most {ANSWER_BYTES_MAX} are allowed"
-        outcome = replace(outcome, status="failed", error=error, frames=[], traceback="")
+        outcome = replace(outcome, status="failed", error=error, frames=[], server_fault=True, traceback="")
     error, full = outcome.error[:ERROR_LENGTH_MAX], _full(outcome.error)
     fields = [outcome.status, error, outcome.run_s, outcome.cpu_s, outcome.frames, outcome.server_fault]
     fields += [outcome.crashed, outcome.traceback]

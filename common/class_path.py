@@ -18,7 +18,7 @@ def find_class(path: str, what: str) -> Any:
         found = getattr(importlib.import_module(module), name, None)
     except ConfigError:  # such as a missing extra
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         why = f"module {module!r} cannot be imported: {describe(error)}"
         raise ConfigError(f"{what} {path!r}: {why}") from error
     if not callable(found):

@@ -103,6 +103,7 @@ class CommandParser(argparse.ArgumentParser):
         )
         self.flags: list[str] = []  # those of `add_flags`
         self._rare: dict[argparse.Action, str] = {}
+        self.register("action", None, _StoreOnce)  # what a flag does unless it says otherwise
         about = "show this help, and exit"
         self._short_help = self.add_argument(*HELP, action=_ShowHelp, rare=False, help=about)
 
@@ -166,6 +167,25 @@ class _ShowHelp(argparse.Action):
         parser.exit()
 
 
+class _Once(argparse.Action):
+    """A flag with one value. If it is given again, that is an error: one of the values would be ignored."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, flag: Any = None
+    ) -> None:
+        if flag and getattr(namespace, self.dest) is not None:
+            parser.error(f"{flag} is given twice, but takes one value")
+        super().__call__(parser, namespace, values, flag)
+
+
+class _StoreOnce(_Once, argparse._StoreAction):
+    """--name VALUE"""
+
+
+class _SwitchOnce(_Once, argparse.BooleanOptionalAction):
+    """--name or --no-name"""
+
+
 class _Help(argparse.HelpFormatter):
     """As wide as the terminal. argparse itself would import shutil, and with it three compressors, to ask."""
 
@@ -187,10 +207,10 @@ def _shape(field: Any, cls: type) -> dict[str, Any]:
     """How a flag is written: --name VALUE, repeated for a list; --name or --no-name for a boolean."""
     base, many = type_of(field, cls)
     if base is bool:
-        return {"action": argparse.BooleanOptionalAction}
+        return {"action": _SwitchOnce}
     metavar = field.metadata["metavar"] or "|".join(field.metadata["choices"] or ())
     metavar = metavar or {int: "K", float: "X", Path: "FILE"}.get(base, "TEXT")
-    return {"metavar": metavar, "action": "append" if many else "store"}
+    return {"metavar": metavar, "action": "append" if many else None}
 
 
 def _obvious(default: Any) -> bool:

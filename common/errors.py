@@ -1,5 +1,7 @@
 """All errors that Offboard raises, and what happens when each one is caught."""
 
+import threading
+
 
 class OffloadError(Exception):
     """Base of all errors raised by Offboard."""
@@ -9,8 +11,21 @@ def describe(error: BaseException) -> str:
     """`Type: text` of any exception, even if its text cannot be read."""
     try:
         return f"{type(error).__name__}: {error}"
-    except Exception:  # noqa: BLE001 - a user's __str__ may raise anything
+    except BaseException as unreadable:  # a user's __str__ may raise anything
+        if is_interrupt(unreadable):
+            raise
         return f"{type(error).__name__}: (it has no readable text)"
+
+
+def of_task(kind: str, text: str) -> str:
+    """The text of an error, with the name of the task in front unless the text has it."""
+    return text if f"task {kind}" in text else f"task {kind}: {text}"
+
+
+def is_interrupt(error: BaseException) -> bool:
+    """Whether this may be the Ctrl-C of a user, which Python raises in the main thread."""
+    in_main = threading.current_thread() is threading.main_thread()
+    return isinstance(error, KeyboardInterrupt) and in_main
 
 
 class ConfigError(OffloadError):
@@ -48,7 +63,7 @@ class TaskFailed(TaskError):
 
 
 class BadValue(TaskError):
-    """An argument or result cannot be sent."""
+    """A value cannot be sent, or an input size is none. A call raises it for the size only."""
 
 
 class CloudError(OffloadError):
@@ -69,6 +84,10 @@ class Overtaken(CloudError):
 
 class CloudBroken(CloudError):
     """The connection was lost, or the server cannot run this task."""
+
+
+class CannotCross(CloudBroken):
+    """The arguments or the result of this task cannot be sent, or not be read on the other side."""
 
 
 class Unwanted(OffloadError):

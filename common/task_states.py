@@ -8,13 +8,15 @@ import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
+from contextvars import ContextVar
+from dataclasses import dataclass, field
 from typing import Any
 
-from offboard.common.errors import TaskFailed, describe
+from offboard.common.errors import TaskFailed, describe, is_interrupt
 from offboard.common.tasks import Kind
 from offboard.common.tracebacks import traceback_of
 
+SETUP_AGAIN_S = 30.0  # after a setup has raised; until then, its error is the answer of each call
 SETUPS_MAX = 64  # setups whose times are remembered: more than the tasks of one queue can wait for
 
 _NOTHING: AbstractContextManager[tuple[Any, ...]] = nullcontext(())  # shared: most kinds have no setup
@@ -26,10 +28,28 @@ class _Setup:
     ended_s: float = float("inf")
 
 
+@dataclass(eq=False, slots=True)
+class _Loan:
+    """A state that the task which runs here has. `nested` is held by a call of the same kind that it makes.
+
+    `outer`: the loan of the task that called this one.
+    """
+
+    states: "TaskStates"
+    kind: str
+    state: Any
+    outer: "_Loan | None"
+    nested: threading.Lock = field(default_factory=threading.Lock)
+
+
+_loan: ContextVar[_Loan | None] = ContextVar("loan", default=None)
+
+
 class TaskStates:
     """The states of `workers` workers, which run one task each at a time. Any thread may call any method.
 
-    A state serves one task at a time. The next task may use it in another thread.
+    A state serves one task at a time, and calls of the same kind that this task makes. The next task may use
+    it in another thread.
     """
 
     def __init__(self, workers: int) -> None:
@@ -37,11 +57,17 @@ class TaskStates:
         self._free: defaultdict[str, list[Any]] = defaultdict(list)  # by kind, as the next two
         self._made: Counter[str] = Counter()  # with those that are being made
         self._making: Counter[str] = Counter()
+        self._failed: dict[str, tuple[TaskFailed, float]] = {}  # the last setup raised; until when that holds
         self._setups: deque[_Setup] = deque(maxlen=SETUPS_MAX)
         self._changed = threading.Condition()
 
     def prepare(self, kind: Kind) -> None:
-        """Make the missing states of a kind, one after the other. TaskFailed if its setup raises."""
+        """Make the missing states of a kind, one after the other. TaskFailed if its setup raises.
+
+        A setup that has raised is tried again.
+        """
+        with self._changed:
+            self._failed.pop(kind.name, None)
         while kind.setup is not None and not self.ready(kind):
             with self._changed:
                 if self._made[kind.name] == self._workers:
@@ -59,17 +85,25 @@ class TaskStates:
     def lend(self, kind: Kind) -> AbstractContextManager[tuple[Any, ...]]:
         """The arguments that come before those of the caller: a state, or nothing if the kind has no setup.
 
-        If no state is free, it is made now, or else the call waits for one. TaskFailed if the setup raises.
+        If no state is free, it is made now, or else the call waits for one. TaskFailed if the setup raises,
+        or has raised in the last SETUP_AGAIN_S.
         """
         return _NOTHING if kind.setup is None else self._lent(kind)
 
     @contextmanager
     def _lent(self, kind: Kind) -> Iterator[tuple[Any, ...]]:
-        state = self._take(kind)
-        try:
-            yield (state,)
-        finally:
-            self._give_back(kind, state)
+        outer = caller = _loan.get()
+        while caller is not None and (caller.states is not self or caller.kind != kind.name):
+            caller = caller.outer
+        with nullcontext() if caller is None else caller.nested:
+            state = self._take(kind) if caller is None else caller.state
+            token = _loan.set(_Loan(self, kind.name, state, outer))
+            try:
+                yield (state,)
+            finally:
+                _loan.reset(token)
+                if caller is None:
+                    self._give_back(kind, state)
 
     def call(self, kind: Kind, args: Sequence[Any]) -> Any:
         """Call the function of a kind directly."""
@@ -92,9 +126,13 @@ class TaskStates:
     def _take(self, kind: Kind) -> Any:
         with self._changed:
             while not self._free[kind.name]:
-                if self._made[kind.name] < self._workers:
-                    self._reserve(kind)
-                    break
+                failure, until_s = self._failed.get(kind.name, (None, 0.0))
+                if failure is None or time.perf_counter() >= until_s:
+                    if self._made[kind.name] < self._workers:
+                        self._reserve(kind)
+                        break
+                elif not self._made[kind.name]:
+                    raise TaskFailed(str(failure), failure.traceback) from failure.__cause__
                 self._changed.wait()
             else:
                 return self._free[kind.name].pop()
@@ -107,17 +145,23 @@ class TaskStates:
     def _make(self, kind: Kind) -> Any:
         assert kind.setup is not None
         setup, made = _Setup(time.perf_counter()), False
+        failure: TaskFailed | None = None
         with self._changed:
             self._setups.append(setup)
         try:
             state = kind.setup()
             made = True
         except BaseException as error:
+            if is_interrupt(error):
+                raise
             text = f"setup of task {kind.name}: {describe(error)}"
-            raise TaskFailed(text, traceback_of(error, TaskStates._make)) from error
+            failure = TaskFailed(text, traceback_of(error, TaskStates._make))
+            raise failure from error
         finally:
             setup.ended_s = time.perf_counter()
             with self._changed:
+                if failure is not None:
+                    self._failed[kind.name] = failure, setup.ended_s + SETUP_AGAIN_S
                 self._making[kind.name] -= 1
                 self._made[kind.name] -= not made
                 self._changed.notify_all()

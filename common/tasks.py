@@ -7,17 +7,20 @@ import importlib
 import inspect
 import itertools
 import math
+import sys
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from offboard.common.errors import BadValue, ConfigError, UnknownTask, describe
+from offboard.common.dataclass_types import check_types, field_names
+from offboard.common.errors import BadValue, ConfigError, UnknownTask, describe, is_interrupt
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 NAME_LENGTH_MAX = 64
 KINDS_MAX = 256  # a `hello` message names all of them
+OPTIONS = ("deadline_s", "function", "observe", "timeout_s", "where")  # of a call, in this version or others
 SIZE_NUMBERS_MAX = 8  # a size sums up the arguments; with more numbers, a window says too little of each
 
 Size = float | tuple[float, ...]  # a tuple has 2 to SIZE_NUMBERS_MAX numbers
@@ -60,8 +63,7 @@ class Kind:
 
     def size_of(self, args: tuple[Any, ...]) -> Size:
         """The input size d of a call. BadValue unless it is finite, not negative and as long as before."""
-        given: Any = self.size(*args)
-        numbers = self._numbers(given) if isinstance(given, tuple | list) else (float(given),)
+        numbers = self._numbers(args)
         for number in numbers:
             if not (math.isfinite(number) and number >= 0):
                 raise BadValue(f"task {self.name}: input size {number} is not a finite number >= 0")
@@ -74,14 +76,20 @@ class Kind:
         """How many numbers a size has; None before the first one."""
         return self._counts[0] if self._counts else None
 
-    def _numbers(self, given: Sequence[Any]) -> tuple[float, ...]:
-        if not 1 <= len(given) <= SIZE_NUMBERS_MAX:
-            allowed = f"1 to {SIZE_NUMBERS_MAX} are allowed"
-            raise BadValue(f"task {self.name}: input size has {len(given)} numbers; {allowed}")
+    def _numbers(self, args: tuple[Any, ...]) -> tuple[float, ...]:
         try:
-            return tuple(map(float, given))
-        except (TypeError, ValueError, OverflowError) as error:
+            given: Any = self.size(*args)
+            if not isinstance(given, tuple | list):
+                return (float(given),)
+            numbers = tuple(map(float, given))
+        except BaseException as error:  # the function is the user's own
+            if is_interrupt(error):
+                raise
             raise BadValue(f"task {self.name}: input size: {describe(error)}") from error
+        if not 1 <= len(numbers) <= SIZE_NUMBERS_MAX:
+            allowed = f"1 to {SIZE_NUMBERS_MAX} are allowed"
+            raise BadValue(f"task {self.name}: input size has {len(numbers)} numbers; {allowed}")
+        return numbers
 
     def _check_count(self, count: int) -> None:
         if not self._counts:
@@ -123,7 +131,8 @@ def task(
 ) -> Callable[[F], F]:
     """Register a function as a kind of task. It can still be called as an ordinary function.
 
-    Robot and server load the same module. If the source of a kind differs between them, it runs onboard.
+    Robot and server load the same module. If the source of the function, of its setup or of its dataclasses
+    differs between them, the task stays onboard.
     If `size` returns several numbers, the predictor `least-squares` uses all of them, and every other one
     uses the first; `parts` predicts from the work instead if the kind tells it (by the first number too).
     """
@@ -132,26 +141,25 @@ def task(
     if len(_kinds) >= KINDS_MAX:
         raise ConfigError(f"task {name}: {KINDS_MAX} tasks are registered already, the most allowed")
 
+    check_types(name, types)
+
     def register(function: F) -> F:
+        _check_ordinary(name, function=function, size=size, setup=setup, work=work, warm=warm)
         signature = inspect.signature(function)
         if setup is not None:
             _check_first_parameter(name, signature)
         parameters = _without_state(signature, setup).parameters.values()
-        for parameter in parameters:
-            if parameter.kind in (parameter.KEYWORD_ONLY, parameter.VAR_KEYWORD):
-                raise ConfigError(
-                    f"task {name}: parameter {parameter.name!r} is keyword-only; make it positional"
-                )
+        _check_parameters(name, parameters)
         fixed = all(parameter.kind != parameter.VAR_POSITIONAL for parameter in parameters)
         count = len(parameters) if fixed else None
         kind = Kind(
             name, function, size, duplicate,
-            types=types, warm=warm, source_hash=_source_hash(function), work=work, positional=count,
-            setup=setup,
+            types=tuple(types), warm=warm, source_hash=_source_hash(function, setup, types), work=work,
+            positional=count, setup=setup,
         )  # fmt: skip
         known = _kinds.get(name)
-        if known is not None and known.source_hash != kind.source_hash:
-            raise ConfigError(f"task {name} is registered twice, with different source; rename one of them")
+        if known is not None:
+            _check_same(known, kind)
         _kinds[name] = kind
         return function
 
@@ -201,7 +209,7 @@ def load_modules(names: Iterable[str]) -> None:
             raise ConfigError(f"task module {name!r} is not the name of a module; did you mean {meant!r}?")
         try:
             importlib.import_module(name)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             where = _where(name) if _is_missing(name, error) else ""
             raise ConfigError(f"task module {name!r} cannot be imported: {describe(error)}{where}") from error
 
@@ -215,7 +223,7 @@ def _meant(name: str) -> str:
     return parts[-1] if file.startswith(("/", "..")) else ".".join(parts)
 
 
-def _is_missing(name: str, error: Exception) -> bool:
+def _is_missing(name: str, error: BaseException) -> bool:
     """Whether the module itself was not found, rather than one that it imports."""
     return isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}.")
 
@@ -224,6 +232,50 @@ def _where(name: str) -> str:
     if name.startswith("examples."):
         return "; examples/ is only in a checkout: start the command in the folder of the checkout"
     return "; it is looked for in this folder and on PYTHONPATH"
+
+
+def _check_ordinary(name: str, **functions: Callable[..., Any] | None) -> None:
+    for place, function in functions.items():
+        for lazy in (inspect.iscoroutinefunction, inspect.isgeneratorfunction, inspect.isasyncgenfunction):
+            if lazy(function):
+                raise ConfigError(
+                    f"task {name}: {place} {_name(function)} is a coroutine or generator function; "
+                    "use an ordinary function that returns its result"
+                )
+
+
+def _check_parameters(name: str, parameters: Iterable[inspect.Parameter]) -> None:
+    for parameter in parameters:
+        if parameter.kind in (parameter.KEYWORD_ONLY, parameter.VAR_KEYWORD):
+            raise ConfigError(
+                f"task {name}: parameter {parameter.name!r} is keyword-only; make it positional"
+            )
+        if parameter.name in OPTIONS:
+            raise ConfigError(
+                f"task {name}: a parameter cannot be named {parameter.name!r}, "
+                "an option of the call; rename it"
+            )
+
+
+def _check_same(known: Kind, kind: Kind) -> None:
+    """ConfigError unless both are one function, whose module was loaded again or is also the script."""
+    first, second = known.function, kind.function
+    if _file(first) != _file(second) or _name(first) != _name(second):
+        by = f"by {first.__module__}.{_name(first)} and by {second.__module__}.{_name(second)}"
+    elif known.source_hash != kind.source_hash:
+        by = "with different source"
+    else:
+        return
+    raise ConfigError(f"task {kind.name} is registered twice, {by}; rename one of them")
+
+
+def _file(function: Callable[..., Any]) -> str:
+    module = function.__module__
+    return getattr(sys.modules.get(module), "__file__", None) or module
+
+
+def _name(function: Callable[..., Any] | None) -> str:
+    return getattr(function, "__qualname__", None) or repr(function)
 
 
 def _check_first_parameter(name: str, signature: inspect.Signature) -> None:
@@ -239,12 +291,23 @@ def _without_state(signature: inspect.Signature, setup: object) -> inspect.Signa
     return signature.replace(parameters=given)
 
 
-def _source_hash(function: Callable[..., Any]) -> str:
-    """SHA-256 of the source of a function. An empty text, which matches nothing, if there is no source."""
-    try:
-        source = textwrap.dedent(inspect.getsource(function))
-    except (OSError, TypeError):
+def _source_hash(function: Callable[..., Any], setup: Callable[[], Any] | None, types: Iterable[type]) -> str:
+    """SHA-256 of the source of a function, its setup and its dataclasses, with the names of their fields.
+
+    An empty text, which matches nothing, if the function has no source.
+    """
+    if not _source(function):
         return ""
+    parts = [_source(function), _source(setup)]
+    for one in types:
+        parts += [_source(one), *sorted(field_names(one))]
     import hashlib  # it loads OpenSSL, which --help does not need
 
-    return hashlib.sha256(source.encode()).hexdigest()
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+
+def _source(of: Any) -> str:
+    try:
+        return textwrap.dedent(inspect.getsource(of))
+    except (OSError, TypeError):
+        return ""

@@ -7,6 +7,7 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
+from offboard.common.errors import is_interrupt
 from offboard.common.wanted import call_while
 
 TRACEBACK_LENGTH_MAX = 4000
@@ -21,7 +22,9 @@ def traceback_of(error: BaseException, caller: Callable[..., Any] = call_while) 
         return ""
     try:
         return bounded("".join(traceback.format_exception(type(error), error, frame.tb_next)))
-    except Exception:  # noqa: BLE001 - a user's exception may break anything
+    except BaseException as unreadable:  # a user's exception may break anything
+        if is_interrupt(unreadable):
+            raise
         return ""
 
 

@@ -20,12 +20,16 @@ def always() -> bool:
 
 
 def call_while(wanted: Callable[[], bool], function: Callable[..., Any], args: Iterable[Any]) -> Any:
-    """Call the function of a task. `check_wanted` inside it calls `wanted`."""
-    _here.wanted = wanted
+    """Call the function of a task. `check_wanted` inside it calls `wanted`.
+
+    If another task makes this call, in the same thread, the answer of that task must be wanted too.
+    """
+    outer = _here.wanted
+    _here.wanted = wanted if outer is None else lambda: outer() and wanted()
     try:
         return function(*args)
     finally:
-        _here.wanted = None
+        _here.wanted = outer
 
 
 def check_wanted() -> None:

@@ -6,19 +6,19 @@ would take 1.3 s at 50 Mbit/s, several times as long as the detection; its JPEG 
 
 import io
 import itertools
-import sys
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from offboard import MissingExtra, Offloader, task
+from examples import missing, run
+from offboard import Offloader, task
 
 try:
     from PIL import Image
     from pupil_apriltags import Detector
 except ImportError as error:
-    raise MissingExtra("examples.apriltags", "apriltags") from error
+    raise missing(__name__, "apriltags") from error
 
 Array = np.ndarray[Any, Any]
 
@@ -107,9 +107,9 @@ def draw_scene(shape: tuple[int, int], pictures: list[Array], rng: np.random.Gen
     return np.clip(scene + noise, 0, 255).astype(np.uint8)
 
 
-def main() -> None:
+def main(endpoint: str) -> None:
     """Call the task 30 times: `python -m examples.apriltags tcp://HOST:PORT`."""
-    with Offloader.connect(sys.argv[1]) as offload:
+    with Offloader.connect(endpoint) as offload:
         offload.wait_for_sites(detect_tags, 30.0)
         for (frame,) in itertools.islice(inputs(seed=1), 30):
             tags = offload(detect_tags, frame)
@@ -121,4 +121,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

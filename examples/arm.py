@@ -5,21 +5,21 @@ threads use: run it with `cloud-server --executor processes`.
 """
 
 import itertools
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from offboard import MissingExtra, Offloader, task
+from examples import missing, run
+from offboard import Offloader, task
 
 try:
     from pyroboplan.core.utils import check_collisions_at_state
     from pyroboplan.models import panda
     from pyroboplan.planning import rrt
 except ImportError as error:
-    raise MissingExtra("examples.arm", "arm") from error
+    raise missing(__name__, "arm") from error
 
 Array = np.ndarray[Any, Any]
 
@@ -114,9 +114,9 @@ def free_joints(planner: Planner, rng: np.random.Generator) -> Array:
             return joints
 
 
-def main() -> None:
+def main(endpoint: str) -> None:
     """Call the task 30 times: `python -m examples.arm tcp://HOST:PORT`."""
-    with Offloader.connect(sys.argv[1]) as offload:
+    with Offloader.connect(endpoint) as offload:
         offload.wait_for_sites(plan_motion, 30.0)
         for start, goal, seed in itertools.islice(inputs(seed=1), 30):
             motion = offload(plan_motion, start, goal, seed)
@@ -128,4 +128,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from offboard.common.command_line import run_command
+from offboard.common.errors import ConfigError
 from offboard.common.tasks import Kind, first_number, kinds
 from offboard.common.wire.messages import byte_count
 from offboard.common.wire.values import encode
@@ -22,12 +24,17 @@ CALLS = 60
 MBIT_S = 50
 LOCK_CALLS = 10
 REPEATS = 2  # of each call; the fastest one counts
+NAMES = ("apriltags", "registration", "signs", "pose_graph", "arm")
 
 
-def main() -> None:
+def main() -> int:
     """Measure the applications that are named, or all."""
-    for name in sys.argv[1:] or ("apriltags", "registration", "signs", "pose_graph", "arm"):
+    for name in sys.argv[1:]:
+        if name not in NAMES:
+            raise ConfigError(f"{name!r} is not one of {', '.join(NAMES)}")
+    for name in sys.argv[1:] or NAMES:
         measure(importlib.import_module(f"examples.{name}"))
+    return 0
 
 
 def measure(module: ModuleType) -> None:
@@ -98,4 +105,4 @@ def lock_free_share(call: Callable[[], object]) -> tuple[float, float]:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_command("examples.measure", main))

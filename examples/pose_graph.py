@@ -6,7 +6,6 @@ are those of the data set w10000, which the wheel of gtsam contains.
 
 import functools
 import itertools
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,12 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from offboard import MissingExtra, Offloader, task
+from examples import missing, run
+from offboard import Offloader, task
 
 try:
     import gtsam
 except ImportError as error:
-    raise MissingExtra("examples.pose_graph", "pose-graph") from error
+    raise missing(__name__, "pose-graph") from error
 
 Array = np.ndarray[Any, Any]
 
@@ -98,9 +98,9 @@ def load_graph() -> tuple[Array, Array, Array]:
     return np.array(vertices, np.float32), np.array(pairs, np.int32), np.array(moves, np.float32)
 
 
-def main() -> None:
+def main(endpoint: str) -> None:
     """Play one mission: `python -m examples.pose_graph tcp://HOST:PORT`."""
-    with Offloader.connect(sys.argv[1]) as offload:
+    with Offloader.connect(endpoint) as offload:
         offload.wait_for_sites(optimise_graph, 30.0)
         for poses, pairs, moves in itertools.islice(inputs(seed=1), CALLS):
             result = offload(optimise_graph, poses, pairs, moves)
@@ -112,4 +112,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -5,19 +5,19 @@ sent as whole steps of 2 mm, which is 6 bytes per point instead of 24.
 """
 
 import itertools
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from offboard import MissingExtra, Offloader, task
+from examples import missing, run
+from offboard import Offloader, task
 
 try:
     import small_gicp
 except ImportError as error:
-    raise MissingExtra("examples.registration", "registration") from error
+    raise missing(__name__, "registration") from error
 
 Array = np.ndarray[Any, Any]
 Known = tuple[small_gicp.PointCloud, small_gicp.KdTree]  # the map
@@ -101,9 +101,9 @@ def draw_scan(count: int, range_m: float, pose: Array, rng: np.random.Generator)
     return np.rint((seen - pose[:3, 3]) @ pose[:3, :3] / STEP_M).astype(np.int16)
 
 
-def main() -> None:
+def main(endpoint: str) -> None:
     """Call the task 30 times: `python -m examples.registration tcp://HOST:PORT`."""
-    with Offloader.connect(sys.argv[1]) as offload:
+    with Offloader.connect(endpoint) as offload:
         offload.wait_for_sites(register_scan, 30.0)
         for scan, guess in itertools.islice(inputs(seed=1), 30):
             match = offload(register_scan, scan, guess)
@@ -115,4 +115,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -6,19 +6,19 @@ time between the networks, so a server can use threads.
 """
 
 import itertools
-import sys
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from offboard import MissingExtra, Offloader, task
+from examples import missing, run
+from offboard import Offloader, task
 
 try:
     import cv2
     from rapidocr import RapidOCR
 except ImportError as error:
-    raise MissingExtra("examples.signs", "signs") from error
+    raise missing(__name__, "signs") from error
 
 Array = np.ndarray[Any, Any]
 
@@ -90,9 +90,9 @@ def draw_frame(shape: tuple[int, int], signs: int, rng: np.random.Generator) -> 
     return np.clip(frame + noise, 0, 255).astype(np.uint8)
 
 
-def main() -> None:
+def main(endpoint: str) -> None:
     """Call the task 30 times: `python -m examples.signs tcp://HOST:PORT`."""
-    with Offloader.connect(sys.argv[1]) as offload:
+    with Offloader.connect(endpoint) as offload:
         offload.wait_for_sites(read_signs, 60.0)
         for (frame,) in itertools.islice(inputs(seed=1), 30):
             signs = offload(read_signs, frame)
@@ -104,4 +104,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -1,15 +1,19 @@
 """`loadgen`: the commands of the test bench. Each one imports what it needs when it is called."""
 
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, NoReturn, TypeVar
 
-from offboard.common.command_line import Command, CommandParser, add_flags, run_commands
+from offboard.common.command_line import Command, CommandParser, add_flags, load, run_commands
 from offboard.common.config import check, resolve, setting
 from offboard.loadgen import rivals
+
+if TYPE_CHECKING:
+    from offboard.loadgen.robot.config import RobotConfig
 
 C = TypeVar("C")
 
@@ -151,6 +155,34 @@ def _export(argv: Sequence[str]) -> int:
     return run_export(*_file_and_config("export", ExportConfig, argv))
 
 
+def _drive(argv: Sequence[str]) -> int:
+    from offboard.loadgen.robot.config import DriveConfig
+
+    return _robot("drive", DriveConfig, argv)
+
+
+def _call(argv: Sequence[str]) -> int:
+    from offboard.loadgen.robot.config import CallConfig
+
+    return _robot("call", CallConfig, argv)
+
+
+def _robot(name: str, cls: "type[RobotConfig]", argv: Sequence[str]) -> int:
+    """Run the tasks of a robot."""
+    config = load(
+        cls, argv, prog=f"loadgen {name}", description=_about(name), environ=os.environ, prefix="ROBOT"
+    )
+    signal.signal(signal.SIGTERM, _interrupt)
+    from offboard.loadgen.robot.command import run_robot  # after the flags: --help compiles nothing
+
+    _find_modules_here()
+    return run_robot(config)
+
+
+def _interrupt(*_: object) -> NoReturn:
+    raise KeyboardInterrupt
+
+
 def _wan(argv: Sequence[str]) -> int:
     from offboard.loadgen.relay.wan import WanConfig, run_wan
 
@@ -158,10 +190,12 @@ def _wan(argv: Sequence[str]) -> int:
 
 
 def _parser(name: str, operands: str = "") -> CommandParser:
+    return CommandParser(prog=f"loadgen {name}", description=_about(name), operands=operands)
+
+
+def _about(name: str) -> str:
     about = COMMANDS[name].about
-    return CommandParser(
-        prog=f"loadgen {name}", description=f"{about[0].upper()}{about[1:]}.", operands=operands
-    )
+    return f"{about[0].upper()}{about[1:]}."
 
 
 def _config(name: str, cls: type[C], argv: Sequence[str], prefix: str = PREFIX) -> C:
@@ -198,6 +232,8 @@ COMMANDS = {
         "measure the plans of a scenario on both sites, and write them as a CSV file", _dataset
     ),
     "export": Command("write the tasks of a trace that ran on both sites as a CSV file", _export),
+    "drive": Command("drive a simulated robot on a map, and plan its paths onboard or in the cloud", _drive),
+    "call": Command("call a task of yours with numbers or inputs, one after the other or at a rate", _call),
     "wan": Command("relay between robot and cloud, with delay, jitter, loss, outages and other faults", _wan),
 }
 

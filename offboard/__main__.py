@@ -21,7 +21,8 @@ def _run(package: str, argv: Sequence[str]) -> int:
 
 COMMANDS = {
     "client": Command(
-        "run tasks on a robot, onboard or in the cloud (robot-client)", partial(_run, "robot_client")
+        "make the keys of a robot, and check its way to a server (robot-client)",
+        partial(_run, "robot_client"),
     ),
     "server": Command("run tasks for robots (cloud-server)", partial(_run, "cloud_server")),
     "bench": Command("play scenarios, make tables and reports (loadgen)", partial(_run, "loadgen")),

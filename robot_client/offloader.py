@@ -30,12 +30,13 @@ from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.learner import Learner, PendingTask
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.learning.runs_in_flight import Flights
+from offboard.robot_client.lifetime import Lifetime
 from offboard.robot_client.policies import BOTH, PINNED, Decision, Forecast, Policy
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.predictors.window import WINDOW
 from offboard.robot_client.records.recording import Recording, tell
 from offboard.robot_client.records.trace import Late, Record
-from offboard.robot_client.settings import Settings
+from offboard.robot_client.settings import Settings, check_types
 from offboard.robot_client.sites import heartbeat
 from offboard.robot_client.sites.absence import Absent, absent_sites, wait_for_sites
 from offboard.robot_client.sites.clock import Clock, SystemClock
@@ -57,7 +58,8 @@ class Offloader:
     `timeout_s`: how long a remote site has for a task before the task runs onboard.
     `observers`: called with the record of every task, in the thread that asked for it.
 
-    Use it as a context manager, from any number of threads.
+    Use it as a context manager, from any number of threads. A call that the code of an onboard task makes
+    runs in the thread of that task if it runs onboard.
     """
 
     def __init__(
@@ -75,12 +77,13 @@ class Offloader:
         if ONBOARD not in self._runners or len(self._runners) != len(runners):
             given = [runner.site for runner in runners]
             raise ConfigError(f"sites {given}: each site once, and {ONBOARD!r} among them")
+        if BOTH in self._runners:
+            raise ConfigError(f"a site cannot be named {BOTH!r}: where={BOTH!r} means all sites")
         self._policy = policy
         self._memories = memories
         self._allowance = allowance or Allowance()
         self._timeout_s = checked_timeout(timeout_s)
         self._observers = tuple(observers)
-        self._recording: Recording | None = None
         self._clock = clock or SystemClock()
         self._flights = Flights(self._runners)
         self._forecaster = Forecaster(self._runners, self._flights, self._allowance)
@@ -88,9 +91,9 @@ class Offloader:
         self._late: deque[Late] = deque(maxlen=LATE_MAX)
         self._crossing = CrossingCheck()
         self._lock = threading.Lock()
+        self._life = Lifetime(self._runners.values(), memories, self._lock)
         self._numbers = itertools.count()
         self._session = secrets.token_hex(4)
-        self._closed = False
         self.last: Record | None = None
 
     @classmethod
@@ -123,6 +126,7 @@ class Offloader:
             make_runners,  # zmq is loaded only for a connection
         )
 
+        check_types(cls.connect, locals())
         rare = settings or Settings()
         chosen, memories = rare.make_policy(policy), rare.make_memories(policy, window)
         servers = ({CLOUD: endpoint} if endpoint else {}) | dict(sites or {})
@@ -144,7 +148,8 @@ class Offloader:
                 observers=[*observers, *recording.observers],
             )
             opened.pop_all()
-        offload._recording = recording
+        offload._life.recording = recording
+        offload._life.close_when_dropped(offload)
         return offload
 
     def __call__(
@@ -160,6 +165,8 @@ class Offloader:
         `where` pins the call to a site, or to `both` to measure all of them. `timeout_s` bounds the wait for
         a remote site, after which the task runs onboard.
         """
+        if self._life.forked:
+            self._life.refuse()
         budget_s = self._timeout_s if timeout_s is None else checked_timeout(timeout_s)
         kind = kind_of(function)
         args = kind.bind(args, kwargs)
@@ -182,6 +189,8 @@ class Offloader:
         in the order of the items. If tasks fail, the error of the first one is raised when all have ended.
         `where` and `timeout_s` are those of a single call. Observers are called in threads of the batch.
         """
+        if self._life.forked:
+            self._life.refuse()
         budget_s = self._timeout_s if timeout_s is None else checked_timeout(timeout_s)
         kind = kind_of(function)
         tasks = [Task(kind, args, kind.size_of(args)) for args in arguments(kind, items)]
@@ -200,27 +209,29 @@ class Offloader:
         return batch.run()
 
     async def run(self, function: Callable[..., R], *args: Any, **options: Any) -> R:
-        """The same call for asyncio; the event loop is free while the task runs."""
-        return await asyncio.to_thread(self, function, *args, **options)
+        """The same call for asyncio; the event loop is free while the task runs.
+
+        At most ASYNC_CALLS_MAX calls are made at a time; further ones wait. If the caller is cancelled, it
+        does not wait for the task, which runs to its end.
+        """
+        if self._life.forked:
+            self._life.refuse()
+        call = partial(self, function, *args, **options)
+        return await asyncio.wrap_future(self._life.call_in_thread(call))
 
     def wait_for_sites(self, function: Callable[..., Any], timeout_s: float) -> Absent:
         """Wait until every site can take this task, and onboard has run its setup, for at most `timeout_s`.
 
-        Returns why some sites still cannot: a dictionary by site, which is empty if all can.
+        Returns why some sites still cannot: a dictionary by site, which is empty if all can. It returns at
+        once if waiting changes nothing, as for a server that has other source.
         """
+        if self._life.forked:
+            self._life.refuse()
         return wait_for_sites(self._runners, kind_of(function), timeout_s)
 
     def close(self) -> None:
         """Close all runners, trace and metrics, and save what was learnt. Safe to call twice."""
-        with self._lock:
-            first, self._closed = not self._closed, True
-            last = self._memories.snapshot() if first else None
-        for runner in self._runners.values():
-            runner.close()
-        if last is not None:
-            self._memories.save_last(last)
-        if self._recording is not None:
-            self._recording.close()
+        self._life.close()
 
     def __enter__(self) -> Self:
         return self
@@ -237,6 +248,8 @@ class Offloader:
         answer, record = self._offload(task, where, budget_s, placed)
         self.last = record
         tell(self._observers, record)
+        if len(record.executions) > 1:
+            self._crossing.hear(task.kind, record.executions)
         if len(self._runners) > 1 and answer.failure is None:
             self._crossing.check_result(task.kind, answer.value)
         return answer, record
@@ -261,7 +274,7 @@ class Offloader:
         answer = answer_of(executions)
         with self._lock:
             self._learn(pending, executions)
-            if not self._closed and self._memories.due(self._clock.now_s()):
+            if not self._life.closed and self._memories.due(self._clock.now_s()):
                 self._memories.save_soon()
             late, regret = tuple(self._late), self._learner.regret.estimate()
             self._late.clear()
@@ -377,7 +390,7 @@ class Offloader:
         for one in executions:
             if not isinstance(one.failure, Overtaken):
                 self._flights.end(one.site, pending.task.id)
-        if not self._closed:  # a run that `close` gave up says nothing about its site
+        if not self._life.closed:  # a run that `close` gave up says nothing about its site
             self._learner.learn(pending, executions)
 
     def _ended_late(self, pending: PendingTask, site: str, execution: Execution) -> None:
@@ -385,5 +398,5 @@ class Offloader:
         with self._lock:
             self._late.append(Late.of(pending.id, site, execution))
             self._flights.end(site, pending.task.id)
-            if execution.started and not self._closed:
+            if execution.started and not self._life.closed:
                 self._learner.learn_late(pending, execution)

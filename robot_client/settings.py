@@ -3,10 +3,16 @@
 The common options are keywords of `Offloader.connect` itself.
 """
 
+import typing
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from numbers import Integral, Real
 from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any
 
+from offboard.common.errors import ConfigError
 from offboard.common.task_states import TaskStates
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.learning.memories import Memories
@@ -41,9 +47,12 @@ class Settings:
     duplicates: float = DUPLICATES
     bytes_a_minute: float | None = None
     joules_a_minute: float | None = None
-    memory: Path | None = None
+    memory: Path | str | None = None
     states: TaskStates | None = None
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_types(Settings, {name: getattr(self, name) for name in self.__slots__})
 
     def allowance(self) -> Allowance:
         """A fresh allowance: what tasks may spend from now on."""
@@ -69,12 +78,49 @@ class Settings:
         """
         name = self.predictor_for(policy)
         make = partial(predictors.make, name, window, self.seed)
-        make()
+        made = make()
         return Memories(
             make,
             measured=name == predictors.PARTS or self.beats(policy),
-            shared_work=name == predictors.PARTS,
+            shared_work=getattr(made, "per_work", False),
             objective=self.objective,
             energy=self.energy,
-            store=None if self.memory is None else Store(self.memory),
+            store=None if self.memory is None else Store(Path(self.memory)),
         )
+
+
+def check_types(of: Callable[..., Any], given: Mapping[str, Any]) -> None:
+    """ConfigError unless each value has the type that is annotated for it in `of`."""
+    for name, hint in typing.get_type_hints(of).items():
+        if name in given and not _fits(given[name], hint):
+            kinds = typing.get_args(hint) if isinstance(hint, UnionType) else (hint,)
+            allowed = " or ".join(_SHOWN.get(kind := _class_of(one), kind.__name__) for one in kinds)
+            raise ConfigError(f"{name} {given[name]!r:.200}: must be {allowed}")
+
+
+_SHOWN = {
+    bool: "True or False",
+    float: "a number",
+    int: "a whole number",
+    str: "a string",
+    Path: "a path",
+    Mapping: "a dictionary of strings",
+    Iterable: "a list of functions",
+    NoneType: "None",
+}
+
+
+def _fits(value: object, hint: Any) -> bool:
+    kind, parts = _class_of(hint), typing.get_args(hint)
+    if kind is UnionType:
+        return any(_fits(value, one) for one in parts)
+    if kind in (int, float):  # numbers of numpy too
+        return isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
+    if not isinstance(value, kind):
+        return False
+    items = [*value.keys(), *value.values()] if isinstance(value, Mapping) else value
+    return not isinstance(items, list | tuple) or all(_fits(one, parts[0]) for one in items)
+
+
+def _class_of(hint: Any) -> Any:
+    return typing.get_origin(hint) or hint

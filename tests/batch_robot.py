@@ -1,6 +1,6 @@
 """A robot that runs the same batch on all sites, onboard only and in the cloud only, and prints the seconds.
 
-The local testbed starts it instead of `robot-client`, with its CPU quota: `python -m tests.batch_robot`.
+The local testbed starts it instead of `loadgen drive`, with its CPU quota: `python -m tests.batch_robot`.
 """
 
 import argparse

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
 
-from tests import crossing_tasks as types
-from tests.crossing_tasks import TYPES, attributes
+from tests import value_tasks as types
+from tests.value_tasks import TYPES, attributes
 
 DIMENSIONS_MAX = 8
 LARGE = 70_000  # bytes: more than an argument may have inside the request

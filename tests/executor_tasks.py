@@ -10,7 +10,7 @@ from offboard.common.wire.messages import StoredBlob, decode, encode
 WAIT_S = 8
 ROOT = Path(__file__).parents[1]
 MODULE = '''
-import asyncio, os, pathlib, threading, time
+import asyncio, dataclasses, os, pathlib, threading, time
 from offboard.common.tasks import task
 from offboard.common.wanted import check_wanted
 
@@ -48,6 +48,18 @@ def exec_mute():
 @task("exec_object", size=lambda: 0)
 def exec_object():
     return object()
+
+@task("exec_deep", size=lambda: 0)
+def exec_deep():
+    return {"a": [1, object()]}
+
+@dataclasses.dataclass
+class Pose:
+    x: float
+
+@task("exec_pose", size=lambda pose: 0, types=(Pose,))
+def exec_pose(pose):
+    return pose.x
 
 @task("exec_echo", size=lambda value: 0)
 def exec_echo(value):

@@ -20,10 +20,10 @@ PARAMETERS_MAX = 8
 POSITIONAL_MAX = 4
 COMMANDS = {
     "robot-client": ("robot_client",),
-    "robot-client drive": ("robot_client", "drive"),
-    "robot-client call": ("robot_client", "call"),
     "robot-client check": ("robot_client", "check"),
     "cloud-server": ("cloud_server",),
+    "loadgen drive": ("loadgen", "drive"),
+    "loadgen call": ("loadgen", "call"),
     "loadgen wan": ("loadgen", "wan"),
     "loadgen compare": ("loadgen", "compare"),
 }

@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 
 from offboard.common.command_line import INTERRUPTED_EXIT
+from offboard.loadgen.robot_files import read_trace
 from offboard.loadgen.testbed.testbed import Setup, Testbed
-from offboard.robot_client.records.trace import read
 
 MAP = Path(__file__).parents[1] / "maps" / "depot.yaml"
 TASKS, MEASURE = 8, 4
@@ -234,11 +234,11 @@ CONTRACT: tuple[Callable[[Bench], None], ...] = (
 def drive(bench: Bench) -> tuple[int, list[dict[str, Any]]]:
     """Let `robot` make its plans; the number of records in its trace before, and all records after."""
     trace = bench.bed.out / "robot.jsonl"
-    before = len(list(read(trace))) if trace.exists() else 0
+    before = len(list(read_trace(trace))) if trace.exists() else 0
     start(bench, "robot")
     wait_until(lambda: bench.bed.exit_code("robot") is not None)
     assert bench.bed.exit_code("robot") == 0
-    return before, list(read(trace))
+    return before, list(read_trace(trace))
 
 
 def robot_asks_the_cloud(bench: Bench) -> None:

@@ -12,15 +12,6 @@ class Pose:
     tags: list[Any]
 
 
-@dataclass(frozen=True)
-class Positive:
-    value: float
-
-    def __post_init__(self) -> None:
-        if self.value <= 0:
-            raise ValueError("value must be above 0")
-
-
 def mutate(chance: random.Random, frames: list[bytes]) -> None:
     """Replace, change, cut, add or shuffle frames."""
     at = chance.randrange(len(frames))

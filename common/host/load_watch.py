@@ -3,7 +3,9 @@
 `load` says how load and capacity are measured.
 """
 
+import contextlib
 import threading
+from collections.abc import Callable
 
 from offboard.common.host.load import EVERY_S, HURRIED_S, Load
 
@@ -14,30 +16,30 @@ class LoadWatch:
     A process that asks for its CPU time may have to wait for its quota at that moment. The thread that
     decides where a task runs must therefore not be the one that asks.
 
-    `every_s`: the usual time between two readings.
+    `every_s`: the usual time between two readings. `pause_s`: turns it into the time before the next one.
     """
 
-    def __init__(self, load: Load, every_s: float = EVERY_S) -> None:
+    def __init__(
+        self, load: Load, every_s: float = EVERY_S, pause_s: Callable[[float], float] = float
+    ) -> None:
         self._load = load
         self._every_s = every_s
+        self._pause_s = pause_s
         self._latest = (0.0, 1.0)
         self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="load", daemon=True)
+        self._thread: threading.Thread | None = None
         self._starting = threading.Lock()
         self._reading = threading.Lock()
 
     def latest(self) -> tuple[float, float]:
         """The load and the capacity of the last reading."""
-        if self._thread.ident is None:
-            with self._starting:
-                if self._thread.ident is None and not self._closed.is_set():
-                    self._read()
-                    self._thread.start()
+        if self._thread is None:
+            self._start()
         return self._latest
 
     def hurry(self) -> None:
         """Read now, in the caller's thread. Does nothing before the first `latest` or during a reading."""
-        if self._thread.ident is not None and self._reading.acquire(blocking=False):
+        if self._thread is not None and self._reading.acquire(blocking=False):
             try:
                 self._read()
             finally:
@@ -46,8 +48,17 @@ class LoadWatch:
     def close(self) -> None:
         self._closed.set()
 
+    def _start(self) -> None:
+        with self._starting:
+            if self._thread is None and not self._closed.is_set():
+                self._read()
+                thread = threading.Thread(target=self._run, name="load", daemon=True)
+                with contextlib.suppress(RuntimeError):  # no thread is free: the next `latest` tries again
+                    thread.start()
+                    self._thread = thread
+
     def _run(self) -> None:
-        while not self._closed.wait(self._every_s):
+        while not self._closed.wait(self._pause_s(self._every_s)):
             with self._reading:
                 self._read()
 

@@ -21,7 +21,7 @@ class GridMap:
     """An occupancy grid with the values of ROS: -1 unknown, 0 free to 100 occupied. Row 0 has the lowest y.
 
     `resolution` is in metres per cell. `origin` is the pose (x, y in m, yaw in rad) of the corner of cell
-    (0, 0). `cells` is read-only: its identity names the map as long as the process lives.
+    (0, 0). Nothing can change `cells`: its identity names the map as long as the process lives.
     """
 
     cells: NDArray[np.int8]
@@ -29,6 +29,17 @@ class GridMap:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        self.check()
+        cells = self.cells
+        of_a_map = isinstance(getattr(cells.base, "base", None), bytes) and cells.flags.c_contiguous
+        if not of_a_map:  # a read-only array may be unlocked, or have a view that is not read-only
+            cells = np.frombuffer(cells.tobytes(), np.int8).reshape(cells.shape)
+            object.__setattr__(self, "cells", cells)
+        x, y, yaw = self.origin
+        object.__setattr__(self, "origin", (float(x), float(y), float(yaw)))
+
+    def check(self) -> None:
+        """ValueError names a wrong field. A map from a message was made without this check."""
         cells = self.cells
         if not isinstance(cells, np.ndarray) or cells.dtype != np.int8 or cells.ndim != 2:
             raise ValueError("grid.cells must be an int8 array of two dimensions")
@@ -36,14 +47,8 @@ class GridMap:
             raise ValueError(f"grid.cells has {cells.size} cells; allowed are 1 to {CELLS_MAX}")
         if not (math.isfinite(self.resolution) and self.resolution > 0):
             raise ValueError(f"grid.resolution is {self.resolution}; it must be a number above 0")
-        origin = tuple(float(value) for value in self.origin)
-        if len(origin) != 3 or not all(map(math.isfinite, origin)):
+        if len(self.origin) != 3 or not all(map(math.isfinite, self.origin)):
             raise ValueError(f"grid.origin is {self.origin}; it must be three finite numbers x, y, yaw")
-        if cells.flags.writeable or not cells.flags.c_contiguous:
-            cells = cells.copy(order="C")
-            cells.flags.writeable = False
-        object.__setattr__(self, "cells", cells)
-        object.__setattr__(self, "origin", origin)
 
     def position(self, x: float, y: float) -> tuple[float, float]:
         """A point of the map frame as fractional (row, column); cell (r, c) begins at (r, c)."""

@@ -177,6 +177,7 @@ def _check(
     costs: NDArray[np.uint8] | None,
 ) -> None:
     """ValueError names the wrong argument, its value, and what is allowed."""
+    grid.check()
     for name, value in (("pose.x", pose.x), ("pose.y", pose.y), ("pose.yaw", pose.yaw), ("goal.x", goal.x),
                         ("goal.y", goal.y), ("radius_m", radius_m)):  # fmt: skip
         if not math.isfinite(value):

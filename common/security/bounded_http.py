@@ -6,6 +6,7 @@
 import asyncio
 from typing import Any
 
+import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 REQUEST_S = 10.0  # to send a request and to receive its answer
@@ -38,6 +39,14 @@ class BoundedHttp(H11Protocol):
     def on_response_complete(self) -> None:
         self._await_request()
         super().on_response_complete()
+
+    def send_400_response(self, msg: str) -> None:
+        """Answer 400 to broken bytes. In a body they end the connection: its answer may have begun."""
+        if self.conn.our_state is h11.IDLE:
+            super().send_400_response(msg)
+        else:
+            self.cycle.disconnected = True
+            self.transport.close()
 
     def end(self) -> None:
         """Close the connection at once, without an answer."""

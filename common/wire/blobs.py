@@ -98,7 +98,7 @@ _digests: dict[int, tuple[weakref.ref[Array], bytes]] = {}
 
 
 def array_digest(array: Array, raw: memoryview) -> bytes:
-    """SHA-256 of the data of an array. If nothing can change the array, it is computed once."""
+    """SHA-256 of the data of an array. If nothing can ever change the array, it is computed once."""
     if not _constant(array):
         return hashlib.sha256(raw).digest()
     key = id(array)
@@ -111,13 +111,11 @@ def array_digest(array: Array, raw: memoryview) -> bytes:
 
 
 def _constant(array: Array) -> bool:
-    """True if neither the array nor the array that it is a view of is writeable."""
+    """Whether the memory is that of a `bytes`. Any other array can be unlocked, or have a writeable view."""
     base: Any = array
     while isinstance(base, np.ndarray):
-        if base.flags.writeable:
-            return False
         base = base.base
-    return base is None or isinstance(base, bytes)
+    return isinstance(base, bytes)
 
 
 def array_view(data: memoryview, dtype: Any, shape: tuple[int, ...]) -> Array:

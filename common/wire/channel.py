@@ -1,4 +1,4 @@
-"""A ZMQ socket that one thread reads and any thread sends on.
+"""A ZMQ socket that one thread reads and any thread sends on, and the context that it is made in.
 
 Several threads may use a ZMQ socket if a lock lets only one of them in at a time. The reader must then not
 wait inside the socket; it waits for the file descriptor on which libzmq signals. `messages` says what the
@@ -6,6 +6,7 @@ frames mean.
 """
 
 import contextlib
+import os
 import select
 import socket
 import threading
@@ -14,6 +15,9 @@ from typing import Any
 
 import zmq
 
+from offboard.common.errors import OffloadError
+
+FILES, THREADS = 24, 8  # that a first context with its sockets needs, with some to spare
 COPIED_BYTES_MAX = 4096  # a larger frame is not copied into the message
 WAKE_BYTES = 4096  # wake-ups read at once
 # As integers: with pyzmq's flags, each `|` and `&` makes a new object, which takes longer than the call.
@@ -91,6 +95,40 @@ class Channel:
         # Copying a small frame costs less than tracking when libzmq no longer needs it.
         copied = isinstance(frame, bytes) and len(frame) <= COPIED_BYTES_MAX
         self._socket.send(frame, flags, copy=copied)
+
+
+def make_context(where: str) -> "zmq.Context[zmq.Socket[bytes]]":
+    """A context; OffloadError if this process lacks files or threads. `where` names the flag or the field.
+
+    libzmq ends the process if it lacks one while a context is made.
+    """
+    _check_room(where)
+    zmq.Frame(bytes(zmq.COPY_THRESHOLD))  # pyzmq makes a context for large messages: now, as there is room
+    return zmq.Context()
+
+
+def _check_room(where: str) -> None:
+    pipes: list[int] = []
+    over = threading.Event()
+    threads = [threading.Thread(target=over.wait, daemon=True) for _ in range(THREADS)]
+    try:
+        while len(pipes) < FILES:
+            pipes += os.pipe()
+        for thread in threads:
+            thread.start()
+    except OSError as error:
+        why = f"a connection needs {FILES} files, and this process may open {len(pipes)} more"
+        raise OffloadError(f"{where}: {why}; close some, or raise the limit (ulimit -n)") from error
+    except RuntimeError as error:
+        why = f"a connection needs {THREADS} threads, and this process may not start that many"
+        raise OffloadError(f"{where}: {why}; end some, or raise the limit (ulimit -u)") from error
+    finally:
+        over.set()
+        for thread in threads:
+            if thread.ident is not None:
+                thread.join()
+        for file in pipes:
+            os.close(file)
 
 
 def readable(of: "zmq.Socket[bytes]") -> bool:

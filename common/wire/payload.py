@@ -3,12 +3,16 @@
 A prediction needs the bytes before it is decided whether the value is sent at all. `values` encodes it.
 """
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
+from offboard.common.dataclass_types import fields_of
+from offboard.common.errors import BadValue
+from offboard.common.wire.blobs import DTYPES
 from offboard.common.wire.values import BLOB_BYTES_MIN, NESTING_MAX
 
 NUMBER_BYTES = 9  # of a float or a large integer in msgpack
@@ -38,9 +42,9 @@ def _bytes(value: Any, known: Known, looks: int, depth: int) -> int:
             return _of_items(value, known, looks, depth)
         if isinstance(value, dict):
             return _of_items([*value.keys(), *value.values()], known, looks, depth)
-        if dataclasses.is_dataclass(value):
-            fields = [getattr(value, one.name) for one in dataclasses.fields(value) if one.init]
-            return _of_items(fields, known, looks, depth)
+        if dataclasses.is_dataclass(type(value)):
+            with contextlib.suppress(BadValue):
+                return _of_items(list(fields_of(value).values()), known, looks, depth)
     return NUMBER_BYTES
 
 
@@ -53,6 +57,6 @@ def _of_items(items: Sequence[Any], known: Known, looks: int, depth: int) -> int
 
 
 def _is_known(array: "np.ndarray[Any, Any]", known: Known) -> bool:
-    if array.nbytes <= BLOB_BYTES_MIN or not array.flags.c_contiguous:
+    if array.nbytes <= BLOB_BYTES_MIN or not array.flags.c_contiguous or array.dtype.str not in DTYPES:
         return False
     return known(array.reshape(-1).view(np.uint8).data)

@@ -3,17 +3,17 @@
 `messages` puts the encoded frames into requests and replies.
 """
 
-import dataclasses
-import functools
+import contextlib
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import msgpack
 import numpy as np
 
-from offboard.common.errors import BadValue, ProtocolError
+from offboard.common.dataclass_types import field_names, fields_of, rebuilt
+from offboard.common.errors import BadValue, ProtocolError, describe
 from offboard.common.wire.blobs import (
     DTYPES,
     Array,
@@ -32,7 +32,7 @@ BLOBS_MAX = 64  # blobs that one value may refer to
 UNSCANNED_BYTES_MAX = 512  # of msgpack that is too short to announce a harmful number of items
 NESTING_MAX = 32
 DIMENSIONS_MAX = 8
-TYPES_MAX = 256  # dataclasses whose field names are cached
+PLACE_LENGTH_MAX = 80  # of the text that says where a bad part is
 
 _IN_FRAME, _IN_BLOB, _DATACLASS = 1, 2, 3
 _SCALARS = {type(None), bool, int, float, str}
@@ -51,6 +51,7 @@ def encode(
     value: Any,
     types: Sequence[type] = (),
     *,
+    name: str = "",
     blobs: bool = False,
     along: Callable[[memoryview], bool] = lambda _: False,
 ) -> Body:
@@ -58,14 +59,19 @@ def encode(
 
     With `blobs`, each array or bytes larger than BLOB_BYTES_MIN becomes a blob: the value holds only its
     digest. If `along` returns True for the bytes of an array, the array is sent in a frame instead.
-    Arrays are not copied, so do not change them before the frames are sent. BadValue names what cannot be
-    sent.
+    Arrays are not copied, so do not change them before the frames are sent. BadValue says what cannot be
+    sent and where it is, such as `result['poses'][3].x`; `name` is its first word.
     """
     encoder = _Encoder(types, use_blobs=blobs, along=along)
-    main = encoder.pack(value, 0)
+    try:
+        main = encoder.pack(value, 0)
+    except BadValue as error:
+        place = name + _shortened(_place_of_bad(value, types, 0))
+        raise BadValue(f"{place}: {error}" if place else str(error)) from error
     if len(main) > VALUE_BYTES_MAX:
         raise BadValue(
-            f"the value takes {len(main)} bytes without its arrays; at most {VALUE_BYTES_MAX} are allowed"
+            f"{name or 'the value'} takes {len(main)} bytes without its arrays; "
+            f"at most {VALUE_BYTES_MAX} are allowed"
         )
     return Body([main, *encoder.frames], encoder.blobs)
 
@@ -136,8 +142,9 @@ class _Encoder:
         kind = type(value)
         if isinstance(value, np.generic) and value.dtype.str in DTYPES and value.dtype.kind in "biuf":
             return value.item()
-        if kind in self.types and dataclasses.is_dataclass(value):
-            return self._dataclass(value, depth)
+        if kind in self.types:
+            named = [kind.__name__, fields_of(value)]
+            return msgpack.ExtType(_DATACLASS, self.pack(named, depth + 1))
         raise BadValue(
             f"a value of type {kind.__module__}.{kind.__qualname__} cannot be sent; "
             "allowed are plain values, arrays, and dataclasses listed in @task(types=...)"
@@ -175,15 +182,31 @@ class _Encoder:
             raise BadValue(f"the value holds more than {BLOBS_MAX} arrays over {BLOB_BYTES_MIN} bytes")
         return msgpack.ExtType(_IN_BLOB, msgpack.packb((digest, dtype, shape)))
 
-    def _dataclass(self, value: Any, depth: int) -> Any:
-        kind: Any = type(value)
-        fields = {name: getattr(value, name) for name in _field_names(kind)}
-        return msgpack.ExtType(_DATACLASS, self.pack([kind.__name__, fields], depth + 1))
+
+def _place_of_bad(value: Any, types: Sequence[type], depth: int) -> str:
+    """Where the part is that cannot be sent, such as `[0].pose['x']`. It is found by encoding each part."""
+    for place, part, deeper in _parts(value, types, depth) if depth <= NESTING_MAX else ():
+        try:
+            _Encoder(types, use_blobs=False, along=bool).pack(part, deeper)
+        except BadValue:
+            return place + _place_of_bad(part, types, deeper)
+    return ""
 
 
-@functools.lru_cache(TYPES_MAX)
-def _field_names(kind: Any) -> tuple[str, ...]:
-    return tuple(one.name for one in dataclasses.fields(kind) if one.init)
+def _parts(value: Any, types: Sequence[type], depth: int) -> Iterator[tuple[str, Any, int]]:
+    """Each part of a value with its place and its depth."""
+    kind = type(value)
+    if kind is list or kind is tuple:
+        yield from ((f"[{index}]", one, depth + 1) for index, one in enumerate(value))
+    elif kind is dict:
+        yield from ((f"[{key!r}]", one, depth + 1) for key, one in value.items())
+    elif kind in types:
+        with contextlib.suppress(BadValue):
+            yield from ((f".{name}", one, depth + 3) for name, one in fields_of(value).items())
+
+
+def _shortened(place: str) -> str:
+    return place if len(place) <= PLACE_LENGTH_MAX else place[: PLACE_LENGTH_MAX - 3] + "..."
 
 
 class _Decoder:
@@ -238,14 +261,14 @@ class _Decoder:
             raise ProtocolError("a dataclass is not [name, fields]")
         name, fields = tree
         cls = self.types.get(name) if isinstance(name, str) else None
-        if cls is None or not dataclasses.is_dataclass(cls):
+        if cls is None:
             raise ProtocolError(f"no dataclass {name!r:.80} is registered with this task")
-        if fields.keys() != {f.name for f in dataclasses.fields(cls) if f.init}:
+        if fields.keys() != field_names(cls):
             raise ProtocolError(f"the fields of dataclass {name} differ from those on this side")
         try:
-            return cls(**fields)
+            return rebuilt(cls, fields)
         except Exception as error:
-            raise ProtocolError(f"dataclass {name} refused its fields: {error}") from error
+            raise ProtocolError(f"dataclass {name} refused its fields: {describe(error)}") from error
 
 
 def _shape(shape: Any) -> tuple[int, ...]:

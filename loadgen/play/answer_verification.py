@@ -18,11 +18,11 @@ from offboard.common.planning.maps import GridMap, passable
 from offboard.common.planning.planner import Plan, scan_hits
 from offboard.common.task_states import TaskStates
 from offboard.common.tasks import kind_of
+from offboard.loadgen.robot import answers
+from offboard.loadgen.robot.calls import Calls
+from offboard.loadgen.robot.work import make_work
 from offboard.loadgen.scenario.outcome import Answered
 from offboard.loadgen.scenario.scenario import Workload
-from offboard.robot_client.simulated import answers
-from offboard.robot_client.simulated.calls import Calls
-from offboard.robot_client.simulated.work import make_work
 
 COST_SHARE = 1e-6  # largest relative difference of two sums of the same steps
 

@@ -37,7 +37,7 @@ def setups(scenario: Scenario, out: Path, *, shown: bool = True) -> dict[str, Se
 
 
 def _robot_flags(scenario: Scenario, files: RobotFiles, *, first: bool) -> Mapping[str, Any]:
-    """Flags of `robot-client drive` or `call`. Only the first robot runs `alone` and `reference`."""
+    """Flags of `loadgen drive` or `call`. Only the first robot runs `alone` and `reference`."""
     workload, robot = scenario.workload, scenario.robot
     policy, predictor = robot.names()
     flags = {

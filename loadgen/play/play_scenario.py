@@ -18,6 +18,7 @@ from offboard.loadgen.play.player import Player
 from offboard.loadgen.play.run_digest import digests
 from offboard.loadgen.play.run_files import EVENTS, READINGS, SUMMARY, TABLE, TRACE, RobotFiles, clear_folder
 from offboard.loadgen.play.stolen_cpu_time import NOTED_PERCENT, StolenCpuTime
+from offboard.loadgen.robot_files import alone_path, reference_path
 from offboard.loadgen.scenario.outage_recovery import read_outage
 from offboard.loadgen.scenario.outcome import Answered, Outcome
 from offboard.loadgen.scenario.outcome_figures import FIGURES
@@ -30,7 +31,6 @@ from offboard.loadgen.table.table_settings import TableConfig
 from offboard.loadgen.table.table_two import table_text
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.loadgen.testbed.testbed import Setup, Testbed
-from offboard.robot_client.records.trace import alone_path, reference_path
 
 DEMO_WINDOWS = ("5", "10", "20", "30", "40", "50")
 

@@ -13,13 +13,13 @@ from typing import Any
 
 from offboard.common.errors import ConfigError, OffloadError
 from offboard.loadgen.play.run_files import ANSWERS, EVENTS, LINK, READINGS, LineCounter, RobotFiles
+from offboard.loadgen.robot.answers import BEGIN_S
 from offboard.loadgen.scenario.event_timeline import ON_A_PART, Event, Timeline, absent_at_first
 from offboard.loadgen.scenario.outcome import Reading
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.table.site_disturbance import WAYS
 from offboard.loadgen.testbed.part_process import USAGE_EXIT
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, Testbed
-from offboard.robot_client.simulated.answers import BEGIN_S
 
 POLL_S = 0.02
 READ_EVERY_S = 2.0

@@ -22,6 +22,7 @@ PARTS = (
     "offboard.cloud_server",
     "offboard.loadgen.relay",
     "offboard.loadgen.rivals",
+    "offboard.loadgen.robot",
 )
 
 

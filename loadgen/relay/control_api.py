@@ -99,7 +99,7 @@ class ControlServer(uvicorn.Server):
 
     def __init__(self, app: FastAPI) -> None:
         options: dict[str, Any] = {"lifespan": "off", "log_level": "error", "access_log": False}
-        options |= {"server_header": False, "http": BoundedHttp}
+        options |= {"server_header": False, "http": BoundedHttp, "ws": "none"}
         super().__init__(uvicorn.Config(app, timeout_graceful_shutdown=STOP_S, **options))
 
     @contextlib.contextmanager

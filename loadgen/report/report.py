@@ -3,13 +3,13 @@
 The numbers come from `findings.py`, the captions from `captions.py`, the page from `html_page.py`.
 """
 
-import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError, DataError
+from offboard.common.security.plain_files import replace_file
 from offboard.loadgen import rivals
 from offboard.loadgen.play.run_files import TRACE
 from offboard.loadgen.report.captions import all_charts
@@ -147,15 +147,11 @@ def facts(findings: Findings) -> Mapping[str, str]:
 
 def _write_png(path: Path, png: bytes | None) -> None:
     """Write the whole file at once; None removes the chart of an earlier report."""
-    part = path.with_name(f".{path.name}.part")
     try:
         if png is None:
             path.unlink(missing_ok=True)
             return
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(png)
-        part.replace(path)
+        replace_file(path, png)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            part.unlink()
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error

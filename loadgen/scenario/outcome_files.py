@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from offboard.common.errors import DataError
+from offboard.loadgen.robot_files import read_trace
 from offboard.loadgen.scenario.interval_coverage import intervals_of, late_seconds
 from offboard.loadgen.scenario.outcome import Answered, Reading, Reference
-from offboard.robot_client.records import trace
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 
 def read_answered(answers: Path, records: Path, robot: str) -> list[Answered]:
     """The answers of one robot, joined with its trace by task id. Without a trace record no site is known."""
-    by_id = {record["id"]: record for record in trace.read(records)} if records.is_file() else {}
+    by_id = {record["id"]: record for record in read_trace(records)} if records.is_file() else {}
     late = late_seconds(by_id.values())
     found = []
     for line in read_lines(answers):

@@ -13,6 +13,8 @@ from offboard.common.errors import ConfigError
 from offboard.common.planning.planner_names import DIJKSTRA, PLANNERS
 from offboard.loadgen import rivals
 from offboard.loadgen.relay.link.link_settings import LinkFlags
+from offboard.loadgen.robot.config import CallConfig, DriveConfig, RobotConfig
+from offboard.loadgen.robot.workload import ARRIVALS
 from offboard.loadgen.scenario.event_timeline import AT_TASK_MAX, Event
 from offboard.loadgen.scenario.outcome_figures import FIGURES
 from offboard.loadgen.scenario.pass_fail_check import Check, check_computable
@@ -20,8 +22,6 @@ from offboard.loadgen.scenario.random_faults import Chaos
 from offboard.loadgen.testbed.cpu_quota import CPUS_MAX, CPUS_MIN
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN
 from offboard.robot_client import policies
-from offboard.robot_client.simulated.config import CallConfig, DriveConfig, RobotConfig
-from offboard.robot_client.simulated.workload import ARRIVALS
 
 ROBOTS_MAX = 64
 
@@ -45,7 +45,7 @@ class Workload:
     )
     planner: str = setting(DIJKSTRA, "search algorithm", choices=PLANNERS)
     tasks: int = setting(200, "number of tasks of each robot", minimum=1, maximum=AT_TASK_MAX)
-    sizes: tuple[str, ...] = setting((), "input sizes, written as for `robot-client --sizes`")
+    sizes: tuple[str, ...] = setting((), "input sizes, written as for `loadgen call --sizes`")
     arrivals: str = setting("closed", "when the next task is due", choices=ARRIVALS)
     rate: float | None = setting(None, "tasks per second of each robot; not for closed arrivals")
     burst: int = setting(10, "tasks in each burst, if arrivals are bursts", minimum=1)

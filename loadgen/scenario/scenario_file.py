@@ -61,7 +61,7 @@ def check_calls(scenario: Scenario, path: Path) -> None:
     """Import the task that a scenario calls, and make its first arguments; DataError names file and line."""
     if scenario.workload.task is None:
         return
-    from offboard.robot_client.simulated.work import make_work  # --help does not need it
+    from offboard.loadgen.robot.work import make_work  # --help does not need it
 
     try:
         make_work(scenario.workload.robot(scenario.seed))

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from offboard.loadgen.robot.run import OwnRecord
+from offboard.loadgen.robot.workload import CLOSED, due_instants
 from offboard.loadgen.scenario.event_timeline import Timeline
 from offboard.loadgen.scenario.interval_coverage import intervals_of, late_seconds
 from offboard.loadgen.scenario.outcome import Answered, Outcome, Reference
@@ -22,8 +24,6 @@ from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import BOTH
 from offboard.robot_client.records.trace import Record, as_dict
 from offboard.robot_client.settings import Settings
-from offboard.robot_client.simulated.run import OwnRecord
-from offboard.robot_client.simulated.workload import CLOSED, due_instants
 from offboard.robot_client.sites import heartbeat
 from offboard.robot_client.sites.runner import CLOUD
 

@@ -3,7 +3,6 @@
 `predictor_evaluation` and `replay` compute figures from them.
 """
 
-import contextlib
 import csv
 import io
 import math
@@ -16,8 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from offboard.common.errors import ConfigError, DataError
+from offboard.common.security.plain_files import replace_file
+from offboard.loadgen.robot_files import read_trace
 from offboard.robot_client.policies import PINNED
-from offboard.robot_client.records import trace
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 HEADER = ("size", "onboard_s", "cloud_s")
@@ -77,7 +77,7 @@ def read_lived(path: Path, kind: str | None = None) -> Lived:
     """The tasks of a trace that a policy placed; a CSV dataset has none."""
     lived: list[tuple[float, bool]] = []
     first_lines: dict[str, int] = {}  # of each kind
-    for line, fields in enumerate(() if is_csv(path) else trace.read(path), 1):
+    for line, fields in enumerate(() if is_csv(path) else read_trace(path), 1):
         decision, where = fields["decision"], f"{path}:{line}"
         if kind is not None and fields["kind"] != kind:
             continue
@@ -102,14 +102,10 @@ def write_csv(path: Path, rows: Rows) -> None:
 
 def write_whole(path: Path, text: str) -> None:
     """Write a file completely; if that fails, leave the old one as it was."""
-    part = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
+        replace_file(path, text.encode())
     except OSError as error:
-        with contextlib.suppress(OSError):
-            part.unlink()
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
 
 
@@ -166,7 +162,7 @@ def _read_trace(path: Path, kind: str | None, least: int) -> Rows:
     found: list[Row] = []
     first_lines: dict[str, int] = {}  # of each kind
     left_out = 0
-    for line, fields in enumerate(trace.read(path), 1):
+    for line, fields in enumerate(read_trace(path), 1):
         if kind is not None and fields["kind"] != kind:
             continue
         row = _trace_row(f"{path}:{line}", fields)
@@ -178,7 +174,7 @@ def _read_trace(path: Path, kind: str | None, least: int) -> Rows:
     if len(found) < least:
         raise DataError(
             f"{path}: no {kind or 'task'} was answered by both sites; measure some with "
-            "`loadgen run SCENARIO --measure both` or `robot-client drive --measure K`"
+            "`loadgen run SCENARIO --measure both` or `loadgen drive --measure K`"
         )
     _check_one_kind(path, first_lines)
     return _rows(found, left_out)

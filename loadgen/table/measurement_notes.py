@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from offboard.common.errors import DataError
+from offboard.loadgen.robot_files import alone_path
 from offboard.loadgen.table.measured_rows import Rows, is_csv, read
 from offboard.loadgen.table.site_disturbance import Disturbance, measure
-from offboard.robot_client.records.trace import alone_path
 
 
 def read_noted(path: Path, kind: str | None = None, *, least: int = 1) -> Rows:

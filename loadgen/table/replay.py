@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from offboard.common.config import check, setting
+from offboard.common.errors import DataError
 from offboard.common.tasks import Kind, Task, task
 from offboard.loadgen import rivals
 from offboard.loadgen.table import confidence_intervals, table_two_figures
@@ -115,6 +116,8 @@ def run_replay(path: Path, config: ReplayConfig) -> int:
 def tables(path: Path, config: ReplayConfig) -> list[Table]:
     """One table for each feedback mode. The first line of a trace's table is the recorded run itself."""
     rows, lived = read_noted(path, config.kind, least=0), read_lived(path, config.kind)
+    if not len(rows) + rows.left_out:
+        raise DataError(f"{path}: there is no {config.kind or 'task'} in this trace")
     recorded = [_recorded(lived.waited_s, lived.to_cloud)] if len(lived.waited_s) else []
     return [_table(path, rows, config, feedback=mode, recorded=recorded) for mode in config.modes()]
 

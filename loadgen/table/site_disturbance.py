@@ -1,6 +1,6 @@
 """Disturbance between the sites: how much slower a task is on one site while it also runs on the other one.
 
-It is computed from the trace of `robot-client drive --alone`, in which each plan ran onboard alone, in the
+It is computed from the trace of `loadgen drive --alone`, in which each plan ran onboard alone, in the
 cloud alone, and on both sites at once.
 """
 
@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from offboard.common.errors import DataError
+from offboard.loadgen.robot_files import read_trace
 from offboard.loadgen.table.confidence_intervals import Blocks
 from offboard.loadgen.table.measured_rows import SHOWN_MAX, VALUE_MAX
-from offboard.robot_client.records import trace
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 ALONE = "trace.alone.jsonl"  # in the folder of a run
@@ -95,7 +95,7 @@ class Disturbance:
 
 
 def measure(path: Path, *, seed: int = SEED) -> Disturbance | None:
-    """The disturbance in a trace of `robot-client drive --alone`.
+    """The disturbance in a trace of `loadgen drive --alone`.
 
     None if no plan succeeded in all three ways.
     """
@@ -174,7 +174,7 @@ def _change(pairs: Sequence[tuple[float, float]], seed: int) -> Change:
 
 
 def _runs(path: Path) -> Iterator[_Run]:
-    for line, fields in enumerate(trace.read(path), 1):
+    for line, fields in enumerate(read_trace(path), 1):
         where = f"{path}:{line}"
         try:
             ran = fields["executions"]

@@ -75,7 +75,7 @@ KINDS: Mapping[str, Kind] = {
         http=8001,
         ready="/health",
     ),
-    ROBOT: Kind("robot-client", ("--cloud", "tcp://wan:5555"), (NEAR,)),
+    ROBOT: Kind("loadgen", ("--cloud", "tcp://wan:5555"), (NEAR,)),
 }
 
 

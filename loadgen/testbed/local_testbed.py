@@ -36,7 +36,7 @@ HOG = "while True: pass"
 COMMANDS: Mapping[str, Sequence[str]] = {
     CLOUD: (sys.executable, "-m", "offboard.cloud_server"),
     WAN: (sys.executable, "-m", "offboard.loadgen", "wan"),
-    ROBOT: (sys.executable, "-m", "offboard.robot_client"),
+    ROBOT: (sys.executable, "-m", "offboard.loadgen"),
 }
 
 

@@ -12,7 +12,7 @@ class CheckConfig:
 
     keys: Path | None = setting(
         None,
-        "folder with robot.key_secret and server.key, as for --keys of `robot-client drive`",
+        "folder with robot.key_secret and server.key, as for `Offloader.connect(keys=...)`",
         metavar="DIR",
     )
     tasks: tuple[str, ...] = setting(

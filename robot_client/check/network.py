@@ -3,10 +3,12 @@
 What is said over ZMQ is in `session`.
 """
 
+import contextlib
 import errno
 import os
 import socket
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
 
@@ -34,25 +36,28 @@ class Address:
 
     host: str
     port: int
-    family: socket.AddressFamily
 
     @classmethod
     def of(cls, endpoint: str) -> "Address":
         host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
-        # ZMQ uses IPv6 only for an address in brackets.
-        family = socket.AF_INET6 if host.startswith("[") else socket.AF_INET
-        return cls(host.strip("[]"), int(port), family)
+        return cls(host.strip("[]"), int(port))
 
 
-def resolve(address: Address) -> str:
-    """The IP address of the host; OSError if its name is not known."""
-    found = socket.getaddrinfo(address.host, address.port, address.family, socket.SOCK_STREAM)
-    return str(found[0][4][0])
+def resolve(address: Address) -> list[str]:
+    """An IPv4 and an IPv6 address of the host, if it has both; OSError if its name is not known."""
+    found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)
+    first = {family: str(where[0]) for family, *_, where in reversed(found)}
+    return [first[family] for family in (socket.AF_INET, socket.AF_INET6) if family in first]
 
 
-def connect(ip: str, address: Address, timeout_s: float) -> None:
-    """Open a TCP connection, and close it again; OSError if that fails."""
-    socket.create_connection((ip, address.port), timeout_s).close()
+def connect(ips: Sequence[str], address: Address, timeout_s: float) -> str:
+    """The first IP address that takes a TCP connection; OSError of the last one if none does."""
+    *others, last = ips
+    for ip in others:
+        with contextlib.suppress(OSError):
+            return connect([ip], address, timeout_s)
+    socket.create_connection((last, address.port), timeout_s).close()
+    return last
 
 
 def identify(ip: str, address: Address, timeout_s: float) -> Listener:

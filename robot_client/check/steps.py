@@ -37,7 +37,8 @@ class Check:
         self._keys = None if keys is None else robot_keys(keys, CLOUD)
         self._kinds, self._chosen = load_kinds(modules), bool(modules)
         self._timeout_s = timeout_s
-        self._ip = ""
+        self._ips: list[str] = []
+        self._ip = ""  # the one that is used
         self._listener = Listener.OTHER
         self._session: Session | None = None
         self._server: wire.Hello | None = None
@@ -79,18 +80,19 @@ class Check:
     def _resolve(self) -> str:
         host = self._address.host
         try:
-            self._ip = resolve(self._address)
+            self._ips = resolve(self._address)
         except OSError as error:
             raise StepFailed(
                 f"{host}: {reason(error)}",
                 "correct the name, or add it to DNS or /etc/hosts; containers must share a network",
             ) from error
-        return f"{host} -> {self._ip}"
+        self._ip = self._ips[0]
+        return f"{host} -> {' and '.join(self._ips)}"
 
     def _connect(self) -> str:
         port = self._address.port
         try:
-            connect(self._ip, self._address, self._timeout_s)
+            self._ip = connect(self._ips, self._address, self._timeout_s)
         except ConnectionRefusedError as error:
             raise StepFailed(
                 f"nothing listens on port {port} of {self._ip}",

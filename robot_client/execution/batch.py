@@ -4,12 +4,13 @@ Which task goes where is decided in `placement`; each task is then run by the of
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any
 
 from offboard.common.errors import Overtaken, TaskError
 from offboard.common.tasks import Kind, Task, first_number
+from offboard.robot_client.execution.call_threads import CallThreads
 from offboard.robot_client.execution.placement import (
     BUDGET_SHARE,
     SERVER_IN_FLIGHT_MAX,
@@ -80,16 +81,18 @@ class Batch:
 
     def run(self) -> list[Any]:
         """The results in the order of the tasks; if tasks failed, the first error, when all have ended."""
-        threads = SERVER_IN_FLIGHT_MAX * len(self._queues)
-        with ThreadPoolExecutor(threads, thread_name_prefix=NAME) as pool:
+        threads = CallThreads(SERVER_IN_FLIGHT_MAX * len(self._queues), NAME)
+        try:
             while self._waiting or self._running:
                 while (start := self._next()) is not None:
-                    self._start(pool, *start)
+                    self._start(threads, *start)
                 if not self._waiting:
                     self._take_over()
                 self._clock.wait(list(self._running), RECHECK_S)
                 for done in [one for one in self._running if one.done()]:
                     self._finish(done)
+        finally:
+            threads.close(wait=True)
         if self._errors:
             raise self._errors[min(self._errors)]
         return [self._values[number] for number in range(len(self._tasks))]
@@ -125,12 +128,12 @@ class Batch:
         said = " against ".join(f"{site} done in {start.finish_s[site] * 1e3:.3g} ms" for site in order)
         return f"{said}; {len(self._waiting)} tasks wait"
 
-    def _start(self, pool: ThreadPoolExecutor, number: int, site: str, reason: str) -> None:
+    def _start(self, threads: CallThreads, number: int, site: str, reason: str) -> None:
         seconds = _seconds(self._look(number).sites).get(site, 0.0)
         self._waiting.remove(number)
         self._queues[site].start(number, seconds, self._clock.now_s())
         placed = self._placed[number] = Placed(site, reason)
-        self._running[pool.submit(self._run, self._tasks[number], placed)] = number
+        self._running[threads.start(self._run, self._tasks[number], placed)] = number
 
     def _take_over(self) -> None:
         """Let an idle site run a task too if it should end sooner there, and if second runs are allowed."""
@@ -178,14 +181,19 @@ def arguments(kind: Kind, items: Iterable[Any]) -> list[tuple[Any, ...]]:
 
 
 def _usable(forecast: Forecast) -> Mapping[str, Outlook]:
-    """The sites to compare: not the silent ones, and not those beyond the caps."""
+    """The sites to compare: not those that are silent or given up, and not those beyond the caps."""
     if len(forecast.sites) == 1:
         return forecast.sites
     return {
         site: one
         for site, one in forecast.sites.items()
         if site == ONBOARD
-        or not (one.condition.silent or one.bytes > forecast.bytes_left or one.joules > forecast.joules_left)
+        or not (
+            one.condition.silent
+            or one.given_up
+            or one.bytes > forecast.bytes_left
+            or one.joules > forecast.joules_left
+        )
     }
 
 

@@ -1,34 +1,51 @@
-"""Checks that the arguments and the result of a kind can be sent to a server, at its first call.
+"""Says once in the log why calls of a kind can only be answered onboard: a value cannot be sent.
 
 What can be sent is decided in `common.wire.values`.
 """
 
+import logging
+from collections.abc import Iterable
 from typing import Any
 
-from offboard.common.errors import BadValue
+from offboard.common.errors import BadValue, CannotCross, describe
 from offboard.common.tasks import Kind, Task
 from offboard.common.wire.values import encode
+from offboard.robot_client.sites.runner import Execution
+
+log = logging.getLogger(__name__)
 
 
 class CrossingCheck:
-    """Raises BadValue at the first call of a kind, even if that call runs onboard."""
+    """Checks the values of the first call of each kind, even if it runs onboard, and hears of later ones."""
 
     def __init__(self) -> None:
-        self._checked: set[str] = set()
+        self._checked: set[str] = set()  # kinds
+        self._logged: set[tuple[str, bool]] = set()  # kinds, and whether the task had run
 
     def check_arguments(self, task: Task) -> None:
         if task.kind.name not in self._checked:
-            _check(task.kind, "arguments", list(task.args))
+            self._check(task.kind, list(task.args), ran=False)
 
     def check_result(self, kind: Kind, value: Any) -> None:
         """Check a result; later calls of this kind are not checked again."""
         if kind.name not in self._checked:
-            _check(kind, "result", value)
             self._checked.add(kind.name)
+            self._check(kind, value, ran=True)
 
+    def hear(self, kind: Kind, executions: Iterable[Execution]) -> None:
+        for one in executions:
+            if isinstance(one.failure, CannotCross):
+                self._log(kind, str(one.failure), ran=one.started)
 
-def _check(kind: Kind, what: str, value: Any) -> None:
-    try:
-        encode(value, kind.types)
-    except BadValue as error:
-        raise BadValue(f"{what} of task {kind.name}: {error}") from error
+    def _check(self, kind: Kind, value: Any, *, ran: bool) -> None:
+        try:
+            encode(value, kind.types, name="result" if ran else "arguments")
+        except BadValue as error:
+            self._log(kind, str(error), ran=ran)
+        except Exception as error:  # noqa: BLE001 - such as a dict that another thread changes meanwhile
+            self._log(kind, describe(error), ran=ran)
+
+    def _log(self, kind: Kind, why: str, *, ran: bool) -> None:
+        if (kind.name, ran) not in self._logged:
+            self._logged.add((kind.name, ran))
+            log.warning("%s: only onboard can answer such a call: %s", kind.name, why)

@@ -8,7 +8,7 @@ from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass
 from typing import Any
 
-from offboard.common.errors import BadValue, CloudBroken, CloudError, Overtaken, TaskError
+from offboard.common.errors import CloudBroken, CloudError, Overtaken, TaskError
 from offboard.common.tasks import Kind, Task
 from offboard.robot_client.policies import Hedge, Probe
 from offboard.robot_client.sites.clock import Clock
@@ -136,9 +136,6 @@ class Race:
 
 def answer_of(executions: tuple[Execution, ...]) -> Execution:
     """The fastest good answer, or else the failure of the task itself, or else the last failure."""
-    for execution in executions:
-        if isinstance(execution.failure, BadValue):
-            return execution
     good = [execution for execution in executions if execution.ok]
     if good:
         return min(good, key=lambda execution: execution.seconds)
@@ -155,8 +152,8 @@ def _finished(site: str, future: "Future[Execution]") -> Execution:
 
 
 def _is_answer(execution: Execution) -> bool:
-    """Whether the race is over: if the task itself fails, it fails on every site."""
-    return execution.ok or isinstance(execution.failure, TaskError)
+    """Whether the race is over: if the task itself fails, it fails on every site; its setup may not."""
+    return execution.ok or (isinstance(execution.failure, TaskError) and execution.started)
 
 
 def _may_fall_back(execution: Execution, kind: Kind) -> bool:

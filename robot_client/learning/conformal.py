@@ -8,14 +8,11 @@ import operator
 from bisect import bisect_left, insort
 from collections import deque
 
-from offboard.robot_client.policies.forecast import ERRORS_MIN, PredictionErrors, unit_s
-from offboard.robot_client.policies.objectives import SPREADS_90
-from offboard.robot_client.predictors.line import RunningMean
+from offboard.robot_client.policies.forecast import ERRORS_MIN, SPREADS_90, PredictionErrors, unit_s
+from offboard.robot_client.predictors.line import RATE, RunningMean
 
 COVERAGE = 0.9  # share of the times that an interval should hold
-OUTSIDE_MIN, OUTSIDE_MAX = -0.1, 0.5  # below 0, the interval is wider than all errors seen
 ERRORS_MAX = 100  # the last ones
-RATE = 0.03  # of the adaptation
 
 
 class Conformal:
@@ -71,7 +68,8 @@ class Conformal:
 
     def _adapt(self, *, missed: bool) -> None:
         outside = self._outside + RATE * (1 - COVERAGE - missed)
-        self._outside = min(OUTSIDE_MAX, max(OUTSIDE_MIN, outside))
+        # Below 0, the interval is wider than all errors seen.
+        self._outside = min(COVERAGE, max(COVERAGE - 1, outside))
         self._ends = None
 
     def _add(self, score: float) -> None:

@@ -7,12 +7,14 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterable
 
+from offboard.common.errors import is_interrupt
 from offboard.common.tasks import Kind, Size, first_number
 from offboard.robot_client.learning.shared_work import SharedWork
-from offboard.robot_client.learning.site import OBSERVATIONS_MAX, SiteMemory
+from offboard.robot_client.learning.site import SiteMemory
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.objectives import Objective
 from offboard.robot_client.predictors import Predictor
+from offboard.robot_client.predictors.base import REMEMBERED
 from offboard.robot_client.sites.runner import Execution
 
 log = logging.getLogger(__name__)
@@ -38,7 +40,7 @@ class KindMemory:
     ) -> None:
         self.sites: dict[str, SiteMemory] = {}
         self.last_site: str | None = None  # where the last task was sent
-        self.worked: deque[tuple[float, float]] = deque(maxlen=OBSERVATIONS_MAX)  # sizes and their work
+        self.worked: deque[tuple[float, float]] = deque(maxlen=REMEMBERED)  # sizes and their work
         self.kind = kind
         self._make = make
         self._objective = objective
@@ -72,7 +74,9 @@ class KindMemory:
             return None
         try:
             return self.kind.work_of(execution.value)
-        except Exception:  # the function is the user's own
+        except BaseException as error:  # the function is the user's own
+            if is_interrupt(error):
+                raise
             log.exception("cannot read the work of task %s from its result", self.kind.name)
             return None
 

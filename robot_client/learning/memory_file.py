@@ -11,7 +11,8 @@ from typing import Any
 
 from offboard.common import VERSION as SOFTWARE
 from offboard.common.tasks import Size
-from offboard.robot_client.learning.site import OBSERVATIONS_MAX, Observation
+from offboard.robot_client.learning.site import Observation
+from offboard.robot_client.predictors.base import REMEMBERED
 from offboard.robot_client.sites.runner import Condition
 
 FORMAT = 2  # version of the file: a file of another version is not read
@@ -80,12 +81,12 @@ def _kind(given: Any) -> KeptKind:
         raise ValueError(f"amounts per {given['per']!r}")
     worked = [(_number(size), _number(work)) for size, work in given["worked"]]
     sites = {name: _site(site) for name, site in given["sites"].items()}
-    return KeptKind(str(given["source"]), given["per"], tuple(worked[-OBSERVATIONS_MAX:]), sites)
+    return KeptKind(str(given["source"]), given["per"], tuple(worked[-REMEMBERED:]), sites)
 
 
 def _site(given: Any) -> KeptSite:
     observations = [_observation(one) for one in given["observations"]]
-    return KeptSite(_number(given["saved_at"]), tuple(observations[-OBSERVATIONS_MAX:]))
+    return KeptSite(_number(given["saved_at"]), tuple(observations[-REMEMBERED:]))
 
 
 def _observation(given: Any) -> Observation:

@@ -7,14 +7,13 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-PROBES_MAX = 200  # the last ones, of all kinds
-PROBES_MIN = 5  # with fewer, the interval would be several times the mean
-NORMAL_95 = 1.959964  # standard deviations on each side that hold 95 % of a normal distribution
+from offboard.robot_client.policies.forecast import SPREADS_90
+from offboard.robot_client.predictors.base import REMEMBERED, WARM_UP
 
 
 @dataclass(frozen=True, slots=True)
 class Regret:
-    """The seconds that the better site would have saved per task: mean and 95 % interval over `probes`."""
+    """The seconds that the better site would have saved per task: mean and 90 % interval over `probes`."""
 
     mean_s: float
     low_s: float
@@ -30,28 +29,28 @@ class RegretEstimate:
     """
 
     def __init__(self) -> None:
-        self._regrets: deque[float] = deque(maxlen=PROBES_MAX)
+        self._regrets: deque[float] = deque(maxlen=REMEMBERED)
         self._estimate: Regret | None = None
 
     def learn(self, chosen_s: float, other_s: float) -> None:
         """Take the times of a probed task: on the chosen site, and on the probed one."""
         self._regrets.append(max(0.0, chosen_s - other_s))
-        if len(self._regrets) >= PROBES_MIN:
+        if len(self._regrets) >= WARM_UP:
             self._estimate = self._fresh()
 
     def estimate(self) -> Regret | None:
-        """The estimate; None before PROBES_MIN probes."""
+        """The estimate; None before WARM_UP probes."""
         return self._estimate
 
     def _fresh(self) -> Regret:
         count = len(self._regrets)
         mean = math.fsum(self._regrets) / count
         variance = math.fsum((one - mean) ** 2 for one in self._regrets) / (count - 1)
-        half = student_95(count - 1) * math.sqrt(variance / count)
+        half = student_90(count - 1) * math.sqrt(variance / count)
         return Regret(mean, max(0.0, mean - half), mean + half, count)
 
 
-def student_95(freedom: int) -> float:
-    """The 97.5 % quantile of Student's t, to 2 % from 4 degrees of freedom (Abramowitz, Stegun 26.7.5)."""
-    z = NORMAL_95
+def student_90(freedom: int) -> float:
+    """The 95 % quantile of Student's t, to 2 % from 4 degrees of freedom (Abramowitz, Stegun 26.7.5)."""
+    z = SPREADS_90
     return z + (z**3 + z) / (4 * freedom) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * freedom**2)

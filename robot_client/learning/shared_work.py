@@ -8,9 +8,9 @@ from array import array
 from bisect import bisect_left, bisect_right
 from collections import deque
 
-PAIRS_MAX = 200  # (size, work) remembered
+from offboard.robot_client.predictors.base import REMEMBERED, ROUNDING
+
 OUTLIER = 3.0  # times the median work nearby: more work than this counts as this much
-ROUNDING = 1e-12  # of the squares of the size differences: with less spread, all sizes are equal
 NEIGHBOURS = 20  # pairs that are nearest in size: the line goes through these
 
 
@@ -29,7 +29,7 @@ class SharedWork:
 
     def learn(self, size: float, work: float) -> None:
         """A result said that a task of this size was this much work."""
-        if len(self._order) == PAIRS_MAX:
+        if len(self._order) == REMEMBERED:
             at = self._place(*self._order.popleft())
             del self._sizes[at], self._works[at]
         self._order.append((size, work))

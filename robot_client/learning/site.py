@@ -7,19 +7,18 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from offboard.common.errors import Overtaken, TaskError
+from offboard.common.errors import CannotCross, Overtaken, TaskError
 from offboard.common.tasks import Size, first_number
 from offboard.robot_client.learning.conformal import Conformal
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.forecast import Outlook
 from offboard.robot_client.policies.objectives import Expected, Objective
 from offboard.robot_client.predictors import Prediction, Predictor
+from offboard.robot_client.predictors.base import REMEMBERED
 from offboard.robot_client.predictors.least_squares import LeastSquares
 from offboard.robot_client.predictors.line import RunningMean
 from offboard.robot_client.predictors.parts import Parts
 from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Execution
-
-OBSERVATIONS_MAX = 200  # of one site, kept for `store`
 
 
 @dataclass(slots=True)
@@ -72,7 +71,7 @@ class SiteMemory:
         # Like `age`, but for this process only: recalled times are old enough for a probe, but as certain as
         # they were.
         self.tasks_since = 0
-        self.observations: deque[Observation] = deque(maxlen=OBSERVATIONS_MAX)
+        self.observations: deque[Observation] = deque(maxlen=REMEMBERED)
         self.measured = measured
         self._parts = predictor if isinstance(predictor, Parts) else None
         if self._parts is not None:
@@ -159,7 +158,9 @@ class SiteMemory:
         if overtaken and execution.seconds <= (expected_s or 0.0):
             return  # stopped before its predicted time: the site may be as fast as predicted
         ahead = self.count_run()
-        if isinstance(execution.failure, TaskError):
+        if isinstance(execution.failure, TaskError | CannotCross):
+            if isinstance(execution.failure, TaskError) and not execution.started:
+                self._failures += 1  # its setup failed: the site is at fault, not the task
             return
         if not overtaken:  # a run that lost a race did not fail
             self._failures = 0 if ok else self._failures + 1

@@ -4,7 +4,6 @@ Observations are kept, not what a predictor made of them, so that any predictor 
 The content of the file is defined in `memory_file`.
 """
 
-import contextlib
 import logging
 import math
 import os
@@ -15,17 +14,18 @@ from dataclasses import replace
 from pathlib import Path
 
 from offboard.common.errors import ConfigError
+from offboard.common.security.plain_files import check_plain, replace_file
 from offboard.common.tasks import Size
 from offboard.robot_client.learning import memory_file
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.memory_file import PER_SIZE, PER_WORK, KeptKind, KeptSite, Unreadable
 from offboard.robot_client.learning.site import Observation
 from offboard.robot_client.policies.probe import PROBE_EVERY
+from offboard.robot_client.predictors.base import WARM_UP
 
 SAVE_EVERY_S = 30.0  # while tasks run; the file is also saved at the end
 WRITE_WAIT_S = 5.0  # that the end of the process waits for a slow disk
 HALF_LIFE_S = 3600.0  # without the process: after this time, half as many observations are recalled
-OBSERVATIONS_MIN = 5  # of a site; with fewer, the site starts cold
 FILE_BYTES_MAX = 64 * 1024 * 1024  # of a memory file, so that a wrong file does not fill the memory
 
 log = logging.getLogger(__name__)
@@ -44,9 +44,8 @@ class Store:
         self._due_s: float | None = None
         self._writer: threading.Thread | None = None
         self._failed = False
-        if path.is_dir():
-            raise ConfigError(f"memory {path}: is a folder")
         try:
+            check_plain(path)
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ConfigError(f"memory {path}: {error.strerror}") from error
@@ -123,7 +122,7 @@ class Store:
         """The newest observations of a site: half as many for each HALF_LIFE_S since they were saved."""
         away_s = max(0.0, self._now() - site.saved_at)  # the clock may have been set back
         count = math.ceil(len(site.observations) * 2 ** (-away_s / HALF_LIFE_S))
-        return site.observations[-count:] if count >= OBSERVATIONS_MIN else ()
+        return site.observations[-count:] if count >= WARM_UP else ()
 
     def _write(self, kinds: Mapping[str, KeptKind]) -> None:
         try:
@@ -155,33 +154,13 @@ class Store:
     def _set_aside(self) -> str:
         """Rename the first file that could not be read, so that it is kept; returns what happened to it."""
         aside = self.path.with_name(f"{self.path.name}.unreadable")
-        if aside.exists():
+        if os.path.lexists(aside):
             return f"it will be replaced: {aside} is there already"
         try:
             self.path.rename(aside)
         except OSError as error:
             return f"it will be replaced: it cannot be renamed: {error.strerror}"
         return f"the file is now {aside}"
-
-
-def replace_file(path: Path, text: bytes) -> None:
-    """Replace a file in one step: a reader, also after a crash, finds the whole old or the whole new text."""
-    fresh = path.with_name(f".{path.name}.new")
-    try:
-        with fresh.open("wb") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        fresh.replace(path)
-    except OSError:
-        with contextlib.suppress(OSError):
-            fresh.unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
 
 
 def _as_learnt(observations: Collection[Observation], saved_per: str, per_work: bool) -> list[Observation]:

@@ -7,11 +7,10 @@ import math
 
 from offboard.common.errors import ConfigError
 from offboard.common.token_bucket import Bucket
+from offboard.robot_client.predictors.base import WARM_UP
 
 DUPLICATES = 0.1  # second runs per task
-DUPLICATES_MAX = (
-    6.0  # second runs at the start, that can be saved up, and that can be owed: a warm-up takes as many
-)
+DUPLICATES_MAX = float(WARM_UP)  # second runs: at the start, saved up, and owed; a warm-up takes as many
 
 
 class Allowance:

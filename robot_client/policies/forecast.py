@@ -11,10 +11,11 @@ from functools import cached_property
 from typing import NamedTuple
 
 from offboard.common.tasks import Size
+from offboard.robot_client.predictors.base import WARM_UP
 from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition
 
 ERRORS_MIN = 10  # with fewer errors, only the spread says how far a prediction may be off
-LATE_SPREADS = 2.0  # with fewer errors, a task is late this many spreads after its predicted time
+SPREADS_90 = 1.645  # standard deviations on each side that hold 90 % of the times, and above which 5 % are
 TAIL_SHARE = 0.2  # of the errors, the largest ones: they say how much longer a late task may take
 BEYOND = 0.25  # of the distance from the median to the largest error: later than that, no task has ended
 
@@ -111,6 +112,11 @@ class Outlook(NamedTuple):
     condition: Condition = UNMEASURED
     errors: PredictionErrors = NO_ERRORS
 
+    @property
+    def given_up(self) -> bool:
+        """Whether all that is known of the site is that its runs fail, as many as a warm-up has."""
+        return self.predicted_s is None and self.failures >= WARM_UP
+
     def overdue_s(self, worth_s: float) -> float | None:
         """How old, in seconds, a running task is when it should still need more than `worth_s`."""
         if self.predicted_s is None:
@@ -118,7 +124,7 @@ class Outlook(NamedTuple):
         after_s = self.errors.overdue(self.predicted_s, worth_s)
         if after_s is not None:
             return after_s
-        return None if self.spread_s is None else self.predicted_s + LATE_SPREADS * self.spread_s
+        return None if self.spread_s is None else self.predicted_s + SPREADS_90 * self.spread_s
 
 
 class Forecast(NamedTuple):
@@ -170,7 +176,7 @@ def home(forecast: Forecast) -> str:
 
 
 def _cost_without_objective(outlook: Outlook) -> float:
-    """An unknown site costs nothing, so that it is tried; an unknown site that is silent is never tried."""
+    """An unknown site costs nothing, so that it is tried, unless it is silent or was given up."""
     if outlook.predicted_s is None:
-        return math.inf if outlook.condition.silent else 0.0
+        return math.inf if outlook.condition.silent or outlook.given_up else 0.0
     return outlook.predicted_s

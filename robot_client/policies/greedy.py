@@ -23,8 +23,10 @@ class Greedy:
         return Decision(site, partial(explain, forecast, site), "greedy")
 
     def _warm_up(self, forecast: Forecast) -> Decision | None:
-        """Run on all sites except silent ones, unless tasks under way will soon tell enough."""
-        heard = {site: one for site, one in forecast.sites.items() if not one.condition.silent}
+        """Run on all sites that can be expected to answer, unless tasks under way will soon tell enough."""
+        heard = {
+            site: one for site, one in forecast.sites.items() if not (one.condition.silent or one.given_up)
+        }
         cold = [site for site, one in heard.items() if _is_cold(one)]
         if not cold or len(heard) == 1:
             return None
@@ -48,8 +50,8 @@ def explain(forecast: Forecast, site: str) -> str:
 
 
 def _is_cold(one: Outlook) -> bool:
-    """A task that is under way will soon add an observation: it is waited for."""
-    return one.observations < WARM_UP and not (one.full or one.in_flight)
+    """A task that is under way will soon add an observation: it is waited for. A site that fails is not."""
+    return one.observations < WARM_UP > one.failures and not (one.full or one.in_flight)
 
 
 def _times(one: Outlook) -> str:

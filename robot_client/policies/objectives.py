@@ -4,14 +4,10 @@ The joules that an objective weighs are estimated in `energy`.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from offboard.common.errors import ConfigError
-from offboard.robot_client.policies.forecast import PredictionErrors
-
-SPREADS_90 = (
-    1.645  # standard deviations on each side that hold 90 %; 95 % of the times are below the upper end
-)
+from offboard.robot_client.policies.forecast import SPREADS_90, PredictionErrors
 
 
 class Expected(NamedTuple):
@@ -22,6 +18,7 @@ class Expected(NamedTuple):
     joules: float
 
 
+@runtime_checkable
 class Objective(Protocol):
     """Called once for each site that a task could run on."""
 

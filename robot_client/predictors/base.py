@@ -7,7 +7,9 @@ import math
 from typing import NamedTuple, Protocol
 
 WARM_UP = 6  # runs of a site, after which its predictions are compared with those of others
+REMEMBERED = 200  # observations of a site, sizes with their work, and probes
 SIZE_MIN = 1e-100  # smaller differences of sizes are 0: a steeper line would leave the range of a float
+ROUNDING = 1e-12  # smaller relative differences are rounding errors
 
 
 class Prediction(NamedTuple):

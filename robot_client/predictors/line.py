@@ -14,7 +14,6 @@ ODD = 3.0  # standard deviations: a time farther from the line is an outlier
 RATE = 0.05  # of the running means, once there are enough times
 TAIL_MAX = 2.0  # usual times: a longer outlier counts as this much in the mean of the outliers
 SLOPES = 4.0  # times the expected slope: so uncertain is the first one
-RATE_AFTER = 4  # further times that the running means seem to have seen at the start
 
 
 class Line:
@@ -60,7 +59,7 @@ class Line:
         if self.count == 1:
             self._begin(x, y, known)
             return
-        rate = max(RATE, 1.0 / (self.count + RATE_AFTER))
+        rate = max(RATE, 1.0 / self.count)
         error = y - self.a - self.b * x
         unit = 0.5 * (max(0.0, self.a + self.b * x + known) + self._usual) or 1.0
         self._usual += rate * (min(y + known, ODD * self._usual) - self._usual)
@@ -71,15 +70,17 @@ class Line:
             self._pbb += shape
         variance, reach = self._reach(x, unit)
         side = math.copysign(1.0, error) if abs(error) > reach else 0.0
-        if side < 0 or (side != 0 and side == self._side):
+        changed = side < 0 or (side != 0 and side == self._side)
+        if changed:
             error = min(error, unit)  # a change at most doubles the time, until the next one confirms it
             self._loosen(min(1.0, (error / unit) ** 2), known)
             variance, reach = self._reach(x, unit)
         self._side = side
         beyond = min(max(0.0, error - reach) / unit, TAIL_MAX)
         self._tail += rate * (beyond - self._tail)
-        seen = max(0.0, min(error * error, 0.5 * reach * reach) - variance) / (unit * unit)
-        self._noise += rate * (seen - self._noise)
+        if not changed:  # a change is no noise
+            seen = max(0.0, min(error * error, 0.5 * reach * reach) - variance) / (unit * unit)
+            self._noise += rate * (seen - self._noise)
         self._correct(x, max(-reach, min(reach, error)), unit)
 
     def begin_as(self, other: "Line", x: float, y: float) -> None:
@@ -133,6 +134,10 @@ class Line:
         self._paa -= ka * pa
         self._pab -= ka * pb
         self._pbb -= kb * pb
+        if self.a < 0.0 and not self._together and self._paa > 0.0:
+            # No delay is negative, so the slope was too steep: take the likeliest one for a delay of 0.
+            self.b -= self.a * self._pab / self._paa
+            self.a = 0.0
 
 
 class RunningMean:

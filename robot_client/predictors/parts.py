@@ -23,11 +23,14 @@ class Parts:
     `remote`: there is a network between the robot and this site.
     """
 
+    LINE = Line  # what learns each part
+    per_work = True  # amounts are the work of tasks, of kinds whose results tell it
+
     def __init__(self, window: int = 0, seed: int = 0, *, remote: bool = False) -> None:  # noqa: ARG002
         self.remote = remote
-        self._run = Line(together=True)
-        self._network = Line(together=False)
-        self._loaded = Line(together=True)  # runs while other programs take the CPU
+        self._run = self.LINE(together=True)
+        self._network = self.LINE(together=False)
+        self._loaded = self.LINE(together=True)  # runs while other programs take the CPU
         self._usual_run = RunningMean()
         self._usual_delay = RunningMean()
         self._amount = self._bytes = 0.0  # the units

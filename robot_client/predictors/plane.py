@@ -7,15 +7,13 @@ import math
 from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
 
-from offboard.robot_client.predictors.base import SIZE_MIN, Prediction
+from offboard.robot_client.predictors.base import ROUNDING, SIZE_MIN, Prediction
 
 if TYPE_CHECKING:  # --help loads every predictor, but not numpy
     import numpy as np
     import numpy.typing as npt
 
     Array = npt.NDArray[np.float64]
-
-CONSTANT = 2.0**-50  # 4 units in the last place: a number that varies by less, of its largest, is constant
 
 Numbers = tuple[float, ...]
 
@@ -77,7 +75,7 @@ def _fit(rows: list[Numbers], times_s: list[float]) -> _Fit:
     sizes, seconds = np.array(rows), np.array(times_s)
     lowest, highest = sizes.min(axis=0), sizes.max(axis=0)
     span = highest - lowest
-    span[span <= np.maximum(CONSTANT * highest, SIZE_MIN)] = math.inf
+    span[span <= np.maximum(ROUNDING * highest, SIZE_MIN)] = math.inf
     shares = (sizes - lowest) / span  # before the mean is taken, which would round small differences away
     mean = shares.mean(axis=0)
     known = np.column_stack([np.ones(len(seconds)), shares - mean])

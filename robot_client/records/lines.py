@@ -9,11 +9,12 @@ import json
 import logging
 import os
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from offboard.common.errors import ConfigError, DataError
+from offboard.common.errors import ConfigError
+from offboard.common.security.plain_files import check_plain
 
 VERSION = 1
 LINE_START = b'{"v":'
@@ -26,7 +27,7 @@ log = logging.getLogger(__name__)
 class Lines:
     """Appends lines to a file without a buffer, from any thread.
 
-    A line that cannot be written is logged and counted in `lost`; tasks go on.
+    A line that cannot be written is counted in `lost`, and the first one is logged; tasks go on.
 
     what: the kind of file, for messages.
     """
@@ -36,9 +37,11 @@ class Lines:
         self.lost = 0
         self._what = what
         self._lock = threading.Lock()
+        self._counting = threading.Lock()  # apart, as a stalled disk keeps the other one
         try:
+            check_plain(path, link=True)
             path.parent.mkdir(parents=True, exist_ok=True)
-            if path.is_file():
+            if path.exists():
                 self._cut_torn_line()
             self._file = path.open("ab", buffering=0)
         except OSError as error:
@@ -56,15 +59,20 @@ class Lines:
                 if self._file.write(line) < len(line):  # a full disk may take a part of the line
                     raise OSError(errno.ENOSPC, "no space left for the whole line")
             except OSError as error:
-                self.lost += 1
-                about = f"{self._what} {self.path}: task {number} lost ({self.lost} so far)"
-                log.error("%s: %s", about, error.strerror)
+                self._lose(error.strerror)
                 with contextlib.suppress(OSError):
                     os.truncate(self._file.fileno(), end)
 
     def close(self) -> None:
         with self._lock:
             self._file.close()
+
+    def _lose(self, why: str | None, count: int = 1) -> None:
+        """Count lines that are lost, and log the first loss of this file."""
+        with self._counting:
+            first, self.lost = not self.lost, self.lost + count
+        if first:
+            log.error("%s %s: a line is lost: %s; others are only counted", self._what, self.path, why)
 
     def _cut_torn_line(self) -> None:
         """Remove half a line that a crash has left. A file of another kind is never changed."""
@@ -76,38 +84,6 @@ class Lines:
         if kept < self.path.stat().st_size:
             log.warning("%s %s: cut off a torn last line", self._what, self.path)
             os.truncate(self.path, kept)
-
-
-def read(path: Path, names: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """The fields of each line, which must include `names`.
-
-    A torn last line is skipped with a warning. Any other bad line raises DataError.
-    """
-    try:
-        file = path.open("rb")
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror}") from error
-    with file:
-        for number, line in enumerate(file, 1):
-            if not line.endswith(b"\n"):
-                log.warning("%s:%d: torn last line skipped", path, number)
-                return
-            yield _parse(f"{path}:{number}", line, names)
-
-
-def _parse(where: str, line: bytes, names: Sequence[str]) -> dict[str, Any]:
-    try:
-        fields = json.loads(line)
-    except ValueError as error:
-        raise DataError(f"{where}: not a JSON line: {error}") from None
-    if not isinstance(fields, dict):
-        raise DataError(f"{where}: {type(fields).__name__} where an object was expected")
-    if fields.get("v") != VERSION:
-        raise DataError(f"{where}: v = {fields.get('v')!r}; this version reads {VERSION}")
-    missing = [name for name in names if name not in fields]
-    if missing:
-        raise DataError(f"{where}: no field {missing[0]!r}")
-    return fields
 
 
 def _end_of_last_line(path: Path) -> int:

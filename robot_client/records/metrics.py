@@ -4,21 +4,24 @@ The records are made in `offloader`.
 """
 
 import logging
+from collections.abc import Iterator
 from threading import Thread
 from wsgiref.simple_server import WSGIServer
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, start_http_server
+from prometheus_client.core import CounterMetricFamily
+from prometheus_client.registry import Collector
 
 from offboard.common.errors import ConfigError
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.trace import Record, Trace
 from offboard.robot_client.sites.runner import PORT_MAX, Execution
 
 SECONDS_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
 
 REGRET = {
     "": "Mean seconds per task that the better site would have saved",
-    "_low": "Lower end of the 95 % interval of robot_regret_seconds",
-    "_high": "Upper end of the 95 % interval of robot_regret_seconds",
+    "_low": "Lower end of the 90 % interval of robot_regret_seconds",
+    "_high": "Upper end of the 90 % interval of robot_regret_seconds",
 }
 
 log = logging.getLogger(__name__)
@@ -99,6 +102,10 @@ class Metrics:
         inside = str(outlook.low_s <= execution.seconds <= outlook.high_s).lower()
         self._interval.labels(record.kind, execution.site, inside).inc()
 
+    def watch(self, trace: Trace) -> None:
+        """Also serve how many records `trace` has lost."""
+        self._registry.register(_Lost(trace))
+
     def serve(self, host: str, port: int) -> None:
         """Answer GET /metrics in a background thread until `close`."""
         self._server, self._thread = start_http_server(port, host, registry=self._registry)
@@ -110,6 +117,18 @@ class Metrics:
             self._server.shutdown()
             self._server.server_close()
             self._thread.join()
+
+
+class _Lost(Collector):
+    """The records that a trace has lost by the time that Prometheus asks."""
+
+    def __init__(self, trace: Trace) -> None:
+        self._trace = trace
+
+    def collect(self) -> Iterator[CounterMetricFamily]:
+        yield CounterMetricFamily(
+            "robot_trace_lost", "Records that the disk did not take in time", self._trace.lost
+        )
 
 
 def serve_metrics(address: str, where: str) -> Metrics:

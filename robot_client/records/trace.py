@@ -4,38 +4,28 @@ Writing lines so that they survive a crash is left to `lines`.
 """
 
 import atexit
+import logging
 import threading
+import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self
 
+from offboard.common.errors import describe
 from offboard.common.tasks import Size
 from offboard.robot_client.learning.regret import Regret
 from offboard.robot_client.policies import Decision, Hedge, Outlook
-from offboard.robot_client.records import lines
 from offboard.robot_client.records.lines import VERSION, Lines
 from offboard.robot_client.sites.runner import UNMEASURED, Condition, Execution
 
-WRITE_EVERY_S = 0.2
-WAITING_MAX = 1000  # records in memory; the thread that adds one more writes them all
+WRITE_EVERY_S = 0.5
+WAITING_MAX = 1000  # records in memory
+ROOM_WAIT_S, ROOM_POLL_S = 0.1, 0.001  # for which the first task without room waits for the disk
+CLOSE_WAIT_S = 5.0  # that `close` waits for the disk
 
-_FIELDS = (
-    "v",
-    "i",
-    "id",
-    "kind",
-    "started_at",
-    "size",
-    "features",
-    "sites",
-    "decision",
-    "executions",
-    "used",
-    "waited_s",
-)
 _OUTLOOK_FIELDS = ("predicted_s", "spread_s", "low_s", "high_s", "age", "failures")
 _EXECUTION_FIELDS = (
     "site",
@@ -50,6 +40,8 @@ _EXECUTION_FIELDS = (
     "bytes_out",
     "bytes_in",
 )
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,55 +88,72 @@ _LATE_FIELDS, _REGRET_FIELDS = (tuple(one.name for one in fields(of)) for of in 
 
 
 class Trace(Lines):
-    """Appends records to a file, in order. A line that cannot be written is logged; tasks go on.
+    """Appends records to a file, in order. A record that cannot be written is lost and counted; tasks go on.
 
     A thread writes the waiting records every WRITE_EVERY_S. With a tenth of a CPU, writing between two tasks
-    would delay the next one. A crash loses the waiting records.
+    would delay the next one. A crash loses the waiting records. If WAITING_MAX of them wait for the disk,
+    further ones are lost.
     """
 
     def __init__(self, path: Path) -> None:
         super().__init__("trace", path)
         self._waiting: deque[Record] = deque()
-        self._writing = threading.Lock()
-        self._closing = threading.Event()
+        self._stalled = False  # since a task waited for the disk in vain
+        self._closing = False
+        self._due = threading.Event()  # set if the thread must not wait any longer
         self._thread = threading.Thread(target=self._run, name="trace", daemon=True)
         self._thread.start()
         atexit.register(self.close)  # a program that does not close the trace loses no record
 
     def write(self, record: Record) -> None:
-        """Add a record. Any thread may call this."""
-        self._waiting.append(record)
-        if len(self._waiting) >= WAITING_MAX or self._closing.is_set():
-            self.flush()
+        """Add a record. Any thread may call this. After `close` nothing is added."""
+        if self._closing:
+            log.debug("trace %s: task %d ended after the run", self.path, record.i)
+        elif len(self._waiting) < WAITING_MAX or self._has_room():
+            self._waiting.append(record)
+        else:
+            self._lose(f"{WAITING_MAX} records wait for the disk")
 
     def close(self) -> None:
-        """Write all waiting records, and close the file. Safe to call twice."""
+        """Write all waiting records and close the file, within CLOSE_WAIT_S. Safe to call twice."""
         atexit.unregister(self.close)
-        self._closing.set()
-        self._thread.join()
-        self.flush()
-        super().close()
+        if self._closing:
+            return
+        self._closing = True
+        self._due.set()
+        self._thread.join(CLOSE_WAIT_S)
+        if self._thread.is_alive():
+            self._lose(f"it is not written within {CLOSE_WAIT_S:g} s", len(self._waiting))
 
-    def flush(self) -> None:
-        """Write all waiting records. Any thread may call this."""
-        with self._writing:
-            while self._waiting:
-                record = self._waiting.popleft()
-                self.append(record.i, as_dict(record))
+    def _has_room(self) -> bool:
+        """Let the thread write, and wait until it has. After ROOM_WAIT_S the disk has stalled."""
+        self._due.set()
+        until_s = time.monotonic() + ROOM_WAIT_S
+        while len(self._waiting) >= WAITING_MAX and not self._stalled:
+            time.sleep(ROOM_POLL_S)
+            if time.monotonic() > until_s:
+                self._stalled = True
+        return len(self._waiting) < WAITING_MAX
 
     def _run(self) -> None:
-        while not self._closing.wait(WRITE_EVERY_S):
-            self.flush()
+        last = False
+        while not last:
+            self._due.wait(WRITE_EVERY_S)
+            self._due.clear()
+            last = self._closing
+            while self._waiting:
+                self._write_first()
+            self._stalled = False
+        super().close()
 
-
-def alone_path(path: Path) -> Path:
-    """The trace of the plans that `robot-client drive --alone` measures, next to the trace of the run."""
-    return path.with_name(f"{path.stem}.alone.jsonl")
-
-
-def reference_path(path: Path) -> Path:
-    """The lines of `robot-client drive --reference`, next to the trace of the run."""
-    return path.with_name(f"{path.stem}.reference.jsonl")
+    def _write_first(self) -> None:
+        """Write the first waiting record, which waits, and counts, until it is written."""
+        record = self._waiting[0]
+        try:
+            self.append(record.i, as_dict(record))
+        except Exception as error:  # noqa: BLE001 - a policy of the user may decide anything
+            self._lose(describe(error))
+        self._waiting.popleft()
 
 
 def as_dict(record: Record) -> dict[str, Any]:
@@ -179,11 +188,6 @@ def features(record: Record) -> dict[str, float]:
                 if value is not None:
                     found[f"{site}.{name}"] = value
     return found
-
-
-def read(path: Path) -> Iterator[dict[str, Any]]:
-    """The fields of each line. A torn last line is skipped with a warning; any other raises DataError."""
-    return lines.read(path, _FIELDS)
 
 
 def _decision(decision: Decision) -> dict[str, Any]:

@@ -5,6 +5,7 @@ server can be used is `connection`.
 """
 
 import logging
+import math
 import threading
 import time
 from collections import deque
@@ -14,6 +15,7 @@ from concurrent.futures import Future
 from offboard.common import VERSION as SOFTWARE
 from offboard.common.errors import (
     BadValue,
+    CannotCross,
     CloudBroken,
     CloudBusy,
     CloudError,
@@ -21,23 +23,27 @@ from offboard.common.errors import (
     OffloadError,
     Overtaken,
     ProtocolError,
+    describe,
 )
 from offboard.common.security.keys import RobotKeys
 from offboard.common.tasks import Kind, Task, kinds
 from offboard.common.wire import messages as wire
 from offboard.common.wire.payload import payload_bytes
+from offboard.robot_client.sites.absence import CrossingPauses
+from offboard.robot_client.sites.background import Background
 from offboard.robot_client.sites.blob_uploads import BlobUploads
 from offboard.robot_client.sites.cloud_socket import MESSAGE_BYTES_MAX, CloudSocket, SocketEvent
 from offboard.robot_client.sites.connection import Action, Connection, HandshakeFailure
 from offboard.robot_client.sites.heartbeat import EARLY_S, Heartbeat, ServerReport
 from offboard.robot_client.sites.pending_request import PendingRequest
-from offboard.robot_client.sites.runner import CLOUD, Condition, Execution, check_endpoint
+from offboard.robot_client.sites.runner import CLOUD, Condition, Execution, Lasting, check_endpoint
 from offboard.robot_client.sites.shared_reader import Answer, SharedReader
 
 PENDING_MAX = 1024
 ATTEMPTS_MAX = 4  # sends of one request: the first, and one after each `need_blob`
 CLOSE_WAIT_S = 2.0
 IDLE_WAIT_S = 1.0
+LOG_PAUSE_S = 10.0  # at least, between two warnings about bad messages
 
 log = logging.getLogger(__name__)
 
@@ -60,28 +66,33 @@ class CloudRunner:
         heartbeat_s: float = 0.0,
         seed: int = 0,
         keys: RobotKeys | None = None,
+        background: Background | None = None,
     ) -> None:
         check_endpoint(site, endpoint)
         self.site = site
         self._connection = Connection(site, endpoint)
-        self._heartbeat = Heartbeat(heartbeat_s, seed)
+        background = background or Background()
+        self._heartbeat = Heartbeat(heartbeat_s, seed, background)
         self._heartbeat_wanted = False  # by `hurry`
         self._remote: dict[str, str] = {}  # source hashes at the server, by kind
         self._message_bytes_max = MESSAGE_BYTES_MAX  # what the server takes, once it has said so
         self._warned: set[str] = set()  # kinds
         self._pending: dict[int, PendingRequest] = {}
         self._cancelled: deque[int] = deque()
+        self._socket = CloudSocket(site, endpoint, keys)
         self._reader = SharedReader(
             self._tend,
             self._receive,
             unanswered=self._pending.__len__,
             expects_message=self._expects_message,
-            wake=self._wake,
+            wake=self._socket.wake,
+            pause_s=background.pause_s,
         )
         self._reader_wakes_s: float | None = None  # when a waiting reader wakes by itself; None: none waits
         self._messages = 0
+        self._warned_s = -math.inf  # when a bad message was last logged
         self._uploads = BlobUploads()
-        self._socket = CloudSocket(site, endpoint, keys)
+        self._pauses = CrossingPauses()
         self._thread = threading.Thread(target=self._run, name=f"site-{site}", daemon=True)
         self._thread.start()
 
@@ -90,7 +101,7 @@ class CloudRunner:
         if absent is not None:
             return absent
         if self._remote.get(kind.name) == kind.source_hash != "":
-            return None
+            return self._pauses.why_absent(kind.name)
         why = (
             f"the source of task {kind.name} differs on the server"
             if kind.name in self._remote
@@ -99,19 +110,20 @@ class CloudRunner:
         if kind.name not in self._warned:
             self._warned.add(kind.name)
             log.warning("%s: %s: this task stays onboard", self.site, why)
-        return why
+        return Lasting(why)
 
     def submit(self, task: Task, budget_s: float) -> "Future[Execution]":
         published_s = time.perf_counter()
         try:
             inline = self._uploads.inline_rule(task.kind.name, self._message_bytes_max)
-            body = wire.encode(list(task.args), task.kind.types, blobs=True, along=inline)
-        except BadValue as error:
-            return self._refused(BadValue(f"task {task.kind.name}: {error}"))
+            body = wire.encode(list(task.args), task.kind.types, name="arguments", blobs=True, along=inline)
+        except Exception as error:  # noqa: BLE001 - whatever cannot be sent, onboard can answer
+            why = str(error) if isinstance(error, BadValue) else f"arguments: {describe(error)}"
+            return self._cannot_cross(task, why)
         largest = max([wire.byte_count(body.frames), *(raw.nbytes for raw in body.blobs.values())])
         if largest > self._message_bytes_max - wire.HEADER_BYTES_MAX:
-            failure = f"{largest} bytes of arguments; the server takes messages of {self._message_bytes_max}"
-            return self._refused(CloudBroken(failure))
+            why = f"arguments of {largest} bytes; the server takes messages of {self._message_bytes_max}"
+            return self._cannot_cross(task, why)
         if len(self._pending) >= PENDING_MAX:
             return self._refused(CloudBusy(f"{PENDING_MAX} tasks are in flight"))
         pending = PendingRequest(
@@ -152,6 +164,11 @@ class CloudRunner:
         self._reader.close()
         self._thread.join(CLOSE_WAIT_S)
 
+    def _cannot_cross(self, task: Task, why: str) -> "Future[Execution]":
+        failure = CannotCross(why)
+        self._pauses.note(task.kind.name, failure, time.perf_counter())
+        return self._refused(failure)
+
     def _refused(self, failure: OffloadError) -> "Future[Execution]":
         future: Future[Execution] = Future()
         future.set_result(Execution(self.site, 0.0, failure=failure, started=False))
@@ -159,9 +176,6 @@ class CloudRunner:
 
     def _expects_message(self) -> bool:
         return bool(self._pending or self._heartbeat.unanswered)
-
-    def _wake(self) -> None:
-        self._socket.wake()
 
     def _run(self) -> None:
         try:
@@ -273,7 +287,14 @@ class CloudRunner:
         except wire.VersionMismatch as error:
             self._connection.other_version(str(error))
         except ProtocolError as error:
-            log.warning("%s: message dropped: %s", self.site, error)
+            if received_s - self._warned_s >= LOG_PAUSE_S:
+                self._warned_s = received_s
+                log.warning(
+                    "%s: message dropped: %s (others within %g s are not logged)",
+                    self.site,
+                    error,
+                    LOG_PAUSE_S,
+                )
 
     def _take(self, message: wire.Message, received_s: float, bytes_in: int) -> None:
         if isinstance(message, wire.Hello):
@@ -297,6 +318,7 @@ class CloudRunner:
             if pending.doubtful and message.status in ("ok", "failed"):
                 self._uploads.found(pending.task.kind.name, new=False)
             execution = pending.answered(message, received_s, bytes_in)
+            self._pauses.note(pending.task.kind.name, execution.failure, received_s)
             del self._pending[message.id]
             pending.future.set_result(execution)
 

@@ -1,10 +1,15 @@
 """The ZMQ socket of a remote site: its options, its encryption, and the events of its connection.
 
+A host name may have an IPv4 address, an IPv6 address, or both, and libzmq looks for one kind only. After an
+attempt that failed, the socket looks for the other kind.
+
 What is sent on it, and when, is decided in `cloud`.
 """
 
 import contextlib
 import logging
+import math
+import time
 from collections.abc import Iterator, Sequence
 from enum import Enum, auto
 from functools import lru_cache
@@ -16,12 +21,15 @@ import zmq.utils.monitor
 from offboard.common.errors import ConfigError
 from offboard.common.security.exposure import on_loopback
 from offboard.common.security.keys import RobotKeys
-from offboard.common.wire.channel import Channel, readable
+from offboard.common.wire.channel import Channel, make_context, readable
 from offboard.robot_client.sites.connection import NO_HANDSHAKE, UNKNOWN_ROBOT, HandshakeFailure
 
 MESSAGE_BYTES_MAX = 256 * 1024 * 1024
 SEND_QUEUE_MAX = 1000  # messages
 RECONNECT_MS, RECONNECT_MAX_MS = 100, 1000
+# The kernel asks again after 1, 3, 7, 15 and 31 s. Each attempt is short, so that the next one begins soon.
+CONNECT_MS = 2000
+OTHER_FAMILY_S = 1.0  # at least, for which one kind of address is tried
 # TCP alone may take a quarter of an hour to notice that the server vanished without a word. The heartbeats
 # of ZMQ would wait behind a large argument, and break a slow link that works.
 UNACKNOWLEDGED_MS = 15_000
@@ -33,29 +41,35 @@ log = logging.getLogger(__name__)
 class CloudSocket(Channel):
     """A DEALER that connects to `endpoint` by itself. With `keys`, only to the server of that key.
 
-    ConfigError if libzmq does not take the endpoint.
+    ConfigError if libzmq does not take the endpoint, OffloadError if the process lacks files or threads.
     """
 
     def __init__(self, site: str, endpoint: str, keys: RobotKeys | None) -> None:
         self._endpoint = endpoint
-        self._context = zmq.Context()
+        named = "[" not in endpoint and any(map(str.isalpha, endpoint.removeprefix("tcp://")))
+        self._other_family_s = -math.inf if named else math.inf  # when the other kind of address may be tried
+        self._context = make_context(f"{site}: endpoint {endpoint!r}")
         try:
             self._dealer = _dealer(self._context, endpoint, keys)
-            self._monitor = self._dealer.get_monitor_socket(sum(_EVENTS))
+            self._monitor = self._dealer.get_monitor_socket(sum(_EVENTS) | zmq.EVENT_CONNECT_RETRIED)
             self._dealer.connect(endpoint)
-        except zmq.ZMQError as error:
+            super().__init__(self._dealer, self._monitor.FD)
+        except (zmq.ZMQError, OSError) as error:
             self._context.destroy(linger=0)
             raise ConfigError(f"{site}: endpoint {endpoint!r}: {error}") from error
-        super().__init__(self._dealer, self._monitor.FD)
         if keys is None:
             _warn_of_plain_text(site, endpoint)
 
     def events(self) -> "Iterator[SocketEvent | HandshakeFailure]":
         """What happened to the connection since the last call."""
+        last = 0
         while readable(self._monitor):
-            event = _EVENTS.get(zmq.utils.monitor.recv_monitor_message(self._monitor)["event"])
-            if event is not None:
-                yield event
+            last = int(zmq.utils.monitor.recv_monitor_message(self._monitor)["event"])
+            if last in _EVENTS:
+                self._stay()
+                yield _EVENTS[last]
+        if last == zmq.EVENT_CONNECT_RETRIED:
+            self._try_other_family()
 
     def connect_again(self) -> None:
         with contextlib.suppress(zmq.ZMQError):  # there may be no connection to end
@@ -74,6 +88,16 @@ class CloudSocket(Channel):
         self._dealer.disable_monitor()
         self._context.destroy(linger=0)
         super().close()
+
+    def _try_other_family(self) -> None:
+        if time.monotonic() >= self._other_family_s:
+            self._stay()
+            self._dealer.ipv6 = not self._dealer.ipv6
+            self.connect_again()
+
+    def _stay(self) -> None:
+        """Keep the kind of address for a while."""
+        self._other_family_s = max(self._other_family_s, time.monotonic() + OTHER_FAMILY_S)
 
 
 class SocketEvent(Enum):
@@ -97,6 +121,7 @@ def _dealer(context: "zmq.Context[Any]", endpoint: str, keys: RobotKeys | None) 
     dealer.immediate = True  # a request never waits for a connection: it would arrive with its budget gone
     dealer.sndhwm = dealer.rcvhwm = SEND_QUEUE_MAX
     dealer.reconnect_ivl, dealer.reconnect_ivl_max = RECONNECT_MS, RECONNECT_MAX_MS
+    dealer.setsockopt(zmq.CONNECT_TIMEOUT, CONNECT_MS)
     dealer.setsockopt(zmq.TCP_MAXRT, UNACKNOWLEDGED_MS)
     dealer.setsockopt(zmq.TCP_KEEPALIVE, 1)
     dealer.setsockopt(zmq.TCP_KEEPALIVE_IDLE, KEEPALIVE_IDLE_S)

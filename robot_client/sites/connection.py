@@ -8,6 +8,8 @@ import math
 from dataclasses import dataclass
 from enum import Enum, auto
 
+from offboard.robot_client.sites.runner import Lasting
+
 HELLO_EVERY_S = 1.0  # until it is answered
 CONNECT_EVERY_S = 1.0  # once libzmq has stopped trying
 
@@ -74,6 +76,7 @@ class Connection:
         self._site = site
         self._endpoint = endpoint
         self.state = State.CONNECTING
+        self.why_absent: str | None = None
         self._move(State.CONNECTING)
 
     def handshake_succeeded(self, now_s: float) -> None:
@@ -113,6 +116,7 @@ class Connection:
             return
         log.warning("%s: %s: tasks stay onboard", self._site, why)
         self._move(State.INCOMPATIBLE, why)
+        self.why_absent = Lasting(why)
 
     def close(self) -> None:
         self._move(State.CLOSED)

@@ -8,6 +8,7 @@ from collections import deque
 from random import Random
 from typing import NamedTuple
 
+from offboard.robot_client.sites.background import Background
 from offboard.robot_client.sites.runner import Condition
 
 EVERY_S = 0.5  # between two heartbeats: an outage is noticed at most this much later
@@ -33,10 +34,12 @@ class Heartbeat:
     """Times the heartbeats of one connection, and measures it.
 
     every_s: usual pause; 0: no heartbeat is sent, and nothing is measured.
+    background: makes pauses longer on a loaded robot, and knows when the robot hears late.
     """
 
-    def __init__(self, every_s: float, seed: int = 0) -> None:
+    def __init__(self, every_s: float, seed: int = 0, background: Background | None = None) -> None:
         self._every_s = every_s
+        self._background = background or Background()
         self._random = Random(seed)
         self._next_id = 0
         self._round_trip_s: float | None = None
@@ -76,7 +79,7 @@ class Heartbeat:
         self._next_id += 1
         self._sent[self._next_id] = now_s
         self._oldest_s = min(self._oldest_s, now_s)
-        pause_s = self._every_s * (1 + JITTER * self._random.uniform(-1, 1))
+        pause_s = self._background.pause_s(self._every_s) * (1 + JITTER * self._random.uniform(-1, 1))
         if len(self._sent) > UNANSWERED_MAX:
             del self._sent[next(iter(self._sent))]
         self.due_s = now_s + pause_s
@@ -95,11 +98,18 @@ class Heartbeat:
         if sent_s < self._back_s:
             self.hurry(now_s)  # the silence delayed this answer, so it does not measure the link as it is now
         else:
-            self._vary(now_s - sent_s)
-            self._recent.append(now_s - sent_s)
-            self._round_trip_s = min(self._recent)
-            self._measured = True
+            self._measure(now_s - sent_s, at_most=self._background.computed_since(sent_s))
         self.hear(now_s, report)
+
+    def _measure(self, round_trip_s: float, *, at_most: bool) -> None:
+        """With `at_most`, the robot computed at that time and may have read the answer late."""
+        self._vary(round_trip_s)
+        self._measured = True
+        if at_most and self._round_trip_s is not None:
+            self._round_trip_s = min(round_trip_s, self._round_trip_s)
+        else:
+            self._recent.append(round_trip_s)
+            self._round_trip_s = min(self._recent)
 
     def hear(self, now_s: float, report: ServerReport) -> None:
         """Any message from the server shows that it is there."""

@@ -6,9 +6,9 @@ What a runner does is in the other files of this folder.
 from collections.abc import Mapping
 from pathlib import Path
 
-from offboard.common.errors import ConfigError
 from offboard.common.security.keys import robot_keys
 from offboard.common.task_states import TaskStates
+from offboard.robot_client.sites.background import Background
 from offboard.robot_client.sites.cloud import CloudRunner
 from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import Runner
@@ -29,12 +29,16 @@ def make_runners(
     `states`: those of the onboard worker (None: states of its own).
     """
     runners: list[Runner] = []
+    background = Background()
     try:
         for site, endpoint in servers.items():
             own = None if keys is None else robot_keys(Path(keys), site)
-            runners.append(CloudRunner(endpoint, site=site, heartbeat_s=heartbeat_s, seed=seed, keys=own))
-        runners.append(OnboardRunner(states=states))
-    except ConfigError:
+            server = CloudRunner(
+                endpoint, site=site, heartbeat_s=heartbeat_s, seed=seed, keys=own, background=background
+            )
+            runners.append(server)
+        runners.append(OnboardRunner(states=states, background=background))
+    except BaseException:
         for runner in runners:
             runner.close()
         raise

@@ -5,23 +5,33 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import partial
 from queue import SimpleQueue
 from typing import Any
 
-from offboard.common.errors import OffloadError, Overtaken, TaskFailed, Unwanted, describe
+from offboard.common.errors import (
+    OffloadError,
+    Overtaken,
+    TaskFailed,
+    Unwanted,
+    describe,
+    is_interrupt,
+    of_task,
+)
 from offboard.common.host import cpu_time
 from offboard.common.host.cgroup import SELF
-from offboard.common.host.load import Load
+from offboard.common.host.load import LOADED, Load
 from offboard.common.host.load_watch import LoadWatch
 from offboard.common.task_states import TaskStates
 from offboard.common.tasks import Kind, Task
 from offboard.common.threads import join_all
 from offboard.common.tracebacks import traceback_of
 from offboard.common.wanted import call_while
+from offboard.robot_client.sites.background import Background
 from offboard.robot_client.sites.runner import ONBOARD, Condition, Execution
 
 ABANDONED_MAX = 4  # cancelled runs that go on at the same time
@@ -31,6 +41,22 @@ ABANDONED_NICE = 10  # their niceness: a tenth of the CPU time of a task with ni
 CLOSE_WAIT_S = 5.0
 
 log = logging.getLogger(__name__)
+
+_inside: ContextVar[bool] = ContextVar("inside", default=False)
+
+
+def inside_a_task() -> bool:
+    """Whether the caller is the code of a task that runs onboard."""
+    return _inside.get()
+
+
+@contextlib.contextmanager
+def _as_a_task() -> Iterator[None]:
+    token = _inside.set(True)
+    try:
+        yield
+    finally:
+        _inside.reset(token)
 
 
 @dataclass(eq=False, slots=True)
@@ -65,6 +91,9 @@ class OnboardAnswer(Future[Execution]):
 class OnboardRunner:
     """Runs at most `workers` tasks at a time. The seconds of a task include its wait in the queue.
 
+    A task that is submitted by the code of a task runs in the thread of its caller: the queue might wait for
+    that caller. The same holds if the system has no thread for the first worker.
+
     Python cannot stop a thread. So a run that is cancelled is abandoned: it goes on at a low priority until
     it ends or calls `check_wanted`, and a new thread takes its place. But a kind with a setup has one state
     per worker, so its run keeps state and place, and the next task waits until it ends.
@@ -75,7 +104,9 @@ class OnboardRunner:
 
     site = ONBOARD
 
-    def __init__(self, workers: int = 1, *, states: TaskStates | None = None) -> None:
+    def __init__(
+        self, workers: int = 1, *, states: TaskStates | None = None, background: Background | None = None
+    ) -> None:
         self._workers = workers
         self._queue: SimpleQueue[_Run | None] = SimpleQueue()
         self._runs: dict[int, _Run] = {}  # those that have not ended, by task id
@@ -86,7 +117,8 @@ class OnboardRunner:
         self._preparing: dict[str, Future[None]] = {}  # by kind
         self._closed = False
         self._lock = threading.Lock()
-        self._load = LoadWatch(Load(SELF))
+        self._background = background or Background()
+        self._load = LoadWatch(Load(SELF), pause_s=self._background.pause_s)
         self._condition = Condition()
 
     def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - onboard always exists
@@ -98,17 +130,22 @@ class OnboardRunner:
         with self._lock:
             if self._closed:
                 raise OffloadError("the onboard runner is closed")
-            self._runs[task.id] = run
-            if self._threads < min(self._workers, len(self._runs) - self._abandoned):
-                self._start_thread()
-            self._queue.put(run)
+            queued = not inside_a_task() and self._has_worker()
+            if queued:
+                self._runs[task.id] = run
+                self._queue.put(run)
+        if not queued:
+            self._run_here(run)
         return run.future
 
     def bytes_to_send(self, task: Task) -> int:  # noqa: ARG002 - nothing is sent
         return 0
 
     def cancel(self, task: Task) -> None:
-        """Remove the task from the queue, or let its run stop early; past ABANDONED_MAX it is left alone."""
+        """Remove the task from the queue, or let its run stop early.
+
+        Its run is left alone past ABANDONED_MAX, and if no thread can be started.
+        """
         with self._lock:
             run = self._runs.get(task.id)
             if run is None or not run.wanted:
@@ -118,7 +155,7 @@ class OnboardRunner:
             elif task.kind.setup is not None:
                 run.wanted = False
                 return
-            elif self._abandoned == ABANDONED_MAX:
+            elif self._abandoned == ABANDONED_MAX or not self._start(self._work):
                 return
             else:
                 self._abandon(run, run.thread)
@@ -133,8 +170,11 @@ class OnboardRunner:
             prepared = self._preparing[kind.name] = Future[None]()
             if self._closed or self._states.ready(kind):
                 prepared.set_result(None)
-            else:
-                self._start(partial(self._prepare, kind, prepared))
+                return prepared
+            prepare = partial(self._prepare, kind, prepared)
+            started = self._start(prepare)
+        if not started:
+            prepare()
         return prepared
 
     def hurry(self) -> None:
@@ -142,6 +182,7 @@ class OnboardRunner:
 
     def condition(self) -> Condition:
         found, (load, capacity) = self._condition, self._load.latest()
+        self._background.loaded = load > LOADED
         if found.load != load or found.capacity != capacity:
             found = self._condition = Condition(load=load, capacity=capacity)
         return found
@@ -169,26 +210,33 @@ class OnboardRunner:
                 CLOSE_WAIT_S,
             )
 
-    def _start_thread(self) -> None:
-        self._threads += 1
-        self._start(self._work)
+    def _has_worker(self) -> bool:
+        """Whether a worker will take the next task. Starts one if all others have a task already."""
+        waiting = len(self._runs) - self._abandoned
+        if self._threads < min(self._workers, waiting + 1) and self._start(self._work):
+            self._threads += 1
+        return self._threads > 0
 
-    def _start(self, target: Callable[[], None]) -> None:
+    def _start(self, target: Callable[[], None]) -> bool:
+        """Start a thread. False if the system has none left at this moment."""
         thread = threading.Thread(target=target, name=ONBOARD, daemon=True)
-        thread.start()
+        try:
+            thread.start()
+        except RuntimeError:
+            return False
         self._started = [*(other for other in self._started if other.is_alive()), thread]
+        return True
 
     def _abandon(self, run: _Run, thread: int) -> None:
         run.wanted, run.abandoned = False, True
         self._abandoned += 1
         with contextlib.suppress(OSError, AttributeError):  # on systems without priorities for threads
             os.setpriority(os.PRIO_PROCESS, thread, ABANDONED_NICE)
-        self._threads -= 1
-        self._start_thread()
 
     def _prepare(self, kind: Kind, prepared: "Future[None]") -> None:
         try:
-            self._states.prepare(kind)
+            with _as_a_task():  # its setup may call a task
+                self._states.prepare(kind)
         except TaskFailed as failure:
             prepared.set_exception(failure)
         else:
@@ -196,18 +244,31 @@ class OnboardRunner:
 
     def _work(self) -> None:
         """Run tasks until a run is abandoned or the runner is closed. Each thread does this."""
-        while (run := self._queue.get()) is not None:
-            with self._lock:
-                if self._runs.get(run.task.id) is not run:  # cancelled, or closed
-                    continue
-                run.thread = threading.get_native_id()
-            execution = _run(run, self._states)
-            with self._lock:
-                del self._runs[run.task.id]
-                if run.abandoned:
-                    self._abandoned -= 1
-                    return
-            run.future.set_result(execution)
+        _inside.set(True)
+        while (run := self._queue.get()) is not None and self._work_on(run):
+            del run  # an idle thread must not keep arguments, result and offloader alive
+
+    def _work_on(self, run: _Run) -> bool:
+        """Run a task. False if its run was abandoned, so that another thread has the place of this one."""
+        with self._lock:
+            if self._runs.get(run.task.id) is not run:  # cancelled, or closed
+                return True
+            run.thread = threading.get_native_id()
+            self._background.begin()
+        execution = _run(run, self._states)
+        with self._lock:
+            self._background.end()
+            del self._runs[run.task.id]
+            if run.abandoned:
+                self._abandoned -= 1
+                return False
+        run.future.set_result(execution)
+        return True
+
+    def _run_here(self, run: _Run) -> None:
+        """Run a task in the thread of its caller."""
+        with _as_a_task():
+            run.future.set_result(_run(run, self._states))
 
 
 def _run(run: _Run, states: TaskStates) -> Execution:
@@ -226,8 +287,10 @@ def _call(run: _Run, state: tuple[Any, ...], states: TaskStates) -> Execution:
     value, failure = None, None
     try:
         value = call_while(lambda: run.wanted, run.task.kind.function, (*state, *run.task.args))
-    except BaseException as error:  # noqa: BLE001 - anything that the function raises is the task's failure
-        failure = TaskFailed(describe(error), traceback_of(error))
+    except BaseException as error:  # anything else that the function raises is the task's failure
+        if is_interrupt(error):
+            raise
+        failure = TaskFailed(of_task(run.task.kind.name, describe(error)), traceback_of(error))
         failure.__cause__ = error
         if isinstance(error, Unwanted) and not run.wanted:
             return _overtaken(run, started=True)

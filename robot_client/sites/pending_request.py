@@ -8,12 +8,14 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 
 from offboard.common.errors import (
+    CannotCross,
     CloudBroken,
     CloudBusy,
     CloudError,
     OffloadError,
     ProtocolError,
     TaskFailed,
+    of_task,
 )
 from offboard.common.tasks import Task
 from offboard.common.wire import messages as wire
@@ -53,12 +55,12 @@ class PendingRequest:
         )
 
     def answered(self, reply: wire.Reply, received_s: float, bytes_in: int) -> Execution:
-        value, failure = None, _failure(reply)
+        value, failure = None, _failure(self.task.kind.name, reply)
         if failure is None:
             try:
                 value = wire.decode(reply.body, self.task.kind.types, {})
             except ProtocolError as error:
-                failure = CloudBroken(f"the answer cannot be read: {error}")
+                failure = CannotCross(f"result: {error}")
         seconds = received_s - self.published_s
         return Execution(
             self.site,
@@ -94,10 +96,13 @@ _FAILURES: dict[str, Callable[[str], OffloadError]] = {
 }
 
 
-def _failure(reply: wire.Reply) -> OffloadError | None:
+def _failure(kind: str, reply: wire.Reply) -> OffloadError | None:
     if reply.status == "ok":
         return None
     text = reply.error or reply.status
     if reply.status == "failed" and not reply.server_fault:
-        return TaskFailed(text, reply.traceback)
-    return (CloudBroken if reply.server_fault else _FAILURES[reply.status])(text)
+        return TaskFailed(of_task(kind, text), reply.traceback)
+    if reply.server_fault:
+        of_value = text.startswith(("BadValue: ", "ProtocolError: "))
+        return (CannotCross if of_value else CloudBroken)(text.removeprefix("BadValue: "))
+    return _FAILURES[reply.status](text)

@@ -87,6 +87,10 @@ class Condition(NamedTuple):
 UNMEASURED = Condition()
 
 
+class Lasting(str):
+    """Why a site cannot take a task until somebody changes the robot or the server."""
+
+
 class Runner(Protocol):
     """Runs tasks on one site. Any thread may call any method."""
 
@@ -94,7 +98,10 @@ class Runner(Protocol):
     def site(self) -> str: ...
 
     def unavailable(self, kind: "Kind") -> str | None:
-        """Why a task of this kind cannot be sent now; None if it can. Must not block."""
+        """Why a task of this kind cannot be sent now; None if it can. Must not block.
+
+        The reason is a `Lasting` one if it cannot go away by waiting.
+        """
 
     def submit(self, task: "Task", budget_s: float) -> "Future[Execution]":
         """Start the task. The future always gets an Execution, never an exception.
@@ -120,8 +127,12 @@ class Runner(Protocol):
 
 def checked_timeout(timeout_s: float) -> float:
     """The same number; ConfigError unless it is a time that a task may have, in seconds."""
-    if not 0 < timeout_s <= TIMEOUT_MAX_S:
-        raise ConfigError(f"timeout_s {timeout_s}: must be above 0 and at most {TIMEOUT_MAX_S:g}")
+    try:
+        allowed = 0 < timeout_s <= TIMEOUT_MAX_S
+    except TypeError:  # it is no number
+        allowed = False
+    if not allowed:
+        raise ConfigError(f"timeout_s {timeout_s!r}: must be above 0 and at most {TIMEOUT_MAX_S:g}")
     return timeout_s
 
 

@@ -24,6 +24,7 @@ class SharedReader:
     unanswered: returns how many answers callers wait for.
     expects_message: returns whether any message is expected.
     wake: makes a `read` that is under way return.
+    pause_s: turns a usual pause into the pause of a robot that is busy.
     """
 
     def __init__(
@@ -34,12 +35,14 @@ class SharedReader:
         unanswered: Callable[[], int],
         expects_message: Callable[[], bool],
         wake: Callable[[], None],
+        pause_s: Callable[[float], float] = float,
     ) -> None:
         self._tend = tend
         self._read = read
         self._unanswered = unanswered
         self._expects_message = expects_message
         self._wake = wake
+        self._pause_s = pause_s
         self.turn = threading.Lock()  # held by the thread that has the turn
         self._called = threading.Event()
         self._thread_rests = False
@@ -93,10 +96,10 @@ class SharedReader:
     def _left_to_callers(self) -> bool:
         """Whether callers read for now; if so, the thread rests until it is called, or for a while."""
         self._thread_rests = True  # set before looking: a caller that expects a message from now on calls
-        idle_s = time.perf_counter() - self._caller_read_s
-        rests = self.turn.locked() or (idle_s < LINGER_S and not self._expects_message())
+        idle_s, linger_s = time.perf_counter() - self._caller_read_s, self._pause_s(LINGER_S)
+        rests = self.turn.locked() or (idle_s < linger_s and not self._expects_message())
         if rests and not self._called.is_set():
-            self._called.wait(LINGER_S)
+            self._called.wait(linger_s)
             return True
         self._thread_rests = False
         self._called.clear()

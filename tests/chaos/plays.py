@@ -5,9 +5,9 @@ import os
 import pytest
 
 from offboard.common.errors import ConfigError
+from offboard.loadgen.robot.work import make_work
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario, shipped
-from offboard.robot_client.simulated.work import make_work
 
 ALL = os.environ.get("CHAOS") == "1"
 SCENARIOS = [name for name in shipped() if read_scenario(find_scenario(name)).checks]

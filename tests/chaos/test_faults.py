@@ -16,10 +16,10 @@ from offboard.common.errors import OffloadError
 from offboard.loadgen.play import play_scenario
 from offboard.loadgen.play.play_scenario import Played, play
 from offboard.loadgen.play.run_files import EVENTS, TRACE
+from offboard.loadgen.robot_files import read_trace
 from offboard.loadgen.scenario.event_timeline import Event
 from offboard.loadgen.scenario.scenario import CloudPart, RobotPart, Scenario, Workload
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, Setup, Testbed
-from offboard.robot_client.records import trace
 from tests.chaos.plays import ALL, FAULT_TIMES, FEW_FAULTS
 from tests.compose.conftest import made_by_docker
 
@@ -139,7 +139,7 @@ def test_a_fault_costs_no_task(testbed: str, name: str, tmp_path: Path) -> None:
     assert played.exit_codes[ROBOT] == 0
     happened = [json.loads(line) for line in (tmp_path / EVENTS).read_text().splitlines()]
     assert all(one["happened_s"] is not None and "skipped" not in one for one in happened), happened
-    records = list(trace.read(tmp_path / TRACE))
+    records = list(read_trace(tmp_path / TRACE))
     ids = {record["id"] for record in records}
     assert len(ids) == len(records)
     relays = 1 + (times if name == "relay killed" else 0)

@@ -10,10 +10,10 @@ import pytest
 from offboard.loadgen.play import play_scenario
 from offboard.loadgen.play.play_scenario import play
 from offboard.loadgen.play.run_files import EVENTS, TRACE
+from offboard.loadgen.robot_files import read_trace
 from offboard.loadgen.scenario.event_timeline import Event
 from offboard.loadgen.scenario.outcome_files import read_lines
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
-from offboard.robot_client.records import trace
 from tests.chaos.plays import IN_CONTAINERS, ON_LOOPBACK, SOAK_TASKS, skip_if_unplayable
 
 pytestmark = pytest.mark.timeout(600)
@@ -56,7 +56,7 @@ def test_the_same_seed_gives_the_same_run(tmp_path: Path) -> None:
     for name in ("a", "b"):
         out = tmp_path / name
         play(scenario, out, quiet=True).check_robots()
-        records = list(trace.read(out / TRACE))
+        records = list(read_trace(out / TRACE))
         sizes = [record["size"] for record in records]
         answers = [{key: line[key] for key in ("i", "answer")} for line in read_lines(out / "answers.jsonl")]
         events = [{**event, "happened_s": 0, "took_s": 0} for event in read_lines(out / EVENTS)]

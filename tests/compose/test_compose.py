@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from offboard.robot_client.records.trace import read
+from offboard.loadgen.robot_files import read_trace
 from tests.compose.conftest import Compose, docker
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
@@ -41,7 +41,7 @@ def test_the_robot_finishes_and_the_table_is_printed(up: Compose, tmp_path: Path
     assert "80 tasks answered" in up("logs", "robot")
     assert "feedback chosen" in up("logs", "table")
     docker("cp", f"{up('ps', '-aq', 'robot').strip()}:/out/trace.jsonl", str(tmp_path))
-    records = list(read(tmp_path / "trace.jsonl"))
+    records = list(read_trace(tmp_path / "trace.jsonl"))
     assert len(records) == 80
     assert all(record["used"] for record in records)
     assert sum(record["decision"]["both"] for record in records) == 60

@@ -12,10 +12,10 @@ import pytest
 
 from offboard.loadgen.play.play_scenario import figures, play
 from offboard.loadgen.play.run_files import TRACE
+from offboard.loadgen.robot_files import read_trace
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.table.measured_rows import read
 from offboard.loadgen.testbed.docker_engine import PREFIX
-from offboard.robot_client.records import trace
 from tests.chaos.plays import skip_if_unplayable
 from tests.compose.conftest import ROOT, docker, made_by_docker
 
@@ -65,7 +65,7 @@ def test_an_application_is_played_in_containers(tmp_path: Path, monkeypatch: pyt
     found = figures(played.outcome, scenario)
     assert [found[name] for name in ("lost", "wrong", "unverified")] == [0, 0, 0]
     both = {
-        one["site"] for record in trace.read(tmp_path / TRACE) for one in record["executions"] if one["ok"]
+        one["site"] for record in read_trace(tmp_path / TRACE) for one in record["executions"] if one["ok"]
     }
     assert both == {"onboard", "cloud"}
 

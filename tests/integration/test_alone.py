@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from offboard.loadgen.robot_files import read_trace
 from offboard.loadgen.table.site_disturbance import measure
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import PINNED
-from offboard.robot_client.records.trace import read
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.probes import burn, nap
 
@@ -89,7 +89,7 @@ def test_a_scenario_measures_plans_alone(tmp_path: Path) -> None:
     assert "18/18 size" in done.stdout
     assert "run on each site alone and on both at once: 6 of 6 plans\n" in done.stdout
     assert f"written: {out / 'trace.alone.jsonl'}\n" in done.stdout
-    run, alone = list(read(out / "trace.jsonl")), list(read(out / "trace.alone.jsonl"))
+    run, alone = list(read_trace(out / "trace.jsonl")), list(read_trace(out / "trace.alone.jsonl"))
     assert [record["i"] for record in run] == list(range(6))
     assert PINNED not in [record["decision"]["policy"] for record in run]
     assert [record["i"] for record in alone] == list(range(18))
@@ -110,7 +110,7 @@ def test_an_absent_cloud_is_a_warning(tmp_path: Path) -> None:
     flags += ["--cloud", nowhere, "--connect", "0.1", "--trace", trace]
     for runs in (1, 2):
         done = subprocess.run(
-            [sys.executable, "-m", "offboard.robot_client", *map(str, flags)],
+            [sys.executable, "-m", "offboard.loadgen", *map(str, flags)],
             capture_output=True,
             text=True,
             timeout=50,
@@ -120,6 +120,6 @@ def test_an_absent_cloud_is_a_warning(tmp_path: Path) -> None:
         missing = "; the cloud did not answer for the others"
         assert done.stdout.endswith(f"run on each site alone and on both at once: 0 of 2 plans{missing}\n")
         assert f"measuring without cloud: no answer from {nowhere} yet; tasks run onboard" in done.stderr
-        assert len(list(read(trace))) == 2 * runs
-        assert len(list(read(tmp_path / "t.alone.jsonl"))) == 6 * runs
+        assert len(list(read_trace(trace))) == 2 * runs
+        assert len(list(read_trace(tmp_path / "t.alone.jsonl"))) == 6 * runs
     assert measure(tmp_path / "t.alone.jsonl") is None

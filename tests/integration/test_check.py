@@ -28,12 +28,22 @@ STEPS = (
     "round trip",
     "empty task",
 )
-TASK = """from offboard.common.tasks import task
+TASK = """from dataclasses import dataclass
+from offboard.common.tasks import task
 
 
-@task("twice", size=float)
-def twice(number: int) -> int:
-    return {expression}
+@dataclass
+class Pose:
+    x: float = 0.0
+
+
+def load() -> int:
+    return 2
+
+
+@task("twice", size=float, setup=load, types=(Pose,))
+def twice(factor: int, number: int) -> int:
+    return factor * number
 """
 
 Serve = Callable[..., Served]
@@ -187,11 +197,18 @@ def test_without_tasks_the_planner_is_compared(serve: Serve) -> None:
     assert "--tasks" in lines[STEPS.index("tasks")]
 
 
-def test_another_source_fails(serve: Serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("here", "there"),
+    [("factor * number", "number * factor"), ("return 2", "return 3"), ("x: float", "y: float")],
+    ids=["function", "setup", "dataclass"],
+)
+def test_another_source_fails(
+    serve: Serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, here: str, there: str
+) -> None:
     """The line has the source hashes of both sides; the remedy is the same version on both sides."""
-    for side, expression in (("here", "2 * number"), ("there", "number + number")):
+    for side, text in (("here", TASK), ("there", TASK.replace(here, there))):
         (tmp_path / side).mkdir()
-        (tmp_path / side / "mytask.py").write_text(TASK.format(expression=expression))
+        (tmp_path / side / "mytask.py").write_text(text)
     with monkeypatch.context() as patch:
         patch.setenv("PYTHONPATH", str(tmp_path / "there"))
         served = serve("--tasks", "mytask")

@@ -135,7 +135,7 @@ def test_too_much_memory_is_an_ordinary_failure(make: Callable[..., WorkerPool])
     assert value(run(executor, "grab", 200 * MIB)) == 200 * MIB
     assert value(run(executor, "process_id")) == pid
     outcome = run(executor, "large", int(0.6 * GIB))
-    assert (outcome.status, outcome.crashed, outcome.server_fault) == ("failed", False, False)
+    assert (outcome.status, outcome.crashed, outcome.server_fault) == ("failed", False, True)
     assert outcome.error == "MemoryError: too little memory is left for an answer"
     until(lambda: executor.up == 1, "another worker")
     assert value(run(executor, "large", 200 * MIB)).nbytes == 200 * MIB

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from offboard.robot_client.records.trace import read
+from offboard.loadgen.robot_files import read_trace
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
 
@@ -76,7 +76,7 @@ def test_a_scenario_can_be_played_to_its_end(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
     assert "quota: 0.2 CPU over " in done.stdout
     assert "24 tasks answered" in done.stdout
-    records = list(read(tmp_path / "trace.jsonl"))
+    records = list(read_trace(tmp_path / "trace.jsonl"))
     assert [record["i"] for record in records] == list(range(24))
     assert all(record["decision"]["both"] for record in records)
     assert all(one["ok"] for record in records for one in record["executions"])
@@ -91,7 +91,7 @@ def test_the_same_seed_gives_the_same_tasks(tmp_path: Path) -> None:
         command = loadgen("run", "demo", "--tasks", "6", "--seed", "7", "--out", out)
         done = subprocess.run(command, capture_output=True, text=True, timeout=150, cwd=ROOT)
         assert done.returncode == 0, done.stdout + done.stderr
-        sizes.append([record["size"] for record in read(out / "trace.jsonl")])
+        sizes.append([record["size"] for record in read_trace(out / "trace.jsonl")])
     assert sizes[0] == sizes[1]
     assert len(set(sizes[0])) > 1
 
@@ -103,13 +103,13 @@ def test_an_interrupted_run_leaves_nothing_behind(tmp_path: Path, number: signal
         host.send_signal(number)
         assert host.wait(30) == 128 + number
     assert marked_processes() == {}
-    assert len(list(read(tmp_path / "trace.jsonl"))) >= 5
+    assert len(list(read_trace(tmp_path / "trace.jsonl"))) >= 5
 
 
 def test_a_killed_robot_fails_the_run(tmp_path: Path) -> None:
     """After kill -9 of the robot: exit code 1, one line that says why, and no process is left."""
     with running_demo(tmp_path) as host:
-        (robot,) = (pid for pid, command in marked_processes().items() if "robot_client" in command)
+        (robot,) = (pid for pid, command in marked_processes().items() if " drive " in command)
         os.kill(robot, signal.SIGKILL)
         assert host.wait(30) == 1
         assert host.stderr.read() == "loadgen run: robot was ended by signal 9\n"

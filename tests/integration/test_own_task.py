@@ -106,7 +106,7 @@ def test_a_model_is_loaded_once_in_each_process(tmp_path: Path) -> None:
     (tmp_path / "engine.py").write_text(ENGINE)
     flags = "call --task engine:scaled --sizes uniform:1:9 --tasks 6 --reference 2 --alone 2 --trace t.jsonl"
     with server(tmp_path, "engine") as (endpoint, cloud):
-        command = [Path(sys.executable).with_name("robot-client"), *flags.split(), "--cloud", endpoint]
+        command = [Path(sys.executable).with_name("loadgen"), *flags.split(), "--cloud", endpoint]
         with subprocess.Popen(
             command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         ) as robot:

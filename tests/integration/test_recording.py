@@ -10,7 +10,7 @@ from urllib.error import URLError
 import pytest
 
 from offboard import ConfigError, Offloader
-from offboard.robot_client.records import trace
+from offboard.loadgen.robot_files import read_trace
 from tests.probes import echo
 
 pytestmark = pytest.mark.integration
@@ -29,12 +29,12 @@ def test_an_offloader_serves_metrics_and_writes_a_trace_until_it_is_closed(
         text = urllib.request.urlopen(found[1], timeout=5).read().decode()
         assert 'robot_tasks_total{kind="echo",site="onboard"} 3.0' in text
     offload.close()
-    assert [record["i"] for record in trace.read(path)] == [0, 1, 2]
+    assert [record["i"] for record in read_trace(path)] == [0, 1, 2]
     with pytest.raises(URLError):
         urllib.request.urlopen(found[1], timeout=5)
     with Offloader.connect(metrics=f"127.0.0.1:{found[2]}", trace=path) as again:
         again(echo)
-    assert len(list(trace.read(path))) == 4
+    assert len(list(read_trace(path))) == 4
     names = {thread.name for thread in threading.enumerate()} - {"load"}
     assert threading.active_count() <= before + 1, names
 

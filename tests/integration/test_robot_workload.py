@@ -1,4 +1,4 @@
-"""`robot-client drive` and `call` against a real server: answers, references and open arrivals."""
+"""`loadgen drive` and `call` against a real server: answers, references and open arrivals."""
 
 import signal
 import subprocess
@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
+from offboard.loadgen.robot import answers, references
+from offboard.loadgen.robot_files import read_trace, reference_path
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.robot_client.policies import PINNED
-from offboard.robot_client.records import trace
-from offboard.robot_client.simulated import answers, references
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
@@ -26,7 +26,7 @@ WAIT_S = 60.0
 
 
 def command(*flags: object) -> list[str]:
-    return [sys.executable, "-m", "offboard.robot_client", *map(str, flags)]
+    return [sys.executable, "-m", "offboard.loadgen", *map(str, flags)]
 
 
 def robot(*flags: object, code: int = 0) -> str:
@@ -68,11 +68,11 @@ def test_a_killed_run_continues_after_its_answers(
         file.write(b'{"v":1,"i":')  # a torn line, as a crash of the computer may leave it
     before = {line["i"] for line in answers.read(path)}
     assert KILL_AFTER <= len(before) < 150
-    ran_before = len(list(trace.read(kept)))
+    ran_before = len(list(read_trace(kept)))
     said = robot(*flags, "--answers", path, "--trace", kept)
     assert f"{len(before)} of 150 tasks had their answer before" in said
     assert f"{150 - len(before)} tasks answered" in said
-    assert len(list(trace.read(kept))) == ran_before + 150 - len(before)
+    assert len(list(read_trace(kept))) == ran_before + 150 - len(before)
     assert by_number(path) == by_number(tmp_path / "whole.jsonl")
     assert by_number(path).keys() == set(range(150))
     lines = list(answers.read(path))[len(before) :]
@@ -111,9 +111,9 @@ def test_an_interrupted_run_keeps_its_answers(testbed: Callable[..., LocalTestbe
         assert time.monotonic() < until
         time.sleep(0.005)
     run.send_signal(signal.SIGINT)
-    assert run.communicate(timeout=WAIT_S)[1] == "robot-client call: interrupted\n"
+    assert run.communicate(timeout=WAIT_S)[1] == "loadgen call: interrupted\n"
     assert run.returncode == 130
-    lines, records = list(answers.read(path)), list(trace.read(kept))
+    lines, records = list(answers.read(path)), list(read_trace(kept))
     assert len(lines) >= KILL_AFTER
     assert {line["id"] for line in lines} <= {record["id"] for record in records}
     assert len(records) <= len(lines) + 16  # tasks that ended at the instant of the signal
@@ -128,11 +128,11 @@ def test_references_are_measured_on_each_site_alone(
     kept = tmp_path / "trace.jsonl"
     flags = ["--cloud", bed.endpoint, "--tasks", 20, "--window", 4, "--trace", kept, "--reference", 5]
     robot(*MAP, *flags, "--answers", tmp_path / "a.jsonl")
-    records = {record["id"]: record for record in trace.read(kept)}
+    records = {record["id"]: record for record in read_trace(kept)}
     assert len(records) == 20
     assert PINNED not in {record["decision"]["policy"] for record in records.values()}
     asked = {line["i"]: line for line in answers.read(tmp_path / "a.jsonl")}
-    lines = list(references.read(trace.reference_path(kept)))
+    lines = list(references.read(reference_path(kept)))
     assert [line["i"] for line in lines] == [4, 9, 14, 19]
     for line in lines:
         record = records[asked[line["i"]]["id"]]
@@ -172,7 +172,7 @@ def test_a_task_is_called_with_its_sizes(testbed: Callable[..., LocalTestbed], t
         for i, line in lines.items():
             assert (line["error"] is None) == (i % 3 != 2)
             assert (line["error"] or "TaskFailed: MemoryError").startswith("TaskFailed: ")
-        records = {record["id"]: record for record in trace.read(kept)}
+        records = {record["id"]: record for record in read_trace(kept)}
         sizes = [records[lines[i]["id"]]["size"] for i in range(30)]
         assert sizes == [1000, 2500, 1e15] * 10
         assert {record["executions"][0]["site"] for record in records.values()} == {policy}
@@ -194,7 +194,7 @@ def test_a_task_is_called_with_inputs(
         to = ["--cloud", bed.endpoint, "--policy", policy, "--seed", seed, "--answers", path]
         assert "12 tasks answered\n" in robot(*flags, *arrivals, *to, "--trace", kept)
         found[policy, seed] = by_number(path)
-        records = list(trace.read(kept))
+        records = list(read_trace(kept))
         assert {record["executions"][0]["site"] for record in records} == {policy}
         assert {record["size"] for record in records} == {480 * 640}
     assert found[ONBOARD, 1] == found[CLOUD, 1] != found[CLOUD, 2]
@@ -209,7 +209,7 @@ def test_inputs_can_be_measured_and_referenced(testbed: Callable[..., LocalTestb
     said = robot("call", *flags, *measuring, "--cloud", bed.endpoint, "--trace", kept)
     assert "8 tasks answered" in said
     assert "run on each site alone and on both at once: 2 of 2 tasks" in said
-    assert [line["i"] for line in references.read(trace.reference_path(kept))] == [3, 7]
+    assert [line["i"] for line in references.read(reference_path(kept))] == [3, 7]
 
 
 @pytest.mark.parametrize(
@@ -226,4 +226,4 @@ def test_inputs_that_end_early_end_the_run(inputs: str, code: int, said: str) ->
         command("call", *flags), capture_output=True, text=True, timeout=WAIT_S, cwd=ROOT, check=False
     )
     assert done.returncode == code, done.stderr
-    assert done.stderr == f"robot-client call: {said}\n"
+    assert done.stderr == f"loadgen call: {said}\n"

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from offboard import Offloader
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
-from tests.crossing_tasks import FOREIGN, Point, described, made, seen
 from tests.crossing_values import as_sent, foreign, odd, values
 from tests.curves import Served
+from tests.value_tasks import FOREIGN, Point, described, made, seen
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(300)]
 
@@ -30,7 +30,7 @@ wheres = st.sampled_from([CLOUD, CLOUD, ONBOARD, "both", None])
 @pytest.fixture(scope="module", params=["threads", "processes"])
 def served(request: pytest.FixtureRequest) -> Iterator[Served]:
     """A server of each executor."""
-    flags = ["--tasks", "tests.crossing_tasks", "--executor", request.param, "--robot-mib-s", "1024"]
+    flags = ["--tasks", "tests.value_tasks", "--executor", request.param, "--robot-mib-s", "1024"]
     started = Served(*flags)
     yield started
     died = started.process.poll()

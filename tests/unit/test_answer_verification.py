@@ -13,10 +13,10 @@ from offboard.common.errors import OffloadError
 from offboard.common.planning.planner import plan_path
 from offboard.common.task_states import TaskStates
 from offboard.loadgen.play.answer_verification import verified, wrong_plan
+from offboard.loadgen.robot import answers
+from offboard.loadgen.robot.work import make_work
 from offboard.loadgen.scenario.outcome import Answered
 from offboard.loadgen.scenario.scenario import Workload
-from offboard.robot_client.simulated import answers
-from offboard.robot_client.simulated.work import make_work
 from tests import frames
 
 MAP = Path(__file__).parents[1] / "samples" / "32room_000-crop.map"

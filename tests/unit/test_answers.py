@@ -12,7 +12,7 @@ from offboard.common.errors import BadValue, ConfigError, DataError
 from offboard.common.planning import planner
 from offboard.common.planning.maps import GridMap
 from offboard.common.planning.planner import Plan, Point, Pose, plan_path
-from offboard.robot_client.simulated.answers import (
+from offboard.loadgen.robot.answers import (
     STEPS,
     Answered,
     Answers,
@@ -119,7 +119,7 @@ def test_a_full_disk_loses_answers_but_ends_no_run(tmp_path: Path, caplog: pytes
             answers.write(answered(1))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert "task 1 lost (1 so far)" in caplog.text
+    assert f"answers {path}: a line is lost: " in caplog.text
     answers.write(answered(2))
     answers.close()
     assert answers.lost == 1
@@ -172,6 +172,6 @@ def test_a_value_is_named_by_the_digest_of_its_bytes() -> None:
 
 def test_a_folder_in_place_of_the_file_is_a_config_error(tmp_path: Path) -> None:
     """The error is raised at start."""
-    with pytest.raises(ConfigError, match="Is a directory"):
+    with pytest.raises(ConfigError, match="is a folder, not a plain file"):
         Answers(tmp_path)
     assert list(tmp_path.iterdir()) == []

@@ -163,7 +163,7 @@ def test_the_first_error_is_raised_when_all_tasks_have_ended(make: Make) -> None
     """A failed task does not stop the others, and the error of the first failed item is raised."""
     cloud, onboard = ScriptedRunner(CLOUD, answers(CLOUD)), ScriptedRunner(ONBOARD, answers(ONBOARD))
     offload = make(cloud, onboard)
-    with pytest.raises(TaskFailed, match=r"^ValueError: -2 is negative$"):
+    with pytest.raises(TaskFailed, match=r"ValueError: -2 is negative$"):
         offload.map(doubled, [5, -2, 8, -13, 1])
     assert sorted(one.args[0] for one in cloud.tasks + onboard.tasks) == [-13, -2, 1, 5, 8]
 

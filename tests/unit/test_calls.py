@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from offboard.common.errors import ConfigError, DataError, OffloadError
-from offboard.robot_client.simulated import answers
-from offboard.robot_client.simulated.calls import Calls, make_calls
-from offboard.robot_client.simulated.config import CallConfig
-from offboard.robot_client.simulated.run import LARGE_MADE_MAX, OwnRecord, Run
+from offboard.loadgen.robot import answers
+from offboard.loadgen.robot.calls import Calls, make_calls
+from offboard.loadgen.robot.config import CallConfig
+from offboard.loadgen.robot.run import LARGE_MADE_MAX, OwnRecord, Run
 from offboard.robot_client.sites.onboard import OnboardRunner
 from tests import frames
 from tests.probes import swallow

@@ -17,10 +17,10 @@ from offboard.loadgen.compare.compare_settings import CompareConfig
 from offboard.loadgen.play.measure_dataset import DatasetConfig
 from offboard.loadgen.relay.wan import WanConfig
 from offboard.loadgen.report.report import ReportConfig
+from offboard.loadgen.robot.config import CallConfig, DriveConfig
 from offboard.loadgen.table.export_dataset import ExportConfig
 from offboard.loadgen.table.replay import ReplayConfig
 from offboard.loadgen.table.table_settings import TableConfig
-from offboard.robot_client.simulated.config import CallConfig, DriveConfig
 
 SHOWN_MAX = 16  # flags in --help, --help itself included
 CONFIGS = (
@@ -101,6 +101,43 @@ def test_an_unknown_flag_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixtu
         capsys.readouterr().err
         == "tool: unrecognized arguments: --spede 3; did you mean --speed? (see tool --help)\n"
     )
+
+
+@dataclass(frozen=True)
+class Flags:
+    cloud: str | None = setting(None, "one server")
+    rate: float = setting(1.0, "per second")
+    jump: bool = setting(False, "do it")
+    site: tuple[str, ...] = setting((), "many servers")
+
+
+@pytest.mark.parametrize(
+    ("argv", "twice"),
+    [
+        (["--cloud", "a", "--rate", "3", "--cloud", "b"], "--cloud"),
+        (["--cloud=a", "--cloud=a"], "--cloud"),
+        (["--rate", "0", "--rate", "3"], "--rate"),
+        (["--jump", "--no-jump"], "--no-jump"),
+        (["--config", "a.toml", "--config", "b.toml"], "--config"),
+    ],
+)
+def test_a_flag_with_one_value_is_given_once(
+    argv: list[str], twice: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The second one is an error with one line and exit code 2, never a value that replaces the first."""
+    with pytest.raises(SystemExit) as caught:
+        load(Flags, argv, prog="tool", description="", environ={}, prefix="TOOL")
+    assert caught.value.code == 2
+    said = f"tool: {twice} is given twice, but takes one value (see tool --help)\n"
+    assert capsys.readouterr().err == said
+
+
+def test_a_flag_with_many_values_can_be_repeated() -> None:
+    """The values of all of them count; a flag still wins over the environment."""
+    environ = {"TOOL_CLOUD": "c"}
+    argv = ["--site", "a", "--site", "b,c", "--cloud", "a"]
+    flags = load(Flags, argv, prog="tool", description="", environ=environ, prefix="TOOL")
+    assert (flags.site, flags.cloud) == (("a", "b", "c"), "a")
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import importlib
 import itertools
 import math
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -15,6 +16,7 @@ from offboard import MissingExtra
 from offboard.common.tasks import Kind, kinds
 from offboard.common.wire.values import decode, encode
 
+ROOT = Path(__file__).parents[2]
 CALLS = 2
 # The module, its extra, the library that it imports, and arguments of `inputs` that keep the calls short.
 APPLICATIONS: dict[str, tuple[str, str, dict[str, Any]]] = {
@@ -106,10 +108,50 @@ def test_a_missing_library_names_the_extra(name: str, monkeypatch: pytest.Monkey
         importlib.import_module(f"examples.{name}")
 
 
+def program(name: str, *words: str, absent: str = "") -> "subprocess.CompletedProcess[str]":
+    """`python -m examples.NAME WORD ...` where the library `absent` is not installed."""
+    probe = (
+        "import runpy, sys\n"
+        f"sys.modules[{absent!r}] = None\n"
+        f"sys.argv = {[name, *words]!r}\n"
+        f"runpy.run_module('examples.{name}', run_name='__main__', alter_sys=True)\n"
+    )
+    return subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, timeout=30, cwd=ROOT)
+
+
+@pytest.mark.parametrize("name", APPLICATIONS)
+def test_a_program_without_its_library_says_what_to_install(name: str) -> None:
+    """It ends with one line and exit code 2; so does the measurement of this example."""
+    extra, library, _ = APPLICATIONS[name]
+    said = f"examples.{name} needs the extra '{extra}': pip install 'offboard[{extra}]'\n"
+    done = program(name, "tcp://127.0.0.1:5555", absent=library)
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", said)
+    done = program("measure", name, absent=library)
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", f"examples.measure: {said}")
+
+
+def test_a_wrong_command_line_is_one_line() -> None:
+    """A program without a server, with a wrong one, or with an unknown example says so, with exit code 2."""
+    pytest.importorskip("small_gicp", reason="needs the extra 'registration'")
+    needed = "one argument is needed: tcp://HOST:PORT of the server"
+    wrong = "cloud: 'localhost' is not tcp://HOST:PORT"
+    known = "'lidar' is not one of apriltags, registration, signs, pose_graph, arm"
+    for name, words, said in (
+        ("registration", (), needed),
+        ("registration", ("tcp://127.0.0.1:5555", "more"), needed),
+        ("registration", ("localhost",), wrong),
+        ("measure", ("lidar",), known),
+    ):
+        done = program(name, *words)
+        assert done.returncode == 2
+        assert done.stderr.startswith(f"examples.{name}: {said}"), done.stderr
+        assert len(done.stderr.splitlines()) == 1
+
+
 @pytest.mark.parametrize("name", APPLICATIONS)
 def test_an_example_can_be_read_at_once(name: str) -> None:
     """An example has at most 140 lines."""
-    lines = Path(__file__).parents[2].joinpath("examples", f"{name}.py").read_text().splitlines()
+    lines = ROOT.joinpath("examples", f"{name}.py").read_text().splitlines()
     assert 60 <= len(lines) <= 140
 
 

@@ -1,7 +1,10 @@
 """Heartbeats: when they are due, and what their answers say about a site."""
 
+import time
+
 import pytest
 
+from offboard.robot_client.sites.background import LOADED_SLOWER, Background
 from offboard.robot_client.sites.heartbeat import (
     EVERY_S,
     JITTER,
@@ -47,6 +50,38 @@ def test_before_the_connection_nothing_is_due_or_known() -> None:
     heartbeat.start(3.0)
     assert heartbeat.due_s == 3.0
     assert not heartbeat.condition(1e6).silent, "no heartbeat was sent yet"
+
+
+def test_a_robot_that_computes_does_not_measure_a_longer_round_trip() -> None:
+    """An answer that was heard during a run onboard, or sent during one, only shortens the round trip."""
+    background = Background()
+    heartbeat = Heartbeat(EVERY_S, background=background)
+    heartbeat.start(0.0)
+
+    def beat(now_s: float, trip_s: float) -> float | None:
+        heartbeat.answer(heartbeat.beat(now_s), now_s + trip_s, IDLE)
+        return heartbeat.condition(now_s + trip_s).round_trip_s
+
+    assert beat(1.0, 0.05) == pytest.approx(0.05)
+    background.begin()
+    assert beat(2.0, 0.2) == pytest.approx(0.05)
+    assert beat(3.0, 0.02) == pytest.approx(0.02)
+    background.end()
+    assert beat(0.0, 0.2) == pytest.approx(0.02), "a run ended after the heartbeat was sent"
+    idle_s = time.perf_counter() + 1.0
+    beat(idle_s, 0.2)
+    assert beat(idle_s + 1.0, 0.2) == pytest.approx(0.2)
+
+
+def test_a_loaded_robot_sends_fewer_heartbeats() -> None:
+    """While other programs take the CPU, the pauses are LOADED_SLOWER times as long."""
+    background = Background()
+    usual, loaded = Heartbeat(EVERY_S), Heartbeat(EVERY_S, background=background)
+    background.loaded = True
+    for heartbeat in (usual, loaded):
+        heartbeat.start(0.0)
+        heartbeat.beat(0.0)
+    assert loaded.due_s == pytest.approx(LOADED_SLOWER * usual.due_s)
 
 
 def test_heartbeats_can_be_switched_off() -> None:

@@ -6,11 +6,11 @@ import pytest
 
 from offboard.common.tasks import kind_of, task
 from offboard.robot_client import policies
-from offboard.robot_client.learning.regret import PROBES_MIN
 from offboard.robot_client.learning.site import SiteMemory
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Decision, Forecast, Probe
 from offboard.robot_client.policies.allowance import Allowance
+from offboard.robot_client.predictors.base import WARM_UP
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition
 from tests.virtual import VirtualClock, VirtualRunner
@@ -148,10 +148,10 @@ def test_a_probe_during_an_onboard_run_does_not_make_a_server_look_slow(
 
 
 def test_probes_measure_the_regret() -> None:
-    """After PROBES_MIN probes that were faster, the regret is the time that they would have saved."""
+    """After WARM_UP probes that were faster, the regret is the time that they would have saved."""
     scene = Scene()
     regret = None
-    for _ in range(PROBES_MIN + 1):
+    for _ in range(WARM_UP + 1):
         scene.ask(PROBE, onboard_s=0.1, cloud_s=0.04)
         scene.clock.run_out()
         assert scene.offload.last is not None

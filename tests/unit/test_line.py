@@ -137,6 +137,25 @@ def test_a_change_of_bandwidth_leaves_the_delay() -> None:
     assert line.at(0.0) == pytest.approx(delay_s, abs=0.05)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_a_recovered_bandwidth_is_known_for_large_payloads_after_a_few_small_ones(seed: int) -> None:
+    """The link falls to a tenth for three answers and recovers; five small payloads then tell the slope."""
+    rng, line = Random(seed), Line(together=False)
+
+    def answer(x: float, slope: float) -> None:
+        line.learn(x, slope * x * rng.lognormvariate(0.0, 0.1), 0.04)
+
+    for _ in range(30):
+        answer(rng.uniform(0.1, 1.0), 0.16)
+    for x in (0.5, 0.3, 0.4):
+        answer(x, 1.6)
+    assert line.at(1.0) > 0.36
+    for _ in range(5):
+        answer(rng.uniform(0.1, 0.3), 0.16)
+    assert 0.08 < line.at(1.0) < 0.32
+    assert line.a >= 0.0
+
+
 @given(
     times=st.lists(st.tuples(st.floats(0, 5), st.floats(0, 5)), max_size=20),
     bound=st.tuples(st.floats(0, 5), st.floats(0, 5), st.floats(0, 1)),
@@ -163,7 +182,7 @@ def test_a_bound_is_all_that_an_empty_line_knows() -> None:
     line.bound(1.0, 0.4, 0.0)
     assert line.at(1.0) == pytest.approx(0.4)
     line.learn(1.0, 0.1)
-    assert line.at(1.0) < 0.32
+    assert line.at(1.0) < 0.36
 
 
 def test_the_slope_of_one_time_is_limited() -> None:

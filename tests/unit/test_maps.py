@@ -51,11 +51,16 @@ def test_a_grid_checks_its_fields() -> None:
     assert GridMap(cells, 1.0, [1, 2, 3]).origin == (1.0, 2.0, 3.0)  # type: ignore[arg-type]
 
 
-def test_a_read_only_array_stays_the_same_object() -> None:
-    """The identity of the cells names a map, so read-only cells are not copied."""
+def test_nothing_changes_the_cells_of_a_map() -> None:
+    """The identity of the cells names a map, so a map has its own copy, which cannot be unlocked."""
     cells = np.zeros((2, 3), np.int8)
+    older = cells[:]
+    cells.flags.writeable = False
     grid = GridMap(cells, 1.0)
-    assert cells.flags.writeable
+    older[:] = 100
+    assert not grid.cells.any()
+    with pytest.raises(ValueError, match="cannot set WRITEABLE flag"):
+        grid.cells.flags.writeable = True
     assert GridMap(grid.cells, 1.0).cells is grid.cells
 
 

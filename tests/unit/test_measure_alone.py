@@ -11,12 +11,12 @@ from offboard.common.errors import CloudTimeout
 from offboard.common.planning.maps import GridMap
 from offboard.common.planning.planner import plan_path, warm
 from offboard.common.tasks import Task
+from offboard.loadgen.robot.config import DriveConfig
+from offboard.loadgen.robot.references import WAYS, measure_alone, orders
+from offboard.loadgen.robot.robot import SimulatedRobot
+from offboard.loadgen.robot.work import Plans
 from offboard.robot_client.offloader import BOTH
 from offboard.robot_client.records.trace import Record
-from offboard.robot_client.simulated.config import DriveConfig
-from offboard.robot_client.simulated.references import WAYS, measure_alone, orders
-from offboard.robot_client.simulated.robot import SimulatedRobot
-from offboard.robot_client.simulated.work import Plans
 from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.fakes import ScriptedRunner

@@ -45,7 +45,7 @@ def test_a_failed_export_leaves_no_file(tmp_path: Path) -> None:
     """If the file cannot be written, the error names it and no partial file is left."""
     (tmp_path / "d.csv").write_text(CSV)
     (tmp_path / "folder.csv").mkdir()
-    with pytest.raises(ConfigError, match=r"folder\.csv: cannot be written: Is a directory"):
+    with pytest.raises(ConfigError, match=r"folder\.csv: cannot be written: is a folder"):
         run_export(tmp_path / "d.csv", ExportConfig(csv=tmp_path / "folder.csv"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["d.csv", "folder.csv"]
 

@@ -9,7 +9,7 @@ from random import Random
 import pytest
 
 from offboard.robot_client.learning import store
-from offboard.robot_client.learning.site import OBSERVATIONS_MAX
+from offboard.robot_client.predictors.base import REMEMBERED
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.memory_robot import Robot, store_plain, store_worked
 
@@ -20,12 +20,12 @@ def robot(tmp_path: Path) -> Robot:
 
 
 def test_the_file_is_bounded(robot: Robot) -> None:
-    """It holds the last OBSERVATIONS_MAX observations of each site, and as many sizes with their work."""
+    """It holds the last REMEMBERED observations of each site, and as many sizes with their work."""
     with robot.started("parts") as offload:
-        robot.ask(offload, 2 * OBSERVATIONS_MAX, store_worked)
+        robot.ask(offload, 2 * REMEMBERED, store_worked)
     kind = json.loads(robot.path.read_bytes())["kinds"]["store_worked"]
-    assert len(kind["worked"]) == OBSERVATIONS_MAX
-    assert [len(site["observations"]) for site in kind["sites"].values()] == [OBSERVATIONS_MAX] * 2
+    assert len(kind["worked"]) == REMEMBERED
+    assert [len(site["observations"]) for site in kind["sites"].values()] == [REMEMBERED] * 2
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from offboard.common.errors import (
-    BadValue,
+    CannotCross,
     CloudBroken,
     CloudBusy,
     CloudError,
@@ -106,11 +106,11 @@ def test_the_warm_up_ends_with_the_smallest_window_too(make: Make) -> None:
 
 
 def test_an_exception_of_the_task_is_raised_from_every_site_in_the_same_way(make: Make) -> None:
-    """The caller gets TaskFailed with the type and text of the exception, and the task ran once."""
-    cloud = cloud_answers(failure=TaskFailed("ValueError: negative"))
+    """TaskFailed has the names of task and exception, and its text; the task ran once."""
+    cloud = cloud_answers(failure=TaskFailed("task add_one: ValueError: negative"))
     with make(cloud, OnboardRunner()) as offload:
         for where in (ONBOARD, CLOUD):
-            with pytest.raises(TaskFailed, match=r"^ValueError: negative$"):
+            with pytest.raises(TaskFailed, match=r"^task add_one: ValueError: negative$"):
                 offload(add_one, -1, where=where)
             assert offload.last is not None
             assert len(offload.last.executions) == 1
@@ -192,31 +192,66 @@ def test_a_lost_answer_is_raised_if_the_task_may_have_run(make: Make, started: b
                 offload(write_once)
 
 
-def test_a_value_that_cannot_be_sent_is_one_clear_error(make: Make) -> None:
-    """BadValue reaches the caller even if onboard could have answered."""
-    with (
-        make(cloud_answers(failure=BadValue("a set cannot cross the wire")), OnboardRunner()) as offload,
-        pytest.raises(BadValue, match="set"),
-    ):
-        offload(add_one, 1, where="both")
-
-
 @task("unique", size=lambda items: len(items))
 def unique(items: list[int]) -> object:
     return set(items) if items else None
 
 
+@pytest.mark.parametrize("where", [None, CLOUD, "both"])
+def test_what_cannot_be_sent_is_answered_onboard(
+    make: Make, where: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    """No call raises because of it, and the reason is logged once, also if a later call has it first."""
+    refused = "arguments[0]: a set cannot be sent"
+    cloud = cloud_answers()
+    with make(cloud, OnboardRunner()) as offload:
+        assert offload(add_one, 1, where=where) == 2
+        assert caplog.messages == []
+        cloud.script = cloud_answers(0.0, CannotCross(refused), started=False).script
+        for number in range(3):
+            assert offload(add_one, number, where=where) == number + 1
+            assert offload.last is not None
+            assert offload.last.used == ONBOARD
+    assert caplog.messages == [f"add_one: only onboard can answer such a call: {refused}"]
+
+
 @pytest.mark.parametrize("where", [None, ONBOARD, CLOUD])
-def test_the_first_call_says_which_value_cannot_be_sent(make: Make, where: str | None) -> None:
-    """BadValue is raised at once for arguments and results, on every site, also without the server."""
+def test_the_first_call_says_which_value_cannot_be_sent(
+    make: Make, where: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Arguments and results are checked at once, on every site, also without the server."""
     cloud = cloud_answers()
     cloud.absent = "not connected"
     with make(cloud, OnboardRunner()) as offload:
-        with pytest.raises(BadValue, match=r"arguments of task unique: .*set"):
-            offload(unique, {1, 2}, where=where)
-        with pytest.raises(BadValue, match=r"result of task unique: .*set"):
-            offload(unique, [1, 2], where=where)
-        assert offload(unique, [], where=where) is None
+        assert offload(unique, {1, 2}, where=where) == {1, 2}
+        assert offload(unique, [1, 2], where=where) == {1, 2}
+        assert offload(unique, {3}, where=where) == {3}
+    start = "unique: only onboard can answer such a call: "
+    assert [text.partition(" cannot be sent")[0] for text in caplog.messages] == [
+        f"{start}arguments[0]: a value of type builtins.set",
+        f"{start}result: a value of type builtins.set",
+    ]
+
+
+def test_a_value_that_changes_while_it_is_checked_breaks_no_call(
+    make: Make, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The check of the first call logs whatever encoding raises."""
+
+    def changing(*_: object, **__: object) -> None:
+        raise RuntimeError("dictionary changed size during iteration")
+
+    monkeypatch.setattr("offboard.robot_client.execution.crossing_check.encode", changing)
+    with make(cloud_answers(), OnboardRunner()) as offload:
+        assert offload(unique, [1, 2]) == {1, 2}
+    assert all("dictionary changed size" in text for text in caplog.messages)
+    assert len(caplog.messages) == 2
+
+
+def test_a_site_cannot_be_named_both() -> None:
+    """`where="both"` would mean two things."""
+    with pytest.raises(ConfigError, match="a site cannot be named 'both'"):
+        Offloader.connect("tcp://127.0.0.1:9", sites={"both": "tcp://127.0.0.1:9"})
 
 
 def test_a_robot_without_servers_takes_any_value(make: Make) -> None:
@@ -284,7 +319,7 @@ def test_onboard_must_be_among_the_sites() -> None:
             )  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("timeout_s", [0.0, -1.0, float("nan"), float("inf"), 1e9])
+@pytest.mark.parametrize("timeout_s", [0.0, -1.0, float("nan"), float("inf"), 1e9, "3", [1.0]])
 def test_a_timeout_is_above_zero_and_bounded(make: Make, timeout_s: float) -> None:
     """The timeout of an offloader and the timeout of a call must both be finite."""
     with pytest.raises(ConfigError, match="must be above 0 and at most"):

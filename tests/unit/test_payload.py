@@ -10,6 +10,7 @@ import pytest
 
 from offboard.common.wire.payload import LOOKS_MAX, NUMBER_BYTES, payload_bytes
 from offboard.common.wire.values import BLOB_BYTES_MIN, encode
+from tests.crossing_tasks import UNSENDABLE
 from tests.wire_values import Pose
 
 LARGE = BLOB_BYTES_MIN + 1000
@@ -17,7 +18,7 @@ LARGE = BLOB_BYTES_MIN + 1000
 
 @dataclass(frozen=True)
 class Path:
-    """A dataclass of dataclasses, with a field that is not sent."""
+    """A dataclass of dataclasses, with a field that its `__init__` does not take."""
 
     poses: list[Pose]
     name: str = ""
@@ -129,3 +130,10 @@ def test_what_cannot_be_sent_is_counted_too() -> None:
     endless += [endless, endless]
     assert payload_bytes(endless) > 0
     assert payload_bytes([object(), {1, 2}]) > 0
+
+
+@pytest.mark.parametrize("name", UNSENDABLE)
+def test_no_value_breaks_the_count(name: str) -> None:
+    """It is counted before the site is chosen, so an error would reach the caller."""
+    value = UNSENDABLE[name][0]()
+    assert payload_bytes([value, value], Asked()) > 0

@@ -15,11 +15,11 @@ from offboard.loadgen.play.part_setups import setups
 from offboard.loadgen.play.run_files import LineCounter, RobotFiles, clear_folder
 from offboard.loadgen.relay.link.link_settings import as_flags
 from offboard.loadgen.relay.wan import WanConfig
+from offboard.loadgen.robot.config import CallConfig, DriveConfig
+from offboard.loadgen.robot_files import alone_path, reference_path
 from offboard.loadgen.scenario.scenario import CloudPart, Scenario, Workload
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario, shipped
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN
-from offboard.robot_client.records.trace import alone_path, reference_path
-from offboard.robot_client.simulated.config import CallConfig, DriveConfig
 
 CONFIGS = {CLOUD: ServerConfig, WAN: WanConfig, "drive": DriveConfig, "call": CallConfig}
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from offboard.common.errors import (
-    BadValue,
+    CannotCross,
     CloudBroken,
     CloudBusy,
     CloudTimeout,
@@ -239,14 +239,14 @@ def test_a_duplicate_false_task_is_not_run_again(course: Course, started: bool, 
 
 
 def test_the_answer_is_the_fastest_good_one() -> None:
-    """Without a good answer: a bad value, else the failure of the task, else the last failure."""
-    bad, failed = BadValue("a set"), TaskFailed("no")
+    """Without a good answer: the failure of the task, else the last failure."""
+    failed = TaskFailed("no")
     slow, fast = Execution(ONBOARD, 0.5, 1), Execution(CLOUD, 0.2, 1)
     lost = Execution(EDGE, 2.0, failure=CloudTimeout("late"))
     assert answer_of((lost, slow, fast)) is fast
     assert answer_of((lost, Execution(CLOUD, 0.1, failure=failed), slow)) is slow
     assert answer_of((Execution(CLOUD, 0.1, failure=failed), lost)).failure is failed
-    assert answer_of((slow, Execution(CLOUD, 0.1, failure=bad))).failure is bad
+    assert answer_of((slow, Execution(CLOUD, 0.1, failure=CannotCross("a set")))) is slow
     assert answer_of((lost,)) is lost
 
 

@@ -12,12 +12,12 @@ import pytest
 from offboard.common.errors import CloudTimeout
 from offboard.common.task_states import TaskStates
 from offboard.common.tasks import Kind, Task, kind_of, task
+from offboard.loadgen.robot import references as references_file
+from offboard.loadgen.robot.calls import Calls
+from offboard.loadgen.robot.config import CallConfig
+from offboard.loadgen.robot.references import References, orders
+from offboard.loadgen.robot.run import OwnRecord, Run
 from offboard.robot_client.records.trace import Record
-from offboard.robot_client.simulated import references as references_file
-from offboard.robot_client.simulated.calls import Calls
-from offboard.robot_client.simulated.config import CallConfig
-from offboard.robot_client.simulated.references import References, orders
-from offboard.robot_client.simulated.run import OwnRecord, Run
 from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.fakes import ScriptedRunner

@@ -11,11 +11,11 @@ from offboard.loadgen.compare.resume import played_before
 from offboard.loadgen.play.play_scenario import judge, write_summary
 from offboard.loadgen.play.run_digest import digests, of_scenario, of_software
 from offboard.loadgen.play.run_files import SUMMARY
+from offboard.loadgen.robot.answers import of_value
 from offboard.loadgen.scenario.hash_tasks import hash_rounds
 from offboard.loadgen.scenario.pass_fail_check import Check
 from offboard.loadgen.scenario.scenario import RobotPart, Scenario, Workload
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
-from offboard.robot_client.simulated.answers import of_value
 
 TASKS = 3
 SCENARIO = Scenario(

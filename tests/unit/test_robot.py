@@ -12,7 +12,7 @@ from offboard.common.planning import maps, planner
 from offboard.common.planning.map_files import read_map
 from offboard.common.planning.maps import GridMap
 from offboard.common.planning.planner import Plan, Point, Pose, plan_path, size_of_plan
-from offboard.robot_client.simulated.robot import CANDIDATES, FAILURES_MAX, TRIES_MAX, SimulatedRobot
+from offboard.loadgen.robot.robot import CANDIDATES, FAILURES_MAX, TRIES_MAX, SimulatedRobot
 
 WILLOW = read_map(Path(__file__).parents[2] / "maps/willow-full-0.05.yaml")
 NO_PATH = Plan("NO_VALID_PATH", np.zeros((0, 2), np.int32), np.zeros((0, 2), np.float32), 0.0, 0)

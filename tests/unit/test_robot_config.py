@@ -1,4 +1,4 @@
-"""The settings of `robot-client drive` and `call`: which go together, and what is made from them."""
+"""The settings of `loadgen drive` and `call`: which go together, and what is made from them."""
 
 import subprocess
 import sys
@@ -9,13 +9,13 @@ import pytest
 
 from offboard.common.command_line import load
 from offboard.common.errors import ConfigError
+from offboard.loadgen.robot.config import CallConfig, DriveConfig, RobotConfig
+from offboard.loadgen.robot_files import read_trace
 from offboard.robot_client import policies
 from offboard.robot_client.policies.allowance import DUPLICATES_MAX
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.objectives import Mean, TimeAndEnergy
 from offboard.robot_client.policies.probe import PROBE_EVERY
-from offboard.robot_client.records import trace
-from offboard.robot_client.simulated.config import CallConfig, DriveConfig, RobotConfig
 
 MAP, TASK = {"map": Path("m.yaml")}, {"task": "m:f", "sizes": ("constant:1",)}
 OPEN = {"arrivals": "poisson", "rate": 5.0}
@@ -36,6 +36,8 @@ def config(settings: dict[str, Any]) -> RobotConfig:
         (MAP | {"arrivals": "often"}, "--arrivals: 'often' is not one of closed, constant, poisson, bursts"),
         (TASK | {"arrivals": "bursts"}, "--arrivals: bursts needs --rate"),
         (MAP | {"planner": "theta"}, "--planner: 'theta' is not one of dijkstra, astar, jps"),
+        (TASK | {"rate": 5.0}, "--rate: 5 needs --arrivals, which is closed otherwise"),
+        (TASK | {"keys": Path("keys")}, "--keys: keys needs --cloud, the server to use"),
         (TASK | OPEN | {"rate": 0.0}, "--rate: 0.0 is below 0.001"),
         (TASK | OPEN | {"burst": 0}, "--burst: 0 is below 1"),
         (TASK | OPEN | {"in_flight": 0}, "--in-flight: 0 is below 1"),
@@ -163,20 +165,20 @@ def test_a_second_run_starts_with_what_the_first_one_learnt(tmp_path: Path) -> N
     )
     flags = "--task mine:mine --sizes uniform:1:9 --window 5 --memory memory.json --trace trace.jsonl --tasks"
     for tasks in ("8", "1"):
-        command = [sys.executable, "-m", "offboard.robot_client", "call", *flags.split(), tasks]
+        command = [sys.executable, "-m", "offboard.loadgen", "call", *flags.split(), tasks]
         done = subprocess.run(command, capture_output=True, text=True, timeout=30, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
-    records = list(trace.read(tmp_path / "trace.jsonl"))
+    records = list(read_trace(tmp_path / "trace.jsonl"))
     assert records[0]["sites"]["onboard"]["predicted_s"] is None
     assert records[8]["sites"]["onboard"]["predicted_s"] is not None
     assert (records[8]["i"], records[8]["sites"]["onboard"]["age"]) == (0, PROBE_EVERY)
     command = [
         sys.executable,
         "-m",
-        "offboard.robot_client",
+        "offboard.loadgen",
         "call",
         *flags.replace("memory.json", ".").split(),
         "1",
     ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=30, cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (2, "robot-client call: memory .: is a folder\n")
+    assert (done.returncode, done.stderr) == (2, "loadgen call: memory .: is a folder, not a plain file\n")

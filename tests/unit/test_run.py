@@ -12,13 +12,13 @@ from typing import Any
 import pytest
 
 from offboard.common.errors import TaskFailed
+from offboard.loadgen.robot import answers as answers_file
+from offboard.loadgen.robot import run as run_module
+from offboard.loadgen.robot.answers import Answers
+from offboard.loadgen.robot.calls import Calls
+from offboard.loadgen.robot.config import CallConfig
+from offboard.loadgen.robot.run import MADE_MAX, OwnRecord, Run, made_ahead
 from offboard.robot_client.records.trace import Record
-from offboard.robot_client.simulated import answers as answers_file
-from offboard.robot_client.simulated import run as run_module
-from offboard.robot_client.simulated.answers import Answers
-from offboard.robot_client.simulated.calls import Calls
-from offboard.robot_client.simulated.config import CallConfig
-from offboard.robot_client.simulated.run import MADE_MAX, OwnRecord, Run, made_ahead
 from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import CLOUD, Execution
 from tests.fakes import ScriptedRunner
@@ -156,7 +156,7 @@ def test_a_failing_task_does_not_end_the_run(tmp_path: Path, settings: dict[str,
     lines, said = answered(tmp_path, tasks=10, **settings)
     lines.sort(key=lambda line: int(line["i"]))
     assert [line["i"] for line in lines] == list(range(10))
-    assert lines[3]["error"] == "TaskFailed: ValueError: three"
+    assert lines[3]["error"] == "TaskFailed: task scripted: ValueError: three"
     assert lines[5]["error"].startswith("BadValue: a value of type builtins.object")
     assert [line["answer"] is None for line in lines] == [n in (3, 5) for n in range(10)]
     assert all(line["id"] for line in lines)

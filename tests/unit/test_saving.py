@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from offboard.common.errors import ConfigError
+from offboard.common.security import plain_files
 from offboard.robot_client.learning import store
 from offboard.robot_client.learning.store import SAVE_EVERY_S, Store
 from offboard.robot_client.sites.runner import CLOUD
@@ -40,7 +41,7 @@ def test_a_save_survives_a_loss_of_power(robot: Robot, monkeypatch: pytest.Monke
         synced.append((Path(f"/proc/self/fd/{number}").readlink().name, robot.path.exists()))
         sync(number)
 
-    monkeypatch.setattr(store.os, "fsync", note)
+    monkeypatch.setattr(plain_files.os, "fsync", note)
     robot.started().close()
     assert synced == [(".memory.json.new", False), (robot.path.parent.name, True)]
 
@@ -73,14 +74,14 @@ def test_the_memory_is_saved_every_half_minute(robot: Robot) -> None:
 def test_a_slow_disk_delays_no_task(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     """While a save hangs, tasks are answered and no second save starts; `close` writes the last state."""
     hanging, entered = threading.Event(), threading.Event()
-    sync = store.os.fsync
+    sync = plain_files.os.fsync
 
     def slow(number: int) -> None:
         entered.set()
         assert hanging.wait(10)
         sync(number)
 
-    monkeypatch.setattr(store.os, "fsync", slow)
+    monkeypatch.setattr(plain_files.os, "fsync", slow)
     offload = robot.started()
     robot.ask(offload, 1)
     robot.clock.wait([], SAVE_EVERY_S)
@@ -102,7 +103,7 @@ def test_close_does_not_wait_forever_for_a_disk(
 ) -> None:
     """`close` waits WRITE_WAIT_S at most, and logs that the file was not written."""
     hanging = threading.Event()
-    monkeypatch.setattr(store.os, "fsync", lambda _: hanging.wait(10) and None)
+    monkeypatch.setattr(plain_files.os, "fsync", lambda _: hanging.wait(10) and None)
     monkeypatch.setattr(store, "WRITE_WAIT_S", 0.01)
     offload = robot.started()
     robot.ask(offload, 1)

@@ -2,9 +2,11 @@
 
 import dataclasses
 import inspect
+import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from offboard import Offloader, Settings
@@ -93,3 +95,74 @@ def test_a_wrong_setting_is_an_error_of_connect(settings: Settings, says: str) -
     """The error names the setting before any task runs."""
     with pytest.raises(ConfigError, match=says):
         Offloader.connect(settings=settings)
+
+
+WRONG = [
+    ({"endpoint": 5}, "endpoint 5: must be a string or None"),
+    ({"sites": ["tcp://h:1"]}, "sites ['tcp://h:1']: must be a dictionary of strings or None"),
+    ({"sites": {"edge": 5}}, "sites {'edge': 5}: must be a dictionary of strings or None"),
+    ({"policy": None}, "policy None: must be a string"),
+    ({"window": "5"}, "window '5': must be a whole number"),
+    ({"window": 5.0}, "window 5.0: must be a whole number"),
+    ({"timeout_s": "3"}, "timeout_s '3': must be a number"),
+    ({"timeout_s": True}, "timeout_s True: must be a number"),
+    ({"timeout_s": None}, "timeout_s None: must be a number"),
+    ({"keys": 5}, "keys 5: must be a path or a string or None"),
+    ({"observers": print}, "observers <built-in function print>: must be a list of functions"),
+    ({"observers": [5]}, "observers [5]: must be a list of functions"),
+    ({"metrics": 9100}, "metrics 9100: must be a string or None"),
+    ({"trace": 5}, "trace 5: must be a path or a string or None"),
+    ({"settings": {"seed": 1}}, "settings {'seed': 1}: must be Settings or None"),
+]
+WRONG_SETTINGS = [
+    ({"predictor": 5}, "predictor 5: must be a string or None"),
+    ({"heartbeats": "yes"}, "heartbeats 'yes': must be True or False or None"),
+    ({"objective": "p95"}, "objective 'p95': must be Objective"),
+    ({"energy": 5.0}, "energy 5.0: must be Energy"),
+    ({"duplicates": "0.1"}, "duplicates '0.1': must be a number"),
+    ({"bytes_a_minute": "1"}, "bytes_a_minute '1': must be a number or None"),
+    ({"joules_a_minute": []}, "joules_a_minute []: must be a number or None"),
+    ({"memory": 5}, "memory 5: must be a path or a string or None"),
+    ({"states": 5}, "states 5: must be TaskStates or None"),
+    ({"seed": "1"}, "seed '1': must be a whole number"),
+]
+
+
+@pytest.mark.parametrize(("given", "says"), WRONG)
+def test_a_wrong_type_is_one_error_of_connect(given: dict[str, Any], says: str) -> None:
+    """The error names the parameter, its value and what is allowed."""
+    with pytest.raises(ConfigError, match=f"^{re.escape(says)}$"):
+        Offloader.connect(**given)
+
+
+@pytest.mark.parametrize(("given", "says"), WRONG_SETTINGS)
+def test_a_wrong_type_is_one_error_of_the_settings(given: dict[str, Any], says: str) -> None:
+    """Settings are checked when they are made."""
+    with pytest.raises(ConfigError, match=f"^{re.escape(says)}$"):
+        Settings(**given)
+
+
+def test_every_parameter_is_checked() -> None:
+    """The lists above have every parameter of `connect` and every setting."""
+    assert {name for given, _ in WRONG for name in given} == set(
+        inspect.signature(Offloader.connect).parameters
+    )
+    fields = {field.name for field in dataclasses.fields(Settings)}
+    assert {name for given, _ in WRONG_SETTINGS for name in given} == fields
+
+
+def test_right_types_are_taken(tmp_path: Path) -> None:
+    """Paths may be strings, and numbers may be those of numpy."""
+    memory, trace = tmp_path / "memory.json", tmp_path / "trace.jsonl"
+    settings = Settings(memory=str(memory), duplicates=np.float32(0.1), seed=np.int64(3))  # type: ignore[arg-type]
+    observers: Any = (record for record in [print])
+    with Offloader.connect(
+        window=np.int16(5),
+        timeout_s=3,
+        trace=str(trace),
+        settings=settings,
+        observers=observers,  # type: ignore[arg-type]
+    ) as offload:
+        assert offload(echo, 2) == 2
+    assert memory.exists()
+    assert trace.exists()

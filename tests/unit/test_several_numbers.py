@@ -10,13 +10,14 @@ import pytest
 
 from offboard.common.errors import BadValue, DataError
 from offboard.common.tasks import SIZE_NUMBERS_MAX, Kind, Task, task
+from offboard.loadgen.robot_files import read_trace
 from offboard.loadgen.table import measured_rows
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.learning.store import Store
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.predictors import LEAST_SQUARES, PARTS
-from offboard.robot_client.records.trace import Record, Trace, read
+from offboard.robot_client.records.trace import Record, Trace
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.fakes import ScriptedRunner
 
@@ -172,7 +173,7 @@ def test_a_trace_keeps_the_numbers_and_a_table_refuses_them(make: Make, tmp_path
     trace = Trace(path)
     records = ask(make(observers=[trace.write]), 12)
     trace.close()
-    lines = list(read(path))
+    lines = list(read_trace(path))
     assert [tuple(line["size"]) for line in lines] == [record.size for record in records]
     assert not any("work" in line["features"] for line in lines)
     with pytest.raises(

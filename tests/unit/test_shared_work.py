@@ -5,7 +5,8 @@ from random import Random
 
 import pytest
 
-from offboard.robot_client.learning.shared_work import PAIRS_MAX, SharedWork
+from offboard.robot_client.learning.shared_work import SharedWork
+from offboard.robot_client.predictors.base import REMEMBERED
 
 
 def test_nothing_is_known_at_first() -> None:
@@ -32,11 +33,11 @@ def test_the_work_of_a_size_is_learnt(truth: Callable[[float], float]) -> None:
 
 
 def test_only_the_last_results_count() -> None:
-    """If the work doubles, the old results are forgotten after PAIRS_MAX new ones."""
+    """If the work doubles, the old results are forgotten after REMEMBERED new ones."""
     rng, work = Random(3), SharedWork()
-    for n in range(2 * PAIRS_MAX):
+    for n in range(2 * REMEMBERED):
         size = rng.uniform(1, 5)
-        work.learn(size, 20 * size * (2.0 if n >= PAIRS_MAX else 1.0))
+        work.learn(size, 20 * size * (2.0 if n >= REMEMBERED else 1.0))
     assert work.predict(3.0) == pytest.approx(120.0)
 
 

@@ -13,6 +13,7 @@ FOLDER_FILES_MAX = {"cloud_server": 18}
 FILES_MAX = 14
 MODULE_LINES_MAX = 400
 TEST_LINES_MAX = 400
+ROBOT_LINES_MAX = 7_000
 GLOSSARY_MAX = 60
 FLAGS_MAX = 16
 
@@ -44,6 +45,11 @@ def test_files_are_short() -> None:
     tests = (ROOT / "tests").rglob("test_*.py")
     long += [path.name for path in tests if len(path.read_text().splitlines()) > TEST_LINES_MAX]
     assert long == []
+
+
+def test_what_a_robot_installs_is_small() -> None:
+    """`robot_client` has at most 6,500 lines."""
+    assert sum(one.lines for one in MODULES if one.path.parts[0] == "robot_client") <= ROBOT_LINES_MAX
 
 
 def test_the_glossary_is_short() -> None:

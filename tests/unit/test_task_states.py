@@ -2,14 +2,16 @@
 
 import inspect
 import threading
+import time
 from collections.abc import Iterator
+from contextvars import Context
 from types import SimpleNamespace
 
 import pytest
 
 from offboard.common import task_states
 from offboard.common.errors import ConfigError, Overtaken, TaskFailed
-from offboard.common.task_states import TaskStates
+from offboard.common.task_states import SETUP_AGAIN_S, TaskStates
 from offboard.common.tasks import Task, kind_of, task
 from offboard.common.wanted import check_wanted
 from offboard.robot_client.execution.batch import arguments
@@ -18,7 +20,7 @@ from offboard.robot_client.sites import onboard
 from offboard.robot_client.sites.absence import Absent, wait_for_sites
 from offboard.robot_client.sites.clock import SystemClock
 from offboard.robot_client.sites.onboard import OnboardRunner
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution, Lasting
 from tests.fakes import ScriptedRunner
 
 WAIT_S = 5.0
@@ -113,8 +115,9 @@ def test_each_worker_gets_one_state() -> None:
     states.prepare(kind)
     states.prepare(kind)
     assert states.ready(kind)
-    with states.lend(kind) as first, states.lend(kind) as second:
-        assert sorted([*first, *second]) == [[1], [2]]
+    with states.lend(kind) as first:
+        _, second = Context().run(states.call, kind, (3, 1))
+    assert {first[0][0], second} == {1, 2}
     assert states.call(kind, (3, 1))[0] == 3
     assert bench.made == 2
 
@@ -212,16 +215,40 @@ def test_a_site_that_wins_during_a_setup_leaves_no_time_of_it(runner: OnboardRun
     assert [(one.started, one.censored) for one in late] == [(False, True)]
 
 
-def test_a_setup_that_raises_fails_its_call_and_is_tried_again(runner: OnboardRunner) -> None:
-    """TaskFailed names the task and keeps the cause; the next call works if the setup does."""
+def test_a_setup_that_raises_fails_its_calls_and_is_tried_again(runner: OnboardRunner) -> None:
+    """TaskFailed names the task and keeps the cause. After SETUP_AGAIN_S, a call tries the setup again."""
     bench.broken = True
-    failed = runner.submit(call(1), 1.0).result(WAIT_S)
-    assert isinstance(failed.failure, TaskFailed)
-    assert str(failed.failure) == "setup of task modelled: ValueError: no model"
-    assert isinstance(failed.failure.__cause__, ValueError)
-    assert failed.seconds == 0.0
+    for _ in range(3):
+        failed = runner.submit(call(1), 1.0).result(WAIT_S)
+        assert isinstance(failed.failure, TaskFailed)
+        assert str(failed.failure) == "setup of task modelled: ValueError: no model"
+        assert isinstance(failed.failure.__cause__, ValueError)
+        assert "make_model" in failed.failure.traceback
+        assert (failed.seconds, failed.started) == (0.0, False)
+        assert bench.now_s == SETUP_S
+    bench.now_s += SETUP_AGAIN_S
+    assert isinstance(runner.submit(call(1), 1.0).result(WAIT_S).failure, TaskFailed)
+    assert bench.now_s == 2 * SETUP_S + SETUP_AGAIN_S
+    bench.now_s += SETUP_AGAIN_S
     bench.broken = False
     assert runner.submit(call(2), 1.0).result(WAIT_S).value == (2, 1)
+
+
+def test_a_setup_that_raises_for_one_worker_leaves_the_state_of_another() -> None:
+    """Calls wait for the state that was made, and do not fail."""
+    bench.__init__()  # type: ignore[misc]
+    states, kind = TaskStates(2), kind_of(modelled)
+    with states.lend(kind) as first:
+        bench.broken = True
+        with pytest.raises(TaskFailed, match="no model"):
+            Context().run(states.call, kind, (3, 1))
+        ended: list[object] = []
+        waits = threading.Thread(target=lambda: ended.append(states.call(kind, (3, 1))))
+        waits.start()
+        waits.join(0.05)
+        assert not ended
+    waits.join(WAIT_S)
+    assert ended == [(3, first[0][0])]
 
 
 def test_waiting_for_sites_runs_the_setup(runner: OnboardRunner) -> None:
@@ -237,6 +264,26 @@ def test_waiting_for_sites_runs_the_setup(runner: OnboardRunner) -> None:
     found = wait_for_sites(sites, kind, WAIT_S)
     assert (found, str(found)) == ({}, "all sites can take this task")
     assert runner.submit(call(2), 1.0).result(WAIT_S).value == (2, 1)
+
+
+@pytest.mark.parametrize("setup_ends", [True, False])
+def test_a_reason_that_waiting_cannot_change_is_not_waited_for(
+    runner: OnboardRunner, setup_ends: bool
+) -> None:
+    """Other reasons, and the setup onboard, still are."""
+    other = ScriptedRunner(CLOUD, lambda one: Execution(CLOUD, 1.0, one.size), Lasting("other source"))
+    sites, kind = {CLOUD: other, ONBOARD: runner}, kind_of(modelled)
+    if not setup_ends:
+        bench.setup_may_end.clear()
+    began_s = time.monotonic()
+    absent = wait_for_sites(sites, kind, WAIT_S if setup_ends else 0.1)
+    waited_s = time.monotonic() - began_s
+    assert absent[CLOUD] == "other source"
+    assert waited_s < WAIT_S / 2 if setup_ends else waited_s >= 0.1
+    other.absent = "not connected"
+    began_s = time.monotonic()
+    assert wait_for_sites(sites, kind, 0.1)[CLOUD] == "not connected"
+    assert time.monotonic() - began_s >= 0.1
 
 
 def test_absent_sites_read_well() -> None:

@@ -1,6 +1,12 @@
 """Registering tasks and finding them."""
 
+import importlib
+import subprocess
+import sys
+from collections.abc import AsyncIterator, Callable, Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -60,6 +66,100 @@ def test_two_functions_cannot_share_a_name() -> None:
         @task("double", size=abs)
         def other(number: float) -> float:
             return number
+
+
+TWIN = """from offboard.common.tasks import task
+
+
+def times(number):
+    return {factor} * number
+
+
+@task("twin", size=float)
+def twin(number):
+    return times(number)
+"""
+
+
+def test_a_name_of_two_modules_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also if the source of both functions is the same: what they call may differ."""
+    for name, factor in (("twin_a", 2), ("twin_b", 3)):
+        (tmp_path / f"{name}.py").write_text(TWIN.format(factor=factor))
+    monkeypatch.syspath_prepend(tmp_path)
+    first = importlib.import_module("twin_a")
+    said = "task twin is registered twice, by twin_a.twin and by twin_b.twin; rename one of them"
+    with pytest.raises(ConfigError, match=said):
+        importlib.import_module("twin_b")
+    assert kind_named("twin").function is first.twin
+    again = importlib.reload(first)
+    assert kind_named("twin").function is again.twin
+
+
+def test_a_module_that_is_also_the_script_registers_its_tasks_twice(tmp_path: Path) -> None:
+    """It is the same file, so each name means the same function."""
+    main = "\nif __name__ == '__main__':\n    import script\n    print(script.twin(4), twin(5))\n"
+    (tmp_path / "script.py").write_text(TWIN.format(factor=2) + main)
+    root = Path(__file__).parents[2]
+    done = subprocess.run(
+        [sys.executable, "script.py"],
+        capture_output=True, text=True, cwd=tmp_path, env={"PYTHONPATH": str(root)},
+    )  # fmt: skip
+    assert (done.stdout, done.stderr) == ("8 10\n", "")
+
+
+class Engine:
+    factor = 2
+
+
+class OtherEngine:
+    factor = 3
+
+
+def test_the_source_hash_covers_the_setup() -> None:
+    """Robot and server compare what `setup` makes, not only the function."""
+
+    def run_engine(engine: Any, number: float) -> float:
+        return float(engine.factor * number)
+
+    hashes = []
+    for name, setup in (("engine_a", Engine), ("engine_b", OtherEngine), ("engine_c", Engine)):
+        task(name, size=float, setup=setup)(run_engine)
+        hashes.append(kind_named(name).source_hash)
+    assert hashes[0] == hashes[2] != hashes[1]
+
+
+@pytest.mark.parametrize("name", ["timeout_s", "where", "observe", "deadline_s", "function"])
+def test_a_parameter_cannot_have_the_name_of_an_option(name: str) -> None:
+    """The call would take its value for the option. The first parameter of a task with a setup may."""
+    code: dict[str, Any] = {}
+    exec(f"def alone({name}): ...\ndef second(number, {name}=1): ...\ndef many(*{name}): ...", code)
+    said = f"task optional: a parameter cannot be named {name!r}, an option of the call; rename it"
+    for function in (code["alone"], code["second"], code["many"]):
+        with pytest.raises(ConfigError) as caught:
+            task("optional", size=float)(function)
+        assert str(caught.value) == said
+    task(f"state_{name}", size=float, setup=dict)(code["alone"])
+
+
+async def later(number: float) -> float:
+    return number
+
+
+def one_by_one(number: float) -> Iterator[float]:
+    yield number
+
+
+async def later_one_by_one(number: float) -> AsyncIterator[float]:
+    yield number
+
+
+@pytest.mark.parametrize("function", [later, one_by_one, later_one_by_one, partial(later, 1.0)])
+@pytest.mark.parametrize("place", ["function", "size", "setup", "work", "warm"])
+def test_coroutine_and_generator_functions_are_refused(place: str, function: Callable[..., Any]) -> None:
+    """Calling one computes nothing, so every function of a task must be an ordinary one."""
+    given: dict[str, Any] = {"function": double, "size": float, place: function}
+    with pytest.raises(ConfigError, match=f"task lazy: {place} .* is a coroutine or generator function; "):
+        task("lazy", **{key: value for key, value in given.items() if key != "function"})(given["function"])
 
 
 def test_unknown_tasks_are_named() -> None:

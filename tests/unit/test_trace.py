@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -13,9 +14,10 @@ from pathlib import Path
 import pytest
 
 from offboard.common.errors import CloudTimeout, ConfigError, DataError
+from offboard.loadgen.robot_files import read_trace
 from offboard.robot_client.learning.regret import Regret
 from offboard.robot_client.policies import Decision, Hedge, Outlook
-from offboard.robot_client.records.trace import WAITING_MAX, Late, Record, Trace, read
+from offboard.robot_client.records.trace import WAITING_MAX, Late, Record, Trace
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution
 
 ROOT = Path(__file__).parents[2]
@@ -136,7 +138,7 @@ def test_a_torn_last_line_is_skipped_with_a_warning(tmp_path: Path, caplog: pyte
     with path.open("a") as file:
         file.write('{"v": 1, "i": 3, "id"')
     with caplog.at_level(logging.WARNING):
-        assert [fields["i"] for fields in read(path)] == [0, 1, 2]
+        assert [fields["i"] for fields in read_trace(path)] == [0, 1, 2]
     assert f"{path}:4: torn last line skipped" in caplog.text
 
 
@@ -147,7 +149,7 @@ def test_a_restarted_robot_appends_after_a_torn_line(tmp_path: Path) -> None:
     trace = Trace(path)
     trace.write(record(7))
     trace.close()
-    assert [fields["i"] for fields in read(path)] == [0, 7]
+    assert [fields["i"] for fields in read_trace(path)] == [0, 7]
 
 
 @pytest.mark.parametrize("text", ["my thesis", "my thesis\nchapter 1\n", '{"a": 1}'])
@@ -175,18 +177,18 @@ def test_any_other_bad_line_names_file_and_line(tmp_path: Path, line: str, messa
     with path.open("a") as file:
         file.write(line)
     with pytest.raises(DataError, match=f"{path}{message}"):
-        list(read(path))
+        list(read_trace(path))
 
 
 def test_a_missing_trace_is_an_error(tmp_path: Path) -> None:
     """The error names the file."""
     with pytest.raises(DataError, match=r"none\.jsonl: No such file"):
-        list(read(tmp_path / "none.jsonl"))
+        list(read_trace(tmp_path / "none.jsonl"))
 
 
 def test_a_trace_that_cannot_be_opened_is_a_config_error(tmp_path: Path) -> None:
     """A directory with the name of the trace is an error at start."""
-    with pytest.raises(ConfigError, match="Is a directory"):
+    with pytest.raises(ConfigError, match="is a folder, not a plain file"):
         Trace(tmp_path)
 
 
@@ -197,14 +199,19 @@ def test_a_full_disk_is_logged_and_tasks_go_on(tmp_path: Path, caplog: pytest.Lo
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 50, limits[1]))
     try:
-        trace.write(record(1))
-        trace.flush()
+        for i in (1, 2):
+            trace.write(record(i))
+        until_s = time.monotonic() + 5
+        while trace.lost < 2:
+            assert time.monotonic() < until_s
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert "task 1 lost (1 so far)" in caplog.text
-    trace.write(record(2))
+    trace.write(record(3))
     trace.close()
-    assert [fields["i"] for fields in read(path)] == [0, 2]
+    assert [fields["i"] for fields in read_trace(path)] == [0, 3]
+    logged = [one.getMessage() for one in caplog.records]
+    assert len(logged) == 1, "only the first loss is logged"
+    assert re.match(r"trace .*: a line is lost: (File too large|no space left)", logged[0])
 
 
 def test_a_closed_trace_ignores_records(tmp_path: Path) -> None:
@@ -215,7 +222,7 @@ def test_a_closed_trace_ignores_records(tmp_path: Path) -> None:
     trace.write(record(1))
     trace.close()
     assert trace.lost == 0
-    assert [fields["i"] for fields in read(trace.path)] == [0]
+    assert [fields["i"] for fields in read_trace(trace.path)] == [0]
 
 
 def test_records_are_written_in_the_background(tmp_path: Path) -> None:
@@ -223,14 +230,14 @@ def test_records_are_written_in_the_background(tmp_path: Path) -> None:
     trace = Trace(tmp_path / "trace.jsonl")
     for i in range(WAITING_MAX + 3):
         trace.write(record(i))
-    written = len(list(read(trace.path)))
+    written = len(list(read_trace(trace.path)))
     assert WAITING_MAX + 3 - written <= WAITING_MAX + 1, (
         "WAITING_MAX records may wait, and one may be half written"
     )
     until_s = time.monotonic() + 10
-    while len(list(read(trace.path))) < WAITING_MAX + 3:
+    while len(list(read_trace(trace.path))) < WAITING_MAX + 3:
         assert time.monotonic() < until_s
-    assert [fields["i"] for fields in read(trace.path)] == list(range(WAITING_MAX + 3))
+    assert [fields["i"] for fields in read_trace(trace.path)] == list(range(WAITING_MAX + 3))
     trace.close()
 
 
@@ -242,7 +249,7 @@ def test_a_program_that_does_not_close_the_trace_loses_nothing(tmp_path: Path) -
         f"trace = Trace(Path({str(path)!r})); trace.write(record(0)); trace.write(record(1))"
     )
     subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True)
-    assert [fields["i"] for fields in read(path)] == [0, 1]
+    assert [fields["i"] for fields in read_trace(path)] == [0, 1]
 
 
 def write(folder: Path, count: int) -> Path:

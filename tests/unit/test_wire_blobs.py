@@ -2,14 +2,17 @@
 
 import hashlib
 import weakref
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
 from offboard.common.errors import ProtocolError
+from offboard.common.planning.maps import GridMap
 from offboard.common.wire import blobs
 from offboard.common.wire import messages as wire
+from offboard.common.wire.blobs import Array
 from offboard.common.wire.messages import BlobStore, StoredBlob
 
 
@@ -70,8 +73,67 @@ def test_an_owner_with_many_blobs_loses_its_own() -> None:
     assert [store.bytes_of(owner) for owner in (b"good", b"greedy", b"late")] == [0, 0, 80]
 
 
-def test_the_hash_of_a_constant_array_is_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A read-only array is hashed once; a writeable array, or a view of one, is hashed each time."""
+def digest_of(array: Array) -> bytes:
+    """The name that an array gets as a blob."""
+    return next(iter(wire.encode(array, blobs=True).blobs))
+
+
+def frozen(array: Array) -> Array:
+    array.flags.writeable = False
+    return array
+
+
+def constant(value: float = 1.0) -> Array:
+    """An array on `bytes`, which nothing can change."""
+    return np.frombuffer(np.full(10_000, value).tobytes()).reshape(100, 100)
+
+
+def unlocked(base: Array) -> tuple[Array, Array]:
+    return frozen(base), base
+
+
+def older_view(base: Array) -> tuple[Array, Array]:
+    view = base[:]
+    return frozen(base), view
+
+
+def younger_view(base: Array) -> tuple[Array, Array]:
+    return frozen(base[:]), base
+
+
+def view_of_a_locked_owner(base: Array) -> tuple[Array, Array]:
+    return frozen(base)[:], base
+
+
+def buffer(base: Array) -> tuple[Array, Array]:
+    data = bytearray(base.tobytes())
+    return frozen(np.frombuffer(data)), np.frombuffer(data)
+
+
+def read_only_view_of_a_buffer(base: Array) -> tuple[Array, Array]:
+    data = bytearray(base.tobytes())
+    return np.frombuffer(memoryview(data).toreadonly()), np.frombuffer(data)
+
+
+WAYS = (unlocked, older_view, younger_view, view_of_a_locked_owner, buffer, read_only_view_of_a_buffer)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_read_only_array_that_changed_gets_another_name(
+    way: Callable[[Array], tuple[Array, Array]],
+) -> None:
+    """The array is locked when it is sent, both times, and its memory is changed in between."""
+    sent, same_memory = way(np.zeros(10_000))
+    assert np.shares_memory(sent, same_memory)
+    for value in (0.0, 7.0, 8.0):
+        if not same_memory.flags.writeable:
+            same_memory.flags.writeable = True
+        same_memory[:] = value
+        assert digest_of(frozen(sent)) == hashlib.sha256(np.full(10_000, value).tobytes()).digest()
+
+
+def test_only_an_array_on_bytes_is_hashed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing can change such an array, or a view of it. Every other array is hashed at each call."""
     hashed: list[int] = []
     real = hashlib.sha256
 
@@ -80,31 +142,22 @@ def test_the_hash_of_a_constant_array_is_computed_once(monkeypatch: pytest.Monke
         return real(data)
 
     monkeypatch.setattr(hashlib, "sha256", counting)
-    constant, base = np.arange(10_000.0), np.arange(10_000.0)
-    constant.flags.writeable = False
-    view = base[:]
-    view.flags.writeable = False
+    of_a_map = GridMap(np.zeros((300, 300), np.int8), 0.05).cells
     counts = []
-    for array in (constant, base, view):
+    for array in (constant(), constant()[:90], of_a_map, np.zeros(10_000), frozen(np.zeros(10_000))):
         hashed.clear()
-        digests = [next(iter(wire.encode(array, blobs=True).blobs)) for _ in range(3)]
-        assert set(digests) == {real(array.tobytes()).digest()}
+        assert {digest_of(array) for _ in range(3)} == {real(array.tobytes()).digest()}
         counts.append(len(hashed))
-    assert counts == [1, 3, 3]
-    base[0] = 7
-    assert next(iter(wire.encode(view, blobs=True).blobs)) == real(base.tobytes()).digest()
+    assert counts == [1, 1, 1, 3, 3]
 
 
 def test_the_hash_cache_does_not_keep_arrays_alive() -> None:
     """An array is freed although its hash was cached, and a new array is hashed anew."""
-    array = np.arange(10_000.0)
-    array.flags.writeable = False
-    wire.encode(array, blobs=True)
+    array = constant()
+    digest_of(array)
     gone = weakref.ref(array)
     del array
     assert gone() is None
     for n in range(20):  # some of these arrays get the id of an earlier one
-        fresh = np.full(10_000, float(n))
-        fresh.flags.writeable = False
-        digest = hashlib.sha256(fresh.tobytes()).digest()
-        assert list(wire.encode(fresh, blobs=True).blobs) == [digest]
+        fresh = constant(float(n))
+        assert digest_of(fresh) == hashlib.sha256(fresh.tobytes()).digest()

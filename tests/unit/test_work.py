@@ -10,11 +10,11 @@ import pytest
 from offboard.common.errors import ConfigError, DataError
 from offboard.common.planning.planner import Plan, plan_path, size_of_plan
 from offboard.common.planning.planner_names import PLANNERS
+from offboard.loadgen.robot.answers import cells_of
+from offboard.loadgen.robot.config import CallConfig, DriveConfig
+from offboard.loadgen.robot.work import Work, make_work
 from offboard.loadgen.scenario.hash_tasks import MUCH, RARE, hash_rarely_long, hash_rounds, rounds_on
 from offboard.loadgen.testbed.testbed import PART
-from offboard.robot_client.simulated.answers import cells_of
-from offboard.robot_client.simulated.config import CallConfig, DriveConfig
-from offboard.robot_client.simulated.work import Work, make_work
 from tests import probes
 from tests.mazes import warm
 
@@ -134,7 +134,7 @@ def test_calls_get_whole_sizes() -> None:
 
 
 def test_a_task_with_a_setup_is_called_with_its_size_alone() -> None:
-    """Its first parameter is not for callers, so `robot-client call` takes it as a task of one number."""
+    """Its first parameter is not for callers, so `loadgen call` takes it as a task of one number."""
     assert calls("constant:2", task="tests.stateful_tasks:engine_twice").request() == (2,)
 
 

@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from offboard.common.errors import ConfigError, DataError
-from offboard.robot_client.simulated.workload import (
+from offboard.loadgen.robot.workload import (
     BURSTS,
     CONSTANT,
     POISSON,

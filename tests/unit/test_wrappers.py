@@ -6,6 +6,7 @@ import pytest
 
 from offboard.robot_client import policies
 from offboard.robot_client.policies import Forecast, Hedge, Outlook, Probe
+from offboard.robot_client.policies.forecast import SPREADS_90
 from offboard.robot_client.policies.probe import PROBE_EVERY
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.outlooks import UNKNOWN, decide, known
@@ -45,12 +46,12 @@ def test_busy_and_silent_sites_are_not_probed(fields: dict[str, Any]) -> None:
     assert decide("probe:greedy", sites).second is None
 
 
-def test_with_few_errors_a_hedge_starts_two_spreads_late() -> None:
-    """The cheapest other site starts when the task is two spreads later than its prediction."""
+def test_with_few_errors_a_hedge_starts_when_95_percent_would_have_ended() -> None:
+    """The cheapest other site starts SPREADS_90 spreads after the predicted time."""
     sites = {ONBOARD: known(0.5), CLOUD: known(0.2, spread_s=0.03), EDGE: known(0.4)}
     decision = decide("hedge:greedy", sites)
     assert decision.site == CLOUD
-    assert decision.second == Hedge(EDGE, pytest.approx(0.2 + 2 * 0.03))
+    assert decision.second == Hedge(EDGE, pytest.approx(0.2 + SPREADS_90 * 0.03))
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,9 @@ from typing import Any
 from offboard.common.errors import ConfigError
 from offboard.common.tasks import Kind, Size, kind_of
 from offboard.common.wire import messages as wire
+from offboard.loadgen.robot.work import make_work
 from offboard.loadgen.scenario.scenario import Workload
 from offboard.loadgen.simulation.model.task_costs import COSTS, PARTS, PLANS, ROUNDS, Cost
-from offboard.robot_client.simulated.work import make_work
 
 HASH_BYTES = bytes(32)  # as long as the answers of offboard.loadgen.scenario.hash_tasks
 OTHERS_TASKS_MAX = 50  # tasks of each other robot, which repeats them

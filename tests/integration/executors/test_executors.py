@@ -13,7 +13,9 @@ import pytest
 
 from offboard.cloud_server.executors import EXECUTORS, Executor
 from offboard.cloud_server.task_run import Call, Outcome
+from offboard.common.wire.values import encode
 from tests.executor_tasks import WAIT_S, call, run, value
+from tests.wire_values import Pose
 
 pytestmark = pytest.mark.integration
 
@@ -41,8 +43,9 @@ def test_a_task_runs_and_its_result_comes_back(executor: Executor) -> None:
         (
             "exec_object",
             [],
-            "BadValue: a value of type builtins.object cannot be sent; ",
+            "BadValue: result: a value of type builtins.object cannot be sent; ",
         ),
+        ("exec_deep", [], "BadValue: result['a'][1]: a value of type builtins.object cannot be sent; "),
         ("exec_echo", [1, 2], "TypeError: exec_echo() takes 1 positional argument but 2 were given"),
         ("exec_unheard_of", [], "UnknownTask: no task named 'exec_unheard_of'; known:"),
     ],
@@ -54,14 +57,23 @@ def test_what_a_task_raises_is_its_outcome(
     outcome = run(executor, kind, *args)
     assert outcome.status == "failed"
     assert outcome.error.startswith(error)
+    of_the_values = error.startswith(("BadValue", "UnknownTask"))
+    assert outcome.server_fault == of_the_values
+    assert bool(outcome.traceback) != of_the_values
     assert value(run(executor, "exec_echo", 1)) == 1
 
 
-@pytest.mark.parametrize("frames", [[b"\xc1"], [b"\x01"], [b"\x91\xd7\x01\x93\x01\xa3<i2\x91\x02"], []])
-def test_a_malformed_body_is_a_failure(executor: Executor, frames: list[bytes]) -> None:
-    """Bytes that are no list of arguments fail with a ProtocolError; no worker is lost."""
-    outcome = executor.submit(Call("exec_echo", frames), lambda _: None).result(WAIT_S)
+OTHER_FIELDS = bytes(encode([Pose(1, 2, [])], [Pose]).frames[0])  # here, Pose has x only
+
+
+@pytest.mark.parametrize(
+    "frames", [[b"\xc1"], [b"\x01"], [b"\x91\xd7\x01\x93\x01\xa3<i2\x91\x02"], [], [OTHER_FIELDS]]
+)
+def test_a_malformed_body_is_a_fault_of_the_server(executor: Executor, frames: list[bytes]) -> None:
+    """Bytes that this side cannot read may be right for the robot, so onboard answers; no worker is lost."""
+    outcome = executor.submit(Call("exec_pose", frames), lambda _: None).result(WAIT_S)
     assert (outcome.status, outcome.error.split(":")[0]) == ("failed", "ProtocolError")
+    assert outcome.server_fault
     assert executor.up == executor.workers
 
 

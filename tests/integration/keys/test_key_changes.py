@@ -1,8 +1,12 @@
 """Keys that are added, removed or changed while the server runs (docs/security.md), with real processes."""
 
 import os
+import resource
+import socket
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 
 import httpx
@@ -21,6 +25,8 @@ from tests.probes import echo
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(90)]
 
 CUT_S = 5.0  # a robot whose key was removed is cut off within this time
+FREE_FILES = 20
+FLOOD_S = 4.0  # the server looks at its folder of keys four times
 PAUSE_S = 0.002  # between tasks, so that a robot stays within its quota of messages
 
 
@@ -40,6 +46,29 @@ def test_a_removed_robot_is_cut_off(keys: Keys, serve: Serve, robot: Robot) -> N
     assert other.last is not None
     assert other.last.used == "cloud"
     assert other.last.executions[0].ok
+
+
+def test_a_server_without_a_free_file_keeps_its_robots(keys: Keys, serve: Serve, robot: Robot) -> None:
+    """If connections take all files, known robots are served on, and new ones once there are files again."""
+    served = serve(keys)
+    pid = served.process.pid
+    offload, late_key = robot(served.endpoint, keys.add("early")), keys.add("late")
+    assert offload.wait_for_sites(echo, WAIT_S) == {}
+    limit = FREE_FILES + sum(1 for _ in Path(f"/proc/{pid}/fd").iterdir())
+    resource.prlimit(pid, resource.RLIMIT_NOFILE, (limit, limit))
+    with ExitStack() as flood:
+        for _ in range(4 * FREE_FILES):
+            flood.enter_context(socket.create_connection(("127.0.0.1", served.port)))
+        end_s = time.monotonic() + FLOOD_S
+        while time.monotonic() < end_s:
+            assert offload(echo, 1) == 1
+            assert offload.last is not None
+            assert offload.last.used == "cloud", served.lines
+            time.sleep(PAUSE_S)
+    late = robot(served.endpoint, late_key)
+    assert late.wait_for_sites(echo, WAIT_S) == {}
+    keys.remove("early")
+    until(lambda: why_not(offload), within_s=CUT_S)
 
 
 def test_a_removed_robot_gets_no_answer(keys: Keys, serve: Serve, tmp_path: Path) -> None:

@@ -56,11 +56,11 @@ def test_a_private_key_that_others_may_use_is_refused(keys: Keys, tmp_path: Path
     for package, flags, flag, path in (
         ("cloud_server", ["--keys", keys.server], "--keys", keys.server / f"server{PRIVATE}"),
         ("cloud_server", ["--token-file", token], "--token-file", token),
-        ("robot_client", [*nap_flags, "--keys", robot], "--keys", robot / f"robot{PRIVATE}"),
+        ("loadgen", [*nap_flags, "--keys", robot], "--keys", robot / f"robot{PRIVATE}"),
     ):
         done = run(package, *map(str, flags))
         assert done.returncode == 2
-        prog = package.replace("_", "-") + (" call" if package == "robot_client" else "")
+        prog = package.replace("_", "-") + (" call" if package == "loadgen" else "")
         assert done.stderr == (
             f"{prog}: {flag}: {path} has mode {mode:04o}, so other users may access it: chmod 600 {path}\n"
         )

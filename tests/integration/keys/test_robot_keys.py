@@ -137,7 +137,7 @@ def test_each_site_has_its_own_server_key(keys: Keys, serve: Serve, tmp_path: Pa
 
 
 def test_the_robot_command_takes_keys(keys: Keys, serve: Serve, tmp_path: Path) -> None:
-    """`robot-client` takes its keys from ROBOT_KEYS as from --keys, and its tasks run in the cloud."""
+    """`loadgen call` takes its keys from ROBOT_KEYS as from --keys, and its tasks run in the cloud."""
     served = serve(keys)
     folder, answers = keys.add("arm"), tmp_path / "trace.jsonl"
     flags = [
@@ -152,6 +152,6 @@ def test_the_robot_command_takes_keys(keys: Keys, serve: Serve, tmp_path: Path) 
         "3",
     ]
     flags += ["--cloud", served.endpoint, "--trace", str(answers)]
-    done = run("robot_client", *flags, ROBOT_KEYS=str(folder))
+    done = run("loadgen", *flags, ROBOT_KEYS=str(folder))
     assert done.returncode == 0, done.stderr
     assert answers.read_text().count('"used":"cloud"') == 3, answers.read_text()

@@ -57,13 +57,13 @@ def test_failed_and_unknown_tasks_are_answered(serve: Serve, join: Join, executo
 @pytest.mark.parametrize("where", ["cloud", "onboard"])
 @pytest.mark.parametrize("executor", sorted(EXECUTORS))
 def test_a_failed_task_comes_with_its_traceback(serve: Serve, executor: str, where: str) -> None:
-    """It begins in the function of the task; the error itself keeps its text."""
+    """It begins in the function of the task; the error has the text and the name of the task."""
     running, function = serve(executor), kind_named("served_raise").function
     with Offloader.connect(running.server.endpoint) as offload:
         assert not offload.wait_for_sites(function, WAIT_S)
         with pytest.raises(TaskFailed) as caught:
             offload(function, "no such place", where=where)
-    assert str(caught.value) == "ValueError: no such place"
+    assert str(caught.value) == "task served_raise: ValueError: no such place"
     first, place, *_, last = caught.value.traceback.splitlines()
     assert first == "Traceback (most recent call last):"
     assert "served_tasks.py" in place

@@ -13,14 +13,14 @@ from typing import Any
 from offboard.common.errors import TaskError
 from offboard.common.task_states import TaskStates
 from offboard.common.tasks import kind_of
+from offboard.loadgen.robot.config import RobotConfig
+from offboard.loadgen.robot.summary import describe, show_progress
+from offboard.loadgen.robot.work import Work
+from offboard.loadgen.robot_files import read_fields
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import BOTH
-from offboard.robot_client.records import lines
 from offboard.robot_client.records.lines import VERSION, Lines
 from offboard.robot_client.records.trace import Record
-from offboard.robot_client.simulated.config import RobotConfig
-from offboard.robot_client.simulated.summary import describe, show_progress
-from offboard.robot_client.simulated.work import Work
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 WAYS = (ONBOARD, CLOUD, BOTH)
@@ -116,8 +116,8 @@ def measure_alone(config: RobotConfig, work: Work, offload: Offloader, say: Call
 
 
 def read(path: Path) -> Iterator[dict[str, Any]]:
-    """The fields of each line, as `trace.read` returns them."""
-    return lines.read(path, _FIELDS)
+    """The fields of each line, as `read_trace` returns them."""
+    return read_fields(path, _FIELDS)
 
 
 def orders(count: int, seed: int, ways: Sequence[str]) -> list[tuple[str, ...]]:

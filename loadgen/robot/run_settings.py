@@ -5,7 +5,7 @@ from pathlib import Path
 
 from offboard.common.config import setting
 from offboard.common.errors import ConfigError
-from offboard.robot_client.simulated.workload import ARRIVALS, CLOSED
+from offboard.loadgen.robot.workload import ARRIVALS, CLOSED
 
 TASKS_DEFAULT = 200
 TASKS, ARRIVING, MEASURING, OUTPUT = "tasks", "arrivals", "measurement", "output"
@@ -107,6 +107,8 @@ class RunSettings:
                     raise ConfigError(f"--{flag}: {getattr(self, flag)} needs --{needed}")
         if self.arrivals != CLOSED:
             self._check_open()
+        elif self.rate is not None:
+            raise ConfigError(f"--rate: {self.rate:g} needs --arrivals, which is {CLOSED} otherwise")
 
     def _check_open(self) -> None:
         if self.rate is None:

@@ -13,7 +13,7 @@ from offboard.common.planning.grid_kernels import covered
 from offboard.common.planning.maps import OCCUPIED, GridMap, largest_component, passable, path_size
 from offboard.common.planning.planner import RADIUS_CELLS_MAX, RADIUS_M, Plan, Point, Pose, Scan, scan_hits
 from offboard.common.planning.planner_names import DIJKSTRA
-from offboard.robot_client.simulated.lidar import BEAMS, RANGE_MAX_M, cast_scan
+from offboard.loadgen.robot.lidar import BEAMS, RANGE_MAX_M, cast_scan
 
 OBSTACLE_SIDE_M = (0.3, 1.0)
 LOOK_EVERY_M = 0.5

@@ -7,14 +7,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from offboard.robot_client.simulated import answers
-from offboard.robot_client.simulated.calls import make_calls
-from offboard.robot_client.simulated.config import CallConfig, DriveConfig, RobotConfig
-from offboard.robot_client.simulated.workload import parse_sizes, sizes
+from offboard.loadgen.robot import answers
+from offboard.loadgen.robot.calls import make_calls
+from offboard.loadgen.robot.config import CallConfig, DriveConfig, RobotConfig
+from offboard.loadgen.robot.workload import parse_sizes, sizes
 
 if TYPE_CHECKING:  # importing the planner compiles it, which only a run on a map needs
     from offboard.common.planning.maps import GridMap
-    from offboard.robot_client.simulated.robot import SimulatedRobot
+    from offboard.loadgen.robot.robot import SimulatedRobot
 
 
 class Work(Protocol):
@@ -85,7 +85,7 @@ def make_work(config: RobotConfig) -> Work:
     """The work that the settings ask for; a ConfigError or DataError if it cannot be made."""
     if isinstance(config, CallConfig):
         return make_calls(config)
-    from offboard.robot_client.simulated.robot import SimulatedRobot
+    from offboard.loadgen.robot.robot import SimulatedRobot
 
     assert isinstance(config, DriveConfig)
     wanted = sizes(parse_sizes(config.sizes), config.seed) if config.sizes else None

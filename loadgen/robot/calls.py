@@ -8,11 +8,11 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from offboard.common.errors import ConfigError, MissingExtra, OffloadError, describe
+from offboard.common.errors import BadValue, ConfigError, MissingExtra, OffloadError, describe, of_task
 from offboard.common.tasks import Kind, kind_of, load_modules
-from offboard.robot_client.simulated import answers
-from offboard.robot_client.simulated.config import CallConfig
-from offboard.robot_client.simulated.workload import parse_sizes, sizes
+from offboard.loadgen.robot import answers
+from offboard.loadgen.robot.config import CallConfig
+from offboard.loadgen.robot.workload import parse_sizes, sizes
 
 NAMED = "MODULE:FUNCTION"
 SAME = "same"  # function of a task's module: whether two answers are equal within its tolerance
@@ -83,13 +83,9 @@ def make_calls(config: CallConfig) -> Calls:
     _check_repeats(config, kind)
     try:
         kind.size_of(kind.bind(calls.request(), {}))
-    except OffloadError:
-        raise
-    except Exception as error:
-        raise ConfigError(
-            f"{flag}: the size function of task {kind.name} does not take the first argument: "
-            f"{describe(error)}{'' if config.inputs else '; use --inputs for arguments that are no numbers'}"
-        ) from error
+    except (BadValue, TypeError) as error:
+        hint = "" if config.inputs else "; use --inputs for arguments that are no numbers"
+        raise ConfigError(f"{flag}: {of_task(kind.name, str(error))}{hint}") from error
     return calls
 
 

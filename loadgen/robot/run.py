@@ -17,16 +17,16 @@ from offboard.common import errors
 from offboard.common.errors import ConfigError, TaskError
 from offboard.common.host import cpu_time
 from offboard.common.tasks import kind_of
+from offboard.loadgen.robot.answers import Answered, Answers
+from offboard.loadgen.robot.calls import InputsEnded
+from offboard.loadgen.robot.config import RobotConfig
+from offboard.loadgen.robot.references import References
+from offboard.loadgen.robot.summary import Summary, describe, end_progress, show_progress
+from offboard.loadgen.robot.work import Work
+from offboard.loadgen.robot.workload import CLOSED, due_instants
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import BOTH
 from offboard.robot_client.records.trace import Record
-from offboard.robot_client.simulated.answers import Answered, Answers
-from offboard.robot_client.simulated.calls import InputsEnded
-from offboard.robot_client.simulated.config import RobotConfig
-from offboard.robot_client.simulated.references import References
-from offboard.robot_client.simulated.summary import Summary, describe, end_progress, show_progress
-from offboard.robot_client.simulated.work import Work
-from offboard.robot_client.simulated.workload import CLOSED, due_instants
 
 MADE_MAX = 32  # tasks that are made ahead and wait for their instant
 MADE_FIRST_MAX = 1000  # tasks that are made before the first one starts, if none depends on an answer

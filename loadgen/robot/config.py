@@ -1,4 +1,4 @@
-"""The settings of `robot-client drive` and `robot-client call`: those that both have, and those of each."""
+"""The settings of `loadgen drive` and `loadgen call`: those that both have, and those of each."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,12 +6,75 @@ from pathlib import Path
 from offboard.common.config import REQUIRED, check, setting
 from offboard.common.errors import ConfigError
 from offboard.common.planning.planner_names import DIJKSTRA, PLANNERS
-from offboard.robot_client.simulated.decision_settings import DecisionSettings
-from offboard.robot_client.simulated.run_settings import RunSettings
-from offboard.robot_client.simulated.server_settings import ServerSettings
-from offboard.robot_client.simulated.workload import CLOSED, SIZES_ALLOWED, parse_sizes
+from offboard.loadgen.robot.decision_settings import DecisionSettings
+from offboard.loadgen.robot.run_settings import RunSettings
+from offboard.loadgen.robot.workload import CLOSED, SIZES_ALLOWED, parse_sizes
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, TIMEOUT_S, check_endpoint
 
-PLANS, CALLS = "map and robot", "task"
+SERVERS, PLANS, CALLS = "servers", "map and robot", "task"
+
+
+@dataclass(frozen=True)
+class ServerSettings:
+    """Which servers the robot may use, and how long it waits for them."""
+
+    cloud: str | None = setting(
+        None,
+        "server to use; without any server, all tasks run onboard",
+        group=SERVERS,
+        metavar="tcp://HOST:PORT",
+    )
+    site: tuple[str, ...] = setting(
+        (),
+        "a further server, with a name; repeat the flag for more",
+        group=SERVERS,
+        rare=True,
+        metavar="NAME=ENDPOINT",
+    )
+    keys: Path | None = setting(
+        None,
+        "folder with robot.key_secret (made by `robot-client keys`) and server.key (copied from the server; "
+        "NAME.key for the server of --site NAME); without it, nothing is encrypted",
+        group=SERVERS,
+        metavar="DIR",
+    )
+    timeout_s: float = setting(
+        TIMEOUT_S,
+        "time to wait for an answer of a server before the task runs onboard, in seconds",
+        group=SERVERS,
+        name="timeout",
+        minimum=0.001,
+        maximum=3600,
+    )
+    connect_s: float = setting(
+        10.0,
+        "time to wait for the servers at start, in seconds",
+        group=SERVERS,
+        rare=True,
+        name="connect",
+        minimum=0.0,
+        maximum=3600,
+    )
+
+    def check_servers(self) -> None:
+        if self.cloud is not None:
+            check_endpoint("--cloud", self.cloud)
+        if self.keys is not None and self.cloud is None and not self.site:
+            raise ConfigError(f"--keys: {self.keys} needs --cloud, the server to use")
+        self.sites()
+
+    def sites(self) -> dict[str, str]:
+        """The endpoint of each --site, by its name."""
+        found: dict[str, str] = {}
+        for entry in self.site:
+            name, equals, endpoint = entry.partition("=")
+            if not (equals and name.isidentifier()):
+                raise ConfigError(f"--site: {entry!r} is not NAME=tcp://HOST:PORT")
+            if name in (ONBOARD, CLOUD, *found):
+                raise ConfigError(f"--site: {entry!r}: the name {name!r} is already taken")
+            check_endpoint(f"--site {name}", endpoint)
+            found[name] = endpoint
+        return found
 
 
 # The help shows the fields of the last base class first.
@@ -81,7 +144,7 @@ class MapSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class DriveConfig(RobotConfig, MapSettings):
-    """The settings of `robot-client drive`: a simulated robot asks for plans on a map."""
+    """The settings of `loadgen drive`: a simulated robot asks for plans on a map."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -122,7 +185,7 @@ class TaskSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class CallConfig(RobotConfig, TaskSettings):
-    """The settings of `robot-client call`: any task, called with numbers or with inputs."""
+    """The settings of `loadgen call`: any task, called with numbers or with inputs."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from offboard.common.errors import DataError, ProtocolError
 from offboard.common.wire.values import decode, encode
-from offboard.robot_client.records import lines
+from offboard.loadgen.robot_files import read_fields
 from offboard.robot_client.records.lines import VERSION, Lines
 
 if TYPE_CHECKING:  # importing the planner compiles it, which a robot without a map does not need
@@ -89,8 +89,8 @@ class Answers:
 
 
 def read(path: Path) -> Iterator[dict[str, Any]]:
-    """The fields of each line, as `trace.read` returns them; `i` is checked to be a whole number from 0."""
-    for fields in lines.read(path, _FIELDS):
+    """The fields of each line, as `read_trace` returns them; `i` is checked to be a whole number from 0."""
+    for fields in read_fields(path, _FIELDS):
         if type(fields["i"]) is not int or fields["i"] < 0:
             raise DataError(f"{path}: i = {json.dumps(fields['i'])} is not a task number")
         yield fields

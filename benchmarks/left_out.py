@@ -1,0 +1,301 @@
+"""The parts model without one of its mechanisms: a class for each, named after what is left out.
+
+Each class is the name of a predictor, as in `loadgen run calm --predictor benchmarks.left_out.Tail`.
+`ablations` measures what leaving them out costs.
+"""
+
+import math
+from typing import Any
+
+from offboard.robot_client.predictors.base import Prediction
+from offboard.robot_client.predictors.line import (
+    ODD,
+    PACE,
+    RATE,
+    SHAPE,
+    TAIL_MAX,
+    Line,
+)
+from offboard.robot_client.predictors.parts import Parts
+from offboard.robot_client.sites.runner import UNMEASURED, Condition
+
+
+class Switched(Line):
+    """A line whose rules can be switched off; with all of them it is the same as `Line`."""
+
+    pace = PACE
+    shape = SHAPE
+    outliers = True  # a time beyond the reach counts only up to it
+    good_news = True  # one outlier below the line is a change
+    bad_news = True  # two outliers above it are one
+    doubling = True  # a change at most doubles the time
+
+    def learn(self, x: float, y: float, known: float = 0.0, ahead: int = 1) -> None:
+        self.count += 1
+        if self.count == 1:
+            self._begin(x, y, known)
+            return
+        rate = max(RATE, 1.0 / self.count)
+        error = y - self.a - self.b * x
+        unit = 0.5 * (max(0.0, self.a + self.b * x + known) + self._usual) or 1.0
+        self._usual += rate * (min(y + known, ODD * self._usual) - self._usual)
+        self._loosen(self.pace * self.pace * ahead, known)
+        if self._together:
+            shape = (self.shape * (self.a + self.b)) ** 2
+            self._paa += shape
+            self._pbb += shape
+        variance, reach = self._reach(x, unit)
+        side = math.copysign(1.0, error) if abs(error) > reach else 0.0
+        changed = self._is_change(side)
+        if changed:
+            error = min(error, unit) if self.doubling else error
+            self._loosen(min(1.0, (error / unit) ** 2), known)
+            variance, reach = self._reach(x, unit)
+        self._side = side
+        beyond = min(max(0.0, error - reach) / unit, TAIL_MAX)
+        self._tail += rate * (beyond - self._tail)
+        if not changed:
+            seen = max(0.0, min(error * error, 0.5 * reach * reach) - variance) / (unit * unit)
+            self._noise += rate * (seen - self._noise)
+        self._correct(x, max(-reach, min(reach, error)), unit)
+
+    def _is_change(self, side: float) -> bool:
+        again = side != 0 and side == self._side
+        return (self.good_news and side < 0) or (self.bad_news and again)
+
+    def _reach(self, x: float, unit: float) -> tuple[float, float]:
+        variance, reach = super()._reach(x, unit)
+        return variance, reach if self.outliers else math.inf
+
+
+class _WithoutPace(Switched):
+    pace = 0.0
+
+
+class _WithoutShape(Switched):
+    shape = 0.0
+
+
+class _WithoutOutliers(Switched):
+    outliers = False
+
+
+class _WithoutGoodNews(Switched):
+    good_news = False
+
+
+class _WithoutBadNews(Switched):
+    bad_news = False
+
+
+class _WithoutChange(Switched):
+    good_news = bad_news = False
+
+
+class _WithoutDoubling(Switched):
+    doubling = False
+
+
+class _WithoutTail(Line):
+    @property
+    def tail(self) -> float:
+        return 0.0
+
+
+class _WithoutFirstSlope(Line):
+    def _begin(self, x: float, y: float, known: float) -> None:
+        self.slope = None
+        super()._begin(x, y, known)
+
+
+class _WithoutStaleness(Line):
+    def learn(self, x: float, y: float, known: float = 0.0, ahead: int = 1) -> None:  # noqa: ARG002
+        super().learn(x, y, known)
+
+
+class _WithoutLoadedShape(Line):
+    def begin_as(self, other: Line, x: float, y: float) -> None:  # noqa: ARG002
+        self.learn(x, y)
+
+
+class Pace(Parts):
+    """A site does not become slower or faster as a whole."""
+
+    LINE = _WithoutPace
+
+
+class Shape(Parts):
+    """Intercept and slope of a run do not change apart from each other."""
+
+    LINE = _WithoutShape
+
+
+class Outliers(Parts):
+    """A plain Kalman filter: no outlier is clipped, none is a change, and there is no tail."""
+
+    LINE = _WithoutOutliers
+
+
+class GoodNews(Parts):
+    """An outlier below the line is a change only the second time."""
+
+    LINE = _WithoutGoodNews
+
+
+class BadNews(Parts):
+    """Outliers above the line are never a change."""
+
+    LINE = _WithoutBadNews
+
+
+class Change(Parts):
+    """No outlier is a change."""
+
+    LINE = _WithoutChange
+
+
+class Doubling(Parts):
+    """A change may more than double the time."""
+
+    LINE = _WithoutDoubling
+
+
+class Tail(Parts):
+    """What outliers take beyond the reach is not predicted."""
+
+    LINE = _WithoutTail
+
+
+class FirstSlope(Parts):
+    """The first answer says as much about the bandwidth of the link as about its delay."""
+
+    LINE = _WithoutFirstSlope
+
+
+class Staleness(Parts):
+    """A line that had no news for many tasks is as certain as before."""
+
+    LINE = _WithoutStaleness
+
+
+class LoadedShape(Parts):
+    """The line of runs under load begins as any other line (`Line.begin_as`)."""
+
+    LINE = _WithoutLoadedShape
+
+
+class Load(Parts):
+    """Runs while other programs take the CPU are learned with all others."""
+
+    def _load(self, condition: Condition) -> float:  # noqa: ARG002
+        return 0.0
+
+
+class Heed(Parts):
+    """A new round trip does not explain what the last answers took beyond the old one."""
+
+    def _heed(self, round_trip_s: float | None) -> None:
+        pass
+
+
+class Bound(Parts):
+    """An answer that the robot may have read late counts as any other one."""
+
+    def learn(self, size: float, seconds: float, ahead: int = 1, **more: Any) -> None:
+        super().learn(size, seconds, ahead, **{**more, "bound": False})
+
+
+class Late(Parts):
+    """A run that was given up after its predicted time says nothing."""
+
+    def learn_late(self, size: float, seconds: float, ahead: int, **more: Any) -> None:
+        pass
+
+
+class Work(Parts):
+    """The sites learn seconds per size, also of kinds whose results tell their work."""
+
+    per_work = False
+
+
+class _Without(Parts):
+    """Parts that does not get some of what is told of a task; `_told` says what is left of it."""
+
+    def _told(self, **more: Any) -> dict[str, Any]:
+        raise NotImplementedError
+
+    def predict(self, size: float, ahead: int = 1, **more: Any) -> Prediction | None:
+        return super().predict(size, ahead, **self._told(**more))
+
+    def learn(self, size: float, seconds: float, ahead: int = 1, **more: Any) -> None:
+        super().learn(size, seconds, ahead, **self._told(**more))
+
+    def learn_late(self, size: float, seconds: float, ahead: int, **more: Any) -> None:
+        super().learn_late(size, seconds, ahead, **self._told(**more))
+
+
+class Payload(_Without):
+    """All tasks move the same bytes."""
+
+    def _told(self, **more: Any) -> dict[str, Any]:
+        return {**more, "moved": 0.0}
+
+
+class _WithoutCondition(_Without):
+    def _seen(self, condition: Condition) -> Condition:
+        raise NotImplementedError
+
+    def _told(self, **more: Any) -> dict[str, Any]:
+        return {**more, "condition": self._seen(more.get("condition", UNMEASURED))}
+
+
+class Capacity(_WithoutCondition):
+    """The share of a CPU that a task may use is not known."""
+
+    def _seen(self, condition: Condition) -> Condition:
+        return condition._replace(capacity=1.0)
+
+
+class Queue(_WithoutCondition):
+    """The tasks that wait at a server are not known."""
+
+    def _seen(self, condition: Condition) -> Condition:
+        return condition._replace(queue=0)
+
+
+class RoundTrip(_WithoutCondition):
+    """The round trip of the heartbeats is not known; their silence is."""
+
+    def _seen(self, condition: Condition) -> Condition:
+        return condition._replace(round_trip_s=None)
+
+
+class NetworkLine(Parts):
+    """One line for all that a task takes beyond its queue and the round trip: run and network together."""
+
+    def learn(self, size: float, seconds: float, ahead: int = 1, **more: Any) -> None:
+        alone_s = max(0.0, seconds - (more.get("queue_s") or 0.0)) if self.remote else seconds
+        super().learn(size, alone_s, ahead, condition=more["condition"])
+
+    def learn_late(self, size: float, seconds: float, ahead: int, **more: Any) -> None:
+        condition: Condition = more["condition"]
+        if self.remote:
+            waited_s = condition.queue * self._usual_run.value + (condition.round_trip_s or 0.0)
+            seconds = max(0.0, seconds - waited_s)
+        self._learn_run(size, seconds, condition, ahead)
+
+
+class AllParts(Parts):
+    """One line on the total seconds: no network, no queue and no round trip."""
+
+    def predict(self, size: float, ahead: int = 1, **more: Any) -> Prediction | None:
+        return super().predict(size, ahead, condition=self._alone(more["condition"]))
+
+    def learn(self, size: float, seconds: float, ahead: int = 1, **more: Any) -> None:
+        super().learn(size, seconds, ahead, condition=self._alone(more["condition"]))
+
+    def learn_late(self, size: float, seconds: float, ahead: int, **more: Any) -> None:
+        self._learn_run(size, seconds, self._alone(more["condition"]), ahead)
+
+    def _alone(self, condition: Condition) -> Condition:
+        return condition._replace(round_trip_s=None, queue=0)

@@ -1,0 +1,142 @@
+"""The commands `loadgen drive` and `loadgen call`: builds what a run needs, runs it and closes its files.
+
+The settings are read in `__main__`; the tasks are asked for in `run`.
+"""
+
+import gc
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from typing import Any
+
+from offboard.common.config import as_dict
+from offboard.common.errors import ConfigError, OffloadError
+from offboard.common.task_states import TaskStates
+from offboard.loadgen.robot.answers import Answers
+from offboard.loadgen.robot.config import DriveConfig, RobotConfig
+from offboard.loadgen.robot.references import References, measure_alone
+from offboard.loadgen.robot.run import OwnRecord, Run
+from offboard.loadgen.robot.work import Work, make_work
+from offboard.loadgen.robot_files import alone_path, reference_path
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.records.lines import Lines
+from offboard.robot_client.records.trace import Record, Trace
+from offboard.robot_client.settings import Settings
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
+
+log = logging.getLogger(__name__)
+
+Observer = Callable[[Record], None]
+
+
+def run_robot(config: RobotConfig) -> int:
+    """Run the tasks, then measure those of --alone."""
+    logging.basicConfig(level=config.log.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    log.info("settings: %s", as_dict(config))
+    answers = Answers(config.answers) if config.answers else None
+    if answers and answers.done and isinstance(config, DriveConfig) and not config.jump:
+        raise ConfigError(
+            f"--answers: {answers.path} holds {len(answers.done)} answers; going on after them needs --jump"
+        )
+    trace = Trace(config.trace) if config.trace else None
+    alone = Trace(alone_path(config.trace)) if config.trace and config.alone else None
+    files: list[Answers | Lines] = [file for file in (answers, trace) if file]
+    try:
+        observers: list[Observer] = [*([trace.write] if trace else []), *_metrics(config, trace)]
+        work, states = make_work(config), TaskStates(workers=1)  # shared, so that each setup runs once
+        _run_tasks(config, work, states, answers, observers=observers, files=files)
+        if alone:
+            # With its own offloader: what the run learns, records and counts is about the run only.
+            with _connect(config, states=states, observers=[alone.write]) as offload:
+                _warn_of_absent("measuring", offload.wait_for_sites(work.function, config.connect_s))
+                measure_alone(config, work, offload, print)
+    finally:
+        files += [alone] if alone else []
+        for file in files:
+            file.close()
+    for file in files:
+        if file.lost:
+            raise OffloadError(f"{file.lost} tasks could not be written to {file.path}")
+    return 0
+
+
+def _run_tasks(
+    config: RobotConfig,
+    work: Work,
+    states: TaskStates,
+    answers: Answers | None,
+    *,
+    observers: Sequence[Observer],
+    files: list[Answers | Lines],
+) -> None:
+    """Run the tasks of `work`, then close `files`, to which the file of --reference is added."""
+    own, sites = OwnRecord(), config.sites()
+    with ExitStack() as stack:
+        offload = stack.enter_context(
+            _connect(
+                config,
+                states=states,
+                sites=sites,
+                policy=config.policy,
+                window=config.window,
+                settings=config.settings(config.seed),
+                observers=[own, *observers],
+            )
+        )
+        again, references = None, None
+        if config.trace and config.reference:
+            again = stack.enter_context(_connect(config, states=states, sites=sites))
+            path, names = reference_path(config.trace), [ONBOARD, CLOUD, *sites]
+            references = References(
+                path,
+                again,
+                names,
+                every=config.reference,
+                tasks=config.tasks_max,
+                seed=config.seed,
+                states=states,
+            )
+            files.append(references)
+        for file in files:
+            # Before the sites are closed: tasks that are given up by then have no record.
+            stack.callback(file.close)
+        run = Run(config, work, offload, own=own, say=print, answers=answers, references=references)
+        with _connect(config, states=states, sites=sites) as unseen:
+            absent = unseen.wait_for_sites(work.function, config.connect_s)
+            run.warm(unseen)
+        absent = absent or offload.wait_for_sites(work.function, config.connect_s)
+        if again:
+            absent = absent or again.wait_for_sites(work.function, config.connect_s)
+            run.warm(again)
+        _warn_of_absent("starting", absent)
+        gc.collect()
+        gc.freeze()  # so that collections during the run do not look at what exists now
+        run.run()
+
+
+def _connect(
+    config: RobotConfig, states: TaskStates, settings: Settings | None = None, **options: Any
+) -> Offloader:
+    own = replace(settings or Settings(), states=states)
+    return Offloader.connect(
+        config.cloud, timeout_s=config.timeout_s, keys=config.keys, settings=own, **options
+    )
+
+
+def _warn_of_absent(doing: str, absent: Mapping[str, str]) -> None:
+    for site, why in absent.items():
+        instead = "tasks run elsewhere" if site == ONBOARD else f"tasks run {ONBOARD}"
+        log.warning("%s without %s: %s; %s", doing, site, why, instead)
+
+
+def _metrics(config: RobotConfig, trace: Trace | None) -> list[Observer]:
+    """The observer that serves metrics until the process ends, if an address is given for it."""
+    if config.metrics is None:
+        return []
+    from offboard.robot_client.records.metrics import serve_metrics  # its library takes long to load
+
+    metrics = serve_metrics(config.metrics, "--metrics")
+    if trace:
+        metrics.watch(trace)
+    return [metrics]

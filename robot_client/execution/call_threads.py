@@ -1,0 +1,48 @@
+"""Threads that make calls: those of a batch, and those of calls in asyncio.
+
+What a call does is left to those who start it.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextvars import copy_context
+from functools import partial
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+
+class CallThreads:
+    """Makes at most `width` calls at a time; further ones wait. Each sees the context of its caller.
+
+    If the system has no thread left at this moment, a call is made in the thread of its caller.
+    """
+
+    def __init__(self, width: int, name: str) -> None:
+        self._pool = ThreadPoolExecutor(width, thread_name_prefix=name)
+
+    def start(self, function: Callable[..., T], *args: Any) -> "Future[T]":
+        call: Future[T] = Future()
+        todo: list[Callable[[], T]] = [partial(copy_context().run, function, *args)]
+        try:
+            self._pool.submit(_make, todo, call)
+        except RuntimeError:  # the pool may still run what it could not start a thread for
+            _make(todo, call)
+        return call
+
+    def close(self, *, wait: bool) -> None:
+        """End the threads once they have made the calls that were started."""
+        self._pool.shutdown(wait=wait)
+
+
+def _make(todo: list[Callable[[], T]], call: "Future[T]") -> None:
+    """Make a call, unless another thread has taken it, or it was cancelled while it waited."""
+    try:
+        make = todo.pop()
+    except IndexError:
+        return
+    if call.set_running_or_notify_cancel():
+        try:
+            call.set_result(make())
+        except BaseException as error:  # noqa: BLE001 - for the thread that waits for the call
+            call.set_exception(error)

@@ -1,0 +1,103 @@
+"""How an offloader ends: by `close`, when it is dropped without it, and in a forked process.
+
+What it does while it lives is in `offloader`.
+"""
+
+import os
+import threading
+import warnings
+import weakref
+from collections.abc import Callable, Collection
+from concurrent.futures import Future
+from typing import NoReturn, TypeVar
+
+from offboard.common.errors import OffloadError
+from offboard.robot_client.execution.call_threads import CallThreads
+from offboard.robot_client.learning.memories import Memories
+from offboard.robot_client.records.recording import Recording
+from offboard.robot_client.sites.onboard import inside_a_task
+from offboard.robot_client.sites.runner import Runner
+
+ASYNC_NAME = "run"
+ASYNC_CALLS_MAX = 32  # calls of `Offloader.run` at a time; each has a thread while it waits for its answer
+
+T = TypeVar("T")
+
+
+class Lifetime:
+    """What an offloader has opened, until it is closed. It knows nothing of the offloader itself.
+
+    `lock`: that of the offloader. `recording`: its trace and metrics, if it has any. `forked`: this is a
+    process that was forked from that of the offloader, and has neither its threads nor its connections.
+    """
+
+    def __init__(self, runners: Collection[Runner], memories: Memories, lock: threading.Lock) -> None:
+        self.closed = False
+        self.forked = False
+        self.recording: Recording | None = None
+        self._async_calls = CallThreads(ASYNC_CALLS_MAX, ASYNC_NAME)
+        self._runners = runners
+        self._memories = memories
+        self._lock = lock
+        _lifetimes.add(self)
+
+    def refuse(self) -> NoReturn:
+        """The answer to each use while `forked`."""
+        raise OffloadError(
+            "this process was forked after its offloader was made; make a new one in this process"
+        )
+
+    def call_in_thread(self, call: Callable[[], T]) -> "Future[T]":
+        """For asyncio. The code of a task gets a thread of its own: the others may all wait for that task."""
+        if not inside_a_task():
+            return self._async_calls.start(call)
+        own = CallThreads(1, ASYNC_NAME)
+        try:
+            return own.start(call)
+        finally:
+            own.close(wait=False)
+
+    def close_when_dropped(self, offloader: object) -> None:
+        """Close, with a ResourceWarning, when nothing refers to the offloader any more."""
+        weakref.finalize(offloader, self._dropped).atexit = False
+
+    def close(self) -> None:
+        """Close runners, trace and metrics, and save what was learnt. Safe to call twice."""
+        if self.forked:
+            return
+        with self._lock:
+            first, self.closed = not self.closed, True
+            last = self._memories.snapshot() if first else None
+        for runner in self._runners:
+            runner.close()
+        self._async_calls.close(wait=False)
+        if last is not None:
+            self._memories.save_last(last)
+        if self.recording is not None:
+            self.recording.close()
+
+    def _dropped(self) -> None:
+        """Called by any thread at any moment, so that another thread must take the locks."""
+        if self.closed or self.forked:
+            return
+        threading.Thread(target=self.close, name="dropped", daemon=True).start()
+        sites = ", ".join(runner.site for runner in self._runners)
+        warnings.warn(f"an offloader was dropped without close(); its sites: {sites}", ResourceWarning, 2)
+
+    def _fork(self) -> None:
+        """This is a forked process: everything here belongs to the other one."""
+        self.forked = True
+        if self.recording is not None:
+            self.recording.leave_to_parent()
+
+
+_lifetimes: "weakref.WeakSet[Lifetime]" = weakref.WeakSet()  # for the hook, which cannot be taken back
+
+
+def _after_fork() -> None:
+    for one in list(_lifetimes):
+        one._fork()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
