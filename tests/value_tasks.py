@@ -195,8 +195,8 @@ def described(value: Any, depth: int = 0) -> str:
         return f"{name} {value.tobytes().hex()}"
     if isinstance(value, float):
         return f"{name} {'nan' if value != value else value.hex()}"
-    if isinstance(value, bytes | bytearray):
-        return f"{name} {_bytes(value)}"
+    if isinstance(value, bytes | bytearray | memoryview):
+        return f"{name} {_bytes(bytes(value))}"
     if isinstance(value, dict):
         return f"{name} {{{', '.join(f'{inner(key)}: {inner(one)}' for key, one in value.items())}}}"
     if isinstance(value, list | tuple):
@@ -217,7 +217,7 @@ def attributes(value: Any) -> dict[str, Any]:
     return fields | getattr(value, "__dict__", {})
 
 
-def _bytes(data: bytes | bytearray) -> str:
+def _bytes(data: bytes) -> str:
     if len(data) <= SHOWN_MAX:
         return data.hex()
     return f"{len(data)} bytes with SHA-256 {hashlib.sha256(data).hexdigest()[:16]}"

@@ -49,7 +49,7 @@ class CallRules(Run):
     @asking
     @rule(where=wheres, wait=waits)
     def call_slow_task(self, where: str | None, wait: bool) -> None:
-        self.begin("call of a slow task", lambda do: do(served.nap, NAP_S, where=where), NAP_S, wait=wait)
+        self.begin("slow call", lambda do: do(served.nap, NAP_S, where=where), NAP_S, wait=wait)
 
     @asking
     @rule(items=st.lists(numbers, max_size=8), where=wheres, wait=waits)
@@ -114,7 +114,7 @@ class CallRules(Run):
             except TaskFailed as error:
                 return name if name in str(error) else str(error)
 
-        self.begin(f"call of a task that fails with {how}", failure, name, wait=wait)
+        self.begin(f"failing call of the sort {how}", failure, name, wait=wait)
 
     @asking
     @rule(where=st.sampled_from([None, CLOUD, ONBOARD]), wait=waits)

@@ -89,7 +89,7 @@ class Call:
 
     @property
     def seconds(self) -> float:
-        return self._ended_s - self._began_s
+        return (self._ended_s or time.monotonic()) - self._began_s
 
     def _run(self, act: Callable[[], Any]) -> None:
         try:
