@@ -23,7 +23,7 @@ WAIT_S = 8.0
 HARDLY_EVER_S = 1000.0
 
 
-@task("nothing", size=lambda: 0.0)
+@task("nothing_at_all", size=lambda: 0.0)
 def nothing() -> None:
     pass
 

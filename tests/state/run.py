@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine
 
 from offboard import Offloader, Settings
-from offboard.robot_client.records.trace import read
+from offboard.loadgen.robot_files import read_trace
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.state import served
 from tests.state.calls import HUNG, LOST, WRONG, Call, Tally, never
@@ -127,7 +127,7 @@ class Run(RuleBasedStateMachine):
     def _check_end(self) -> None:
         if self.once.exists() and (again := _repeated(self.once.read_text().split())):
             self.fail(WRONG, f"tasks that must run once ran again: {again}")
-        records = read(self.trace) if self.trace.exists() else ()
+        records = read_trace(self.trace) if self.trace.exists() else ()
         if again := _repeated(record["id"] for record in records):
             self.fail(WRONG, f"tasks that are in the trace twice: {again}")
         if self.memory.with_name(f"{self.memory.name}.unreadable").exists():
