@@ -6,20 +6,19 @@
 import contextlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from offboard.common.errors import OffloadError
 from offboard.loadgen.play import play_scenario
 from offboard.loadgen.play.play_scenario import Played, play
 from offboard.loadgen.play.run_files import EVENTS, TRACE
 from offboard.loadgen.robot_files import read_trace
 from offboard.loadgen.scenario.event_timeline import Event
 from offboard.loadgen.scenario.scenario import CloudPart, RobotPart, Scenario, Workload
-from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, Setup, Testbed
+from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN
 from tests.chaos.plays import ALL, FAULT_TIMES, FEW_FAULTS
 from tests.compose.conftest import made_by_docker
 
@@ -27,7 +26,6 @@ MAP = Path(__file__).parents[2] / "maps" / "depot.yaml"
 RATE = 20.0
 TIMEOUT_S = 0.5
 HUNG_S = 15.0  # longer than the timeout and the queue of onboard plans after it
-FULL_DISK = "/dev/full"
 
 
 @dataclass(frozen=True)
@@ -147,24 +145,3 @@ def test_a_fault_costs_no_task(testbed: str, name: str, tmp_path: Path) -> None:
     fell_back = sum(record["used"] != CLOUD for record in records)
     print(f"{name} x {times} on {testbed}: {len(records)} tasks, {fell_back} answered onboard")
     assert fell_back or name in UNSEEN
-
-
-@pytest.mark.parametrize("testbed", [LOCAL, DOCKER])
-def test_a_full_disk_costs_the_trace_and_no_task(
-    testbed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """If the trace cannot be written, all tasks are answered, and the robot says so and exits with 1."""
-    make: Callable[[Path, Mapping[str, Setup]], Testbed] = play_scenario.TESTBEDS[testbed]
-
-    def full(out: Path, setups: Mapping[str, Setup]) -> Testbed:
-        robot = setups[ROBOT]
-        flags = {**robot.flags, "trace": FULL_DISK}
-        return make(out, {**setups, ROBOT: replace(robot, flags=flags)})
-
-    monkeypatch.setitem(play_scenario.TESTBEDS, testbed, full)
-    played = play(scenario(None, 1), tmp_path, testbed, quiet=True)
-    check(played)
-    with pytest.raises(OffloadError, match="robot ended with exit code 1"):
-        played.check_robots()
-    log = (tmp_path / "logs" / "robot.log").read_text()
-    assert f"{played.scenario.workload.tasks} tasks could not be written to {FULL_DISK}" in log

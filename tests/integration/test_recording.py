@@ -2,6 +2,8 @@
 
 import logging
 import re
+import subprocess
+import sys
 import threading
 import urllib.request
 from pathlib import Path
@@ -13,6 +15,7 @@ from offboard import ConfigError, Offloader
 from offboard.loadgen.robot_files import read_trace
 from tests.probes import echo
 
+ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.integration
 
 
@@ -59,3 +62,25 @@ def test_a_wrong_endpoint_closes_trace_and_metrics(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="is not tcp://HOST:PORT"):
         Offloader.connect("cloud:5555", metrics="127.0.0.1:0", trace=tmp_path / "trace.jsonl")
     assert "trace" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_a_full_disk_costs_the_trace_and_no_task(tmp_path: Path) -> None:
+    """If the trace cannot be written, all tasks are answered, and the run says so and exits with 1."""
+    trace = tmp_path / "trace.jsonl"
+    command = ["prlimit", "--fsize=1500", sys.executable, "-m", "offboard.loadgen", "call"]
+    command += [
+        "--task",
+        "tests.probes:swallow",
+        "--sizes",
+        "constant:1",
+        "--tasks",
+        "20",
+        "--trace",
+        str(trace),
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=30, cwd=ROOT, check=False)
+    assert done.returncode == 1
+    assert "20 tasks" in done.stdout
+    lost = re.search(rf"(\d+) tasks could not be written to {trace}", done.stderr)
+    assert lost is not None
+    assert 0 < int(lost[1]) == 20 - len(list(read_trace(trace)))
