@@ -138,6 +138,7 @@ class CloudRunner:
         with self._socket.lock:
             if self._reader.closed:
                 pending.future.cancel()
+                pending.future.set_running_or_notify_cancel()  # or a wait for several futures would go on
                 return pending.future
             self._pending[task.id] = pending
             self._beat(early_s=EARLY_S)

@@ -201,6 +201,7 @@ class OnboardRunner:
                 self._queue.put(None)
         for run in waiting:
             run.future.cancel()
+            run.future.set_running_or_notify_cancel()  # or a wait for several futures would go on
         if count := join_all(self._started, CLOSE_WAIT_S):
             log.warning(
                 "%s: %d of its threads still run a task %g s after the close; if that is native code, "

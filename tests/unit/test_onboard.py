@@ -3,6 +3,7 @@
 import os
 import threading
 from collections.abc import Iterator
+from concurrent.futures import Future
 
 import pytest
 
@@ -10,6 +11,7 @@ from offboard.common.errors import OffloadError, Overtaken, Unwanted
 from offboard.common.tasks import Task, kind_of, task
 from offboard.common.wanted import check_wanted
 from offboard.robot_client.sites import onboard
+from offboard.robot_client.sites.clock import SystemClock
 from offboard.robot_client.sites.onboard import ABANDONED_MAX, ABANDONED_NICE, OnboardRunner
 
 WAIT_S = 5.0
@@ -152,6 +154,21 @@ def test_closing_cancels_the_queue(runner: OnboardRunner, monkeypatch: pytest.Mo
         runner.submit(call(3), 1.0)
     gate.open.set()
     assert runs.result(WAIT_S).value == 1
+
+
+def test_closing_ends_a_wait_for_several_futures(
+    runner: OnboardRunner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`Offloader.map` waits for a task in the queue, and at the same time for its call to another site."""
+    monkeypatch.setattr(onboard, "CLOSE_WAIT_S", 0.05)
+    runner.submit(call(1), 1.0)
+    queued, other = runner.submit(call(2), 1.0), Future[str]()
+    until_begun(1)
+    waiting = threading.Thread(target=SystemClock().wait, args=([queued, other],), daemon=True)
+    waiting.start()
+    runner.close()
+    waiting.join(WAIT_S)
+    assert not waiting.is_alive()
 
 
 @pytest.mark.usefixtures("runner")
