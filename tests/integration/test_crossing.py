@@ -81,11 +81,11 @@ def test_a_kind_whose_values_never_cross_stays_onboard(
     """After three calls in vain, the cloud is left out for a while: no call waits for it."""
     records: list[Record] = []
     offload = connect(testbed(TASKS), policy=policy, observers=[records.append])
-    for _ in range(20):
+    for _ in range(4):
         assert same(offload(function, value), function(value))
     asked = [len(record.executions) == 2 for record in records]
-    assert asked == [True] * 3 + [False] * 17
-    assert "could not be sent; next try in 1 s" in records[-1].decision.reason
+    assert asked == [True, True, True, False]
+    assert "could not be sent; next try in " in records[-1].decision.reason
 
 
 def test_what_is_larger_than_a_message_is_answered_onboard(testbed: Beds, connect: Connect) -> None:
