@@ -66,7 +66,6 @@ LEFT_OUT: dict[str, LeftOut] = {
     "late runs": _predictor("Late"),
     "staleness": _predictor("Staleness"),
     "PACE": _predictor("Pace"),
-    "SHAPE": _predictor("Shape"),
     "first slope": _predictor("FirstSlope"),
 }
 

@@ -12,7 +12,6 @@ from offboard.robot_client.predictors.line import (
     ODD,
     PACE,
     RATE,
-    SHAPE,
     TAIL_MAX,
     Line,
 )
@@ -24,7 +23,6 @@ class Switched(Line):
     """A line whose rules can be switched off; with all of them it is the same as `Line`."""
 
     pace = PACE
-    shape = SHAPE
     outliers = True  # a time beyond the reach counts only up to it
     good_news = True  # one outlier below the line is a change
     bad_news = True  # two outliers above it are one
@@ -40,10 +38,6 @@ class Switched(Line):
         unit = 0.5 * (max(0.0, self.a + self.b * x + known) + self._usual) or 1.0
         self._usual += rate * (min(y + known, ODD * self._usual) - self._usual)
         self._loosen(self.pace * self.pace * ahead, known)
-        if self._together:
-            shape = (self.shape * (self.a + self.b)) ** 2
-            self._paa += shape
-            self._pbb += shape
         variance, reach = self._reach(x, unit)
         side = math.copysign(1.0, error) if abs(error) > reach else 0.0
         changed = self._is_change(side)
@@ -70,10 +64,6 @@ class Switched(Line):
 
 class _WithoutPace(Switched):
     pace = 0.0
-
-
-class _WithoutShape(Switched):
-    shape = 0.0
 
 
 class _WithoutOutliers(Switched):
@@ -122,12 +112,6 @@ class Pace(Parts):
     """A site does not become slower or faster as a whole."""
 
     LINE = _WithoutPace
-
-
-class Shape(Parts):
-    """Intercept and slope of a run do not change apart from each other."""
-
-    LINE = _WithoutShape
 
 
 class Outliers(Parts):

@@ -9,7 +9,6 @@ import math
 
 NOISE = 0.2  # standard deviation of the first times, as a share of the usual time
 PACE = 0.01  # by which a site becomes slower or faster from one task to the next
-SHAPE = 0.003  # the same for intercept and slope apart from each other
 ODD = 3.0  # standard deviations: a time farther from the line is an outlier
 RATE = 0.05  # of the running means, once there are enough times
 TAIL_MAX = 2.0  # usual times: a longer outlier counts as this much in the mean of the outliers
@@ -64,10 +63,6 @@ class Line:
         unit = 0.5 * (max(0.0, self.a + self.b * x + known) + self._usual) or 1.0
         self._usual += rate * (min(y + known, ODD * self._usual) - self._usual)
         self._loosen(PACE * PACE * ahead, known)
-        if self._together:
-            shape = (SHAPE * (self.a + self.b)) ** 2
-            self._paa += shape
-            self._pbb += shape
         variance, reach = self._reach(x, unit)
         side = math.copysign(1.0, error) if abs(error) > reach else 0.0
         changed = side < 0 or (side != 0 and side == self._side)
