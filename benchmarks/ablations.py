@@ -60,11 +60,9 @@ LEFT_OUT: dict[str, LeftOut] = {
     "change": _predictor("Change"),
     "change to slower": _predictor("BadNews"),
     "change to faster at once": _predictor("GoodNews"),
-    "at most doubles": _predictor("Doubling"),
     "heed": _predictor("Heed"),
     "bound": _predictor("Bound"),
     "late runs": _predictor("Late"),
-    "staleness": _predictor("Staleness"),
     "PACE": _predictor("Pace"),
     "first slope": _predictor("FirstSlope"),
 }

@@ -26,9 +26,8 @@ class Switched(Line):
     outliers = True  # a time beyond the reach counts only up to it
     good_news = True  # one outlier below the line is a change
     bad_news = True  # two outliers above it are one
-    doubling = True  # a change at most doubles the time
 
-    def learn(self, x: float, y: float, known: float = 0.0, ahead: int = 1) -> None:
+    def learn(self, x: float, y: float, known: float = 0.0) -> None:
         self.count += 1
         if self.count == 1:
             self._begin(x, y, known)
@@ -37,12 +36,11 @@ class Switched(Line):
         error = y - self.a - self.b * x
         unit = 0.5 * (max(0.0, self.a + self.b * x + known) + self._usual) or 1.0
         self._usual += rate * (min(y + known, ODD * self._usual) - self._usual)
-        self._loosen(self.pace * self.pace * ahead, known)
+        self._loosen(self.pace * self.pace, known)
         variance, reach = self._reach(x, unit)
         side = math.copysign(1.0, error) if abs(error) > reach else 0.0
         changed = self._is_change(side)
         if changed:
-            error = min(error, unit) if self.doubling else error
             self._loosen(min(1.0, (error / unit) ** 2), known)
             variance, reach = self._reach(x, unit)
         self._side = side
@@ -82,10 +80,6 @@ class _WithoutChange(Switched):
     good_news = bad_news = False
 
 
-class _WithoutDoubling(Switched):
-    doubling = False
-
-
 class _WithoutTail(Line):
     @property
     def tail(self) -> float:
@@ -96,11 +90,6 @@ class _WithoutFirstSlope(Line):
     def _begin(self, x: float, y: float, known: float) -> None:
         self.slope = None
         super()._begin(x, y, known)
-
-
-class _WithoutStaleness(Line):
-    def learn(self, x: float, y: float, known: float = 0.0, ahead: int = 1) -> None:  # noqa: ARG002
-        super().learn(x, y, known)
 
 
 class _WithoutLoadedShape(Line):
@@ -138,12 +127,6 @@ class Change(Parts):
     LINE = _WithoutChange
 
 
-class Doubling(Parts):
-    """A change may more than double the time."""
-
-    LINE = _WithoutDoubling
-
-
 class Tail(Parts):
     """What outliers take beyond the reach is not predicted."""
 
@@ -154,12 +137,6 @@ class FirstSlope(Parts):
     """The first answer says as much about the bandwidth of the link as about its delay."""
 
     LINE = _WithoutFirstSlope
-
-
-class Staleness(Parts):
-    """A line that had no news for many tasks is as certain as before."""
-
-    LINE = _WithoutStaleness
 
 
 class LoadedShape(Parts):
@@ -185,14 +162,14 @@ class Heed(Parts):
 class Bound(Parts):
     """An answer that the robot may have read late counts as any other one."""
 
-    def learn(self, size: float, seconds: float, ahead: int = 1, **more: Any) -> None:
-        super().learn(size, seconds, ahead, **{**more, "bound": False})
+    def learn(self, size: float, seconds: float, **more: Any) -> None:
+        super().learn(size, seconds, **{**more, "bound": False})
 
 
 class Late(Parts):
     """A run that was given up after its predicted time says nothing."""
 
-    def learn_late(self, size: float, seconds: float, ahead: int, **more: Any) -> None:
+    def learn_late(self, size: float, seconds: float, **more: Any) -> None:
         pass
 
 
@@ -211,11 +188,11 @@ class _Without(Parts):
     def predict(self, size: float, ahead: int = 1, **more: Any) -> Prediction | None:
         return super().predict(size, ahead, **self._told(**more))
 
-    def learn(self, size: float, seconds: float, ahead: int = 1, **more: Any) -> None:
-        super().learn(size, seconds, ahead, **self._told(**more))
+    def learn(self, size: float, seconds: float, **more: Any) -> None:
+        super().learn(size, seconds, **self._told(**more))
 
-    def learn_late(self, size: float, seconds: float, ahead: int, **more: Any) -> None:
-        super().learn_late(size, seconds, ahead, **self._told(**more))
+    def learn_late(self, size: float, seconds: float, **more: Any) -> None:
+        super().learn_late(size, seconds, **self._told(**more))
 
 
 class Payload(_Without):
@@ -257,16 +234,16 @@ class RoundTrip(_WithoutCondition):
 class NetworkLine(Parts):
     """One line for all that a task takes beyond its queue and the round trip: run and network together."""
 
-    def learn(self, size: float, seconds: float, ahead: int = 1, **more: Any) -> None:
+    def learn(self, size: float, seconds: float, **more: Any) -> None:
         alone_s = max(0.0, seconds - (more.get("queue_s") or 0.0)) if self.remote else seconds
-        super().learn(size, alone_s, ahead, condition=more["condition"])
+        super().learn(size, alone_s, condition=more["condition"])
 
-    def learn_late(self, size: float, seconds: float, ahead: int, **more: Any) -> None:
+    def learn_late(self, size: float, seconds: float, **more: Any) -> None:
         condition: Condition = more["condition"]
         if self.remote:
             waited_s = condition.queue * self._usual_run.value + (condition.round_trip_s or 0.0)
             seconds = max(0.0, seconds - waited_s)
-        self._learn_run(size, seconds, condition, ahead)
+        self._learn_run(size, seconds, condition)
 
 
 class AllParts(Parts):
@@ -275,11 +252,11 @@ class AllParts(Parts):
     def predict(self, size: float, ahead: int = 1, **more: Any) -> Prediction | None:
         return super().predict(size, ahead, condition=self._alone(more["condition"]))
 
-    def learn(self, size: float, seconds: float, ahead: int = 1, **more: Any) -> None:
-        super().learn(size, seconds, ahead, condition=self._alone(more["condition"]))
+    def learn(self, size: float, seconds: float, **more: Any) -> None:
+        super().learn(size, seconds, condition=self._alone(more["condition"]))
 
-    def learn_late(self, size: float, seconds: float, ahead: int, **more: Any) -> None:
-        self._learn_run(size, seconds, self._alone(more["condition"]), ahead)
+    def learn_late(self, size: float, seconds: float, **more: Any) -> None:
+        self._learn_run(size, seconds, self._alone(more["condition"]))
 
     def _alone(self, condition: Condition) -> Condition:
         return condition._replace(round_trip_s=None, queue=0)

@@ -94,4 +94,3 @@ class KindMemory:
         """Count one more task of this kind, wherever it ran."""
         for memory in self.sites.values():
             memory.age += 1
-            memory.tasks_since += 1

@@ -102,7 +102,6 @@ def _observation(given: Any) -> Observation:
         bytes_out=_number(given["bytes_out"]),
         bytes_in=_number(given["bytes_in"]),
         cpu_s=_maybe(given["cpu_s"]),
-        ahead=int(_number(given["ahead"])),
         run_s=_maybe(given["run_s"]),
         queue_s=_maybe(given["queue_s"]),
         bound=_fact(given["bound"]),

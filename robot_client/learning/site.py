@@ -29,7 +29,6 @@ class Observation:
     `work`: the work that the result said.
     `seconds`: the time without `waited_s`, the wait for other tasks of this robot.
     `predicted_s`: the prediction, if the interval learned its error.
-    `ahead`: how many tasks after the previous run of the site this one came.
     `run_s`, `queue_s`: what the site measured of them; None: nothing.
     `bound`: the robot ran the same task itself and may have received the answer of this site late.
     """
@@ -45,7 +44,6 @@ class Observation:
     bytes_out: float = 0.0
     bytes_in: float = 0.0
     cpu_s: float | None = None
-    ahead: int = 1
     run_s: float | None = None
     queue_s: float | None = None
     bound: bool = False
@@ -68,9 +66,6 @@ class SiteMemory:
     ) -> None:
         predictor = self.predictor = make()
         self.age = 0  # tasks since the site last ran one
-        # Like `age`, but for this process only: recalled times are old enough for a probe, but as certain as
-        # they were.
-        self.tasks_since = 0
         self.observations: deque[Observation] = deque(maxlen=REMEMBERED)
         self.measured = measured
         self._parts = predictor if isinstance(predictor, Parts) else None
@@ -130,11 +125,6 @@ class SiteMemory:
             errors=errors,
         )
 
-    def count_run(self) -> int:
-        """The site has run a task; returns how many tasks after its previous run that was."""
-        ahead, self.tasks_since, self.age = max(1, self.tasks_since), 0, 0
-        return ahead
-
     def learn(
         self,
         amount: Size | None,
@@ -157,7 +147,7 @@ class SiteMemory:
         overtaken = isinstance(execution.failure, Overtaken)
         if overtaken and execution.seconds <= (expected_s or 0.0):
             return  # stopped before its predicted time: the site may be as fast as predicted
-        ahead = self.count_run()
+        self.age = 0
         if isinstance(execution.failure, TaskError | CannotCross):
             if isinstance(execution.failure, TaskError) and not execution.started:
                 self._failures += 1  # its setup failed: the site is at fault, not the task
@@ -181,7 +171,6 @@ class SiteMemory:
                 bytes_out=execution.bytes_out,
                 bytes_in=execution.bytes_in,
                 cpu_s=execution.cpu_s,
-                ahead=ahead,
                 run_s=execution.run_s,
                 queue_s=execution.queue_s,
                 bound=beside,
@@ -252,7 +241,6 @@ class SiteMemory:
             model.learn(
                 number,
                 one.seconds,
-                one.ahead,
                 run_s=one.run_s,
                 queue_s=one.queue_s,
                 moved=moved,
@@ -260,7 +248,7 @@ class SiteMemory:
                 condition=one.condition,
             )
         else:
-            model.learn_late(number, one.seconds, one.ahead, moved=moved, condition=one.condition)
+            model.learn_late(number, one.seconds, moved=moved, condition=one.condition)
 
     def _joules(self, seconds: float) -> float:
         if self._site == ONBOARD:

@@ -52,8 +52,8 @@ class Line:
         seconds = self.a + self.b * x
         return seconds if seconds > 0 else 0.0
 
-    def learn(self, x: float, y: float, known: float = 0.0, ahead: int = 1) -> None:
-        """An amount `x` took `y` seconds beyond `known`; the line had no news for `ahead` tasks."""
+    def learn(self, x: float, y: float, known: float = 0.0) -> None:
+        """An amount `x` took `y` seconds beyond `known`."""
         self.count += 1
         if self.count == 1:
             self._begin(x, y, known)
@@ -62,12 +62,11 @@ class Line:
         error = y - self.a - self.b * x
         unit = 0.5 * (max(0.0, self.a + self.b * x + known) + self._usual) or 1.0
         self._usual += rate * (min(y + known, ODD * self._usual) - self._usual)
-        self._loosen(PACE * PACE * ahead, known)
+        self._loosen(PACE * PACE, known)
         variance, reach = self._reach(x, unit)
         side = math.copysign(1.0, error) if abs(error) > reach else 0.0
         changed = side < 0 or (side != 0 and side == self._side)
         if changed:
-            error = min(error, unit)  # a change at most doubles the time, until the next one confirms it
             self._loosen(min(1.0, (error / unit) ** 2), known)
             variance, reach = self._reach(x, unit)
         self._side = side

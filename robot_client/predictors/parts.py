@@ -68,7 +68,6 @@ class Parts:
         self,
         size: float,
         seconds: float,
-        ahead: int = 1,
         *,
         run_s: float | None = None,
         queue_s: float | None = None,
@@ -86,19 +85,17 @@ class Parts:
             run_s = max(0.0, seconds - rtt_s)
         else:
             rest_s = seconds - (queue_s or 0.0) - run_s - rtt_s
-            self._learn_network(moved, max(0.0, rest_s), rtt_s, ahead, bound=bound)
-        self._learn_run(size, run_s, condition, ahead)
+            self._learn_network(moved, max(0.0, rest_s), rtt_s, bound=bound)
+        self._learn_run(size, run_s, condition)
 
-    def learn_late(
-        self, size: float, seconds: float, ahead: int, *, moved: float, condition: Condition
-    ) -> None:
+    def learn_late(self, size: float, seconds: float, *, moved: float, condition: Condition) -> None:
         """A run was given up after these seconds, which are more than predicted."""
         if not self.remote:
-            self._learn_run(size, seconds, condition, ahead)
+            self._learn_run(size, seconds, condition)
             return
         rtt_s = condition.round_trip_s or 0.0
         expected_s = self._run_s(size, condition) + condition.queue * self._usual_run.value
-        self._learn_network(moved, max(0.0, seconds - expected_s - rtt_s), rtt_s, ahead, bound=False)
+        self._learn_network(moved, max(0.0, seconds - expected_s - rtt_s), rtt_s, bound=False)
 
     def _run_s(self, size: float, condition: Condition) -> float:
         x, load = size / self._amount if self._amount else 0.0, self._load(condition)
@@ -113,7 +110,7 @@ class Parts:
     def _load(self, condition: Condition) -> float:
         return condition.server_load if self.remote else condition.load
 
-    def _learn_run(self, size: float, run_s: float, condition: Condition, ahead: int) -> None:
+    def _learn_run(self, size: float, run_s: float, condition: Condition) -> None:
         """Learn a run, apart from others if other programs take the CPU.
 
         Under load, a run waits for the CPU several times, which depends little on its work. So the factor
@@ -123,13 +120,13 @@ class Parts:
         self._amount = self._amount or size
         x, alone_s = size / self._amount if self._amount else 0.0, run_s * condition.capacity
         if self._load(condition) <= LOADED or not self.full:
-            self._run.learn(x, alone_s, ahead=ahead)
+            self._run.learn(x, alone_s)
         elif not self._loaded.count and self._run.at(x) > 0:
             self._loaded.begin_as(self._run, x, alone_s)
         else:
-            self._loaded.learn(x, alone_s, ahead=ahead)
+            self._loaded.learn(x, alone_s)
 
-    def _learn_network(self, moved: float, rest_s: float, rtt_s: float, ahead: int, *, bound: bool) -> None:
+    def _learn_network(self, moved: float, rest_s: float, rtt_s: float, *, bound: bool) -> None:
         if not self._bytes:
             self._bytes = moved
             self._network.slope = moved / FIRST_BYTES_S
@@ -137,7 +134,7 @@ class Parts:
         if bound:
             self._network.bound(x, rest_s, rtt_s)
         else:
-            self._network.learn(x, rest_s, rtt_s, ahead)
+            self._network.learn(x, rest_s, rtt_s)
         self._usual_delay.add(self._network.a)
 
     def _heed(self, round_trip_s: float | None) -> None:

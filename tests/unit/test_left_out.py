@@ -40,12 +40,11 @@ def predictions(model: Parts) -> Iterator[float]:
         run_s = 0.1 * size * odd * slow * (1.0 + load) * rng.lognormvariate(0.0, 0.1) / condition.capacity
         seconds = rtt_s + 0.03 + moved / 4e6 * odd * slow + run_s
         if n % 30 == 29:
-            model.learn_late(size, 2.0 * seconds, 5, moved=moved, condition=condition)
+            model.learn_late(size, 2.0 * seconds, moved=moved, condition=condition)
             continue
         model.learn(
             size,
             seconds,
-            rng.randrange(1, 20),
             run_s=run_s,
             queue_s=0.01,
             moved=moved,
@@ -60,9 +59,9 @@ def test_a_line_with_all_its_switches_on_is_the_line(together: bool) -> None:
     rng, line, switched = Random(1), Line(together=together), Switched(together=together)
     for n in range(500):
         x, factor = rng.uniform(0.5, 2.0), rng.choice([1.0] * 9 + [0.2, 6.0]) * (3.0 if n > 250 else 1.0)
-        y, ahead = (0.1 + 0.3 * x) * factor * rng.lognormvariate(0.0, 0.2), rng.randrange(1, 20)
+        y = (0.1 + 0.3 * x) * factor * rng.lognormvariate(0.0, 0.2)
         for one in (line, switched):
-            one.learn(x, y, 0.03, ahead)
+            one.learn(x, y, 0.03)
         assert (line.at(1.0), line.tail, line.deviation) == (
             switched.at(1.0),
             switched.tail,

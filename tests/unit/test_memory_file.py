@@ -114,7 +114,7 @@ def test_a_capacity_outside_0_to_1_makes_the_file_unreadable(
     assert f"{capacity} where a share above 0 to 1 was expected" in caplog.text
 
 
-@pytest.mark.parametrize("name", ["ahead", "run_s", "queue_s", "bound", "condition"])
+@pytest.mark.parametrize("name", ["run_s", "queue_s", "bound", "condition"])
 def test_a_missing_field_makes_the_file_unreadable(
     robot: Robot, caplog: pytest.LogCaptureFixture, name: str
 ) -> None:

@@ -234,7 +234,7 @@ def test_a_server_given_up_late_has_a_slower_network() -> None:
     model = server()
     before = predicted_s(model), predicted_s(model, condition=Condition(round_trip_s=RTT_S, queue=1))
     for _ in range(6):
-        model.learn_late(1.0, 2.0, 1, moved=BYTES, condition=NEAR)
+        model.learn_late(1.0, 2.0, moved=BYTES, condition=NEAR)
     after = predicted_s(model), predicted_s(model, condition=Condition(round_trip_s=RTT_S, queue=1))
     assert after[0] > 1.5
     assert after[1] - after[0] == pytest.approx(before[1] - before[0], rel=0.01)
@@ -244,7 +244,7 @@ def test_a_run_given_up_late_onboard_takes_longer() -> None:
     """Onboard there is no network, so the run itself takes at least as long."""
     model = onboard()
     for _ in range(6):
-        model.learn_late(1.0, 2.0, 1, moved=0.0, condition=UNMEASURED)
+        model.learn_late(1.0, 2.0, moved=0.0, condition=UNMEASURED)
     assert predicted_s(model) == pytest.approx(2.0, rel=0.1)
 
 
@@ -321,7 +321,7 @@ def test_no_task_breaks_the_model(
     model = Parts(remote=remote)
     for size, seconds, run_s, moved, condition, way in tasks:
         if way == "c":
-            model.learn_late(size, seconds, 1, moved=moved, condition=condition)
+            model.learn_late(size, seconds, moved=moved, condition=condition)
         else:
             model.learn(
                 size, seconds, run_s=run_s, queue_s=run_s, moved=moved, bound=way == "b", condition=condition
