@@ -60,7 +60,6 @@ LEFT_OUT: dict[str, LeftOut] = {
     "change": _predictor("Change"),
     "change to slower": _predictor("BadNews"),
     "change to faster at once": _predictor("GoodNews"),
-    "heed": _predictor("Heed"),
     "bound": _predictor("Bound"),
     "late runs": _predictor("Late"),
     "PACE": _predictor("Pace"),

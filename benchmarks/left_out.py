@@ -152,13 +152,6 @@ class Load(Parts):
         return 0.0
 
 
-class Heed(Parts):
-    """A new round trip does not explain what the last answers took beyond the old one."""
-
-    def _heed(self, round_trip_s: float | None) -> None:
-        pass
-
-
 class Bound(Parts):
     """An answer that the robot may have read late counts as any other one."""
 

@@ -32,9 +32,7 @@ class Parts:
         self._network = self.LINE(together=False)
         self._loaded = self.LINE(together=True)  # runs while other programs take the CPU
         self._usual_run = RunningMean()
-        self._usual_delay = RunningMean()
         self._amount = self._bytes = 0.0  # the units
-        self._round_trip_s: float | None = None
 
     @property
     def full(self) -> bool:
@@ -58,7 +56,6 @@ class Parts:
         seconds, spread_s = run_s * (1.0 + self._run.tail), self._run.deviation * run_s
         if not self.remote:
             return Prediction(seconds, spread_s)
-        self._heed(condition.round_trip_s)
         rtt_s = condition.round_trip_s or 0.0
         network_s = rtt_s + self._network.at(moved / self._bytes if self._bytes else 0.0)
         seconds += network_s * (1.0 + self._network.tail) + condition.queue * self._usual_run.value
@@ -135,13 +132,3 @@ class Parts:
             self._network.bound(x, rest_s, rtt_s)
         else:
             self._network.learn(x, rest_s, rtt_s)
-        self._usual_delay.add(self._network.a)
-
-    def _heed(self, round_trip_s: float | None) -> None:
-        """A new round trip may explain what the last answers took beyond the old one: count it only once."""
-        before_s, self._round_trip_s = self._round_trip_s, round_trip_s
-        if before_s is None or round_trip_s is None or before_s == round_trip_s or not self._network.count:
-            return
-        change_s, odd_s = round_trip_s - before_s, self._network.a - self._usual_delay.value
-        if change_s * odd_s > 0:
-            self._network.a -= math.copysign(min(abs(change_s), abs(odd_s)), odd_s)
