@@ -231,7 +231,7 @@ def test_a_server_given_up_late_has_a_slower_network() -> None:
 
 
 def test_a_run_given_up_late_onboard_takes_longer() -> None:
-    """Onboard there is no network, so the run itself takes at least as long; a tail may be left for a while."""
+    """Onboard there is no network, so the run itself takes at least as long; a tail may be left."""
     model = onboard()
     for _ in range(6):
         model.learn_late(1.0, 2.0, moved=0.0, condition=UNMEASURED)
