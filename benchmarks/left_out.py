@@ -47,8 +47,8 @@ class Switched(Line):
         beyond = min(max(0.0, error - reach) / unit, TAIL_MAX)
         self._tail += rate * (beyond - self._tail)
         if not changed:
-            seen = max(0.0, min(error * error, 0.5 * reach * reach) - variance) / (unit * unit)
-            self._noise += rate * (seen - self._noise)
+            square = min(error * error, 0.5 * reach * reach)
+            self._noise += rate * (self._expected_noise(square, variance, unit) - self._noise)
         self._correct(x, max(-reach, min(reach, error)), unit)
 
     def _is_change(self, side: float) -> bool:

@@ -189,6 +189,25 @@ def test_the_slope_of_one_time_is_limited() -> None:
     assert line.at(101.0) == pytest.approx(2.0)
 
 
+def test_a_link_much_slower_than_the_first_guess_is_known_after_one_answer() -> None:
+    """The first slope is an eighth of the true one; the error of the next answer is the line's, not noise."""
+    line = Line(together=False, slope=0.01)
+    line.learn(1e-3, 0.04)
+    line.learn(0.75, 0.04 + 0.08 * 0.75)
+    assert line.at(0.5) == pytest.approx(0.08, rel=0.15)
+
+
+def test_times_that_begin_to_vary_are_noise_again() -> None:
+    """After 1,000 equal times, 200 times that vary by 10 % are seen as noise, not as 200 changes."""
+    rng, line = Random(1), Line(together=True)
+    for _ in range(1000):
+        line.learn(1.0, 0.25)
+    for _ in range(200):
+        line.learn(1.0, 0.25 * rng.lognormvariate(0.0, 0.1))
+    assert line.deviation > 0.05
+    assert line.at(1.0) == pytest.approx(0.25, rel=0.05)
+
+
 NS = 1e-9  # no clock tells shorter times apart
 SECONDS = st.one_of(st.just(0.0), st.floats(NS, 10), st.floats(NS, 1e9))
 AMOUNT = st.one_of(st.just(0.0), st.floats(NS, 10), st.floats(NS, 1e12))
