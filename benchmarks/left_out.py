@@ -26,6 +26,7 @@ class Switched(Line):
     outliers = True  # a time beyond the reach counts only up to it
     good_news = True  # one outlier below the line is a change
     bad_news = True  # two outliers above it are one
+    doubling = True  # a change at most doubles the time
 
     def learn(self, x: float, y: float, known: float = 0.0) -> None:
         self.count += 1
@@ -41,14 +42,15 @@ class Switched(Line):
         side = math.copysign(1.0, error) if abs(error) > reach else 0.0
         changed = self._is_change(side)
         if changed:
+            error = min(error, unit) if self.doubling else error
             self._loosen(min(1.0, (error / unit) ** 2), known)
             variance, reach = self._reach(x, unit)
         self._side = side
         beyond = min(max(0.0, error - reach) / unit, TAIL_MAX)
         self._tail += rate * (beyond - self._tail)
         if not changed:
-            square = min(error * error, 0.5 * reach * reach)
-            self._noise += rate * (self._expected_noise(square, variance, unit) - self._noise)
+            seen = max(0.0, min(error * error, 0.5 * reach * reach) - variance) / (unit * unit)
+            self._noise += rate * (min(1.0, seen) - self._noise)
         self._correct(x, max(-reach, min(reach, error)), unit)
 
     def _is_change(self, side: float) -> bool:
@@ -78,6 +80,10 @@ class _WithoutBadNews(Switched):
 
 class _WithoutChange(Switched):
     good_news = bad_news = False
+
+
+class _WithoutDoubling(Switched):
+    doubling = False
 
 
 class _WithoutTail(Line):
@@ -125,6 +131,12 @@ class Change(Parts):
     """No outlier is a change."""
 
     LINE = _WithoutChange
+
+
+class Doubling(Parts):
+    """A change may more than double the time."""
+
+    LINE = _WithoutDoubling
 
 
 class Tail(Parts):

@@ -67,14 +67,15 @@ class Line:
         side = math.copysign(1.0, error) if abs(error) > reach else 0.0
         changed = side < 0 or (side != 0 and side == self._side)
         if changed:
+            error = min(error, unit)  # a change at most doubles the time, until the next one confirms it
             self._loosen(min(1.0, (error / unit) ** 2), known)
             variance, reach = self._reach(x, unit)
         self._side = side
         beyond = min(max(0.0, error - reach) / unit, TAIL_MAX)
         self._tail += rate * (beyond - self._tail)
         if not changed:  # a change is no noise
-            square = min(error * error, 0.5 * reach * reach)
-            self._noise += rate * (self._expected_noise(square, variance, unit) - self._noise)
+            seen = max(0.0, min(error * error, 0.5 * reach * reach) - variance) / (unit * unit)
+            self._noise += rate * (min(1.0, seen) - self._noise)  # a wrong first guess is no noise either
         self._correct(x, max(-reach, min(reach, error)), unit)
 
     def begin_as(self, other: "Line", x: float, y: float) -> None:
@@ -117,19 +118,11 @@ class Line:
         variance = self._paa + 2.0 * x * self._pab + x * x * self._pbb
         return variance, ODD * math.sqrt(max(0.0, variance) + self._noise * unit * unit)
 
-    def _expected_noise(self, square: float, variance: float, unit: float) -> float:
-        """The noise that a squared error tells of, if the line itself has this variance.
-
-        The mean of the squared noise, given the error (the E step of EM for a Kalman filter, Shumway and
-        Stoffer 1982): the error of an uncertain line is mostly the line's, not noise.
-        """
-        squared_unit = unit * unit
-        share = self._noise / (max(0.0, variance) / squared_unit + self._noise)
-        return max(PACE * PACE, self._noise * (1.0 - share) + share * share * square / squared_unit)
-
     def _correct(self, x: float, error: float, unit: float) -> None:
         pa, pb = self._paa + x * self._pab, self._pab + x * self._pbb
         whole = pa + x * pb + self._noise * unit * unit
+        if not whole > 0.0:  # all times were equal
+            return
         ka, kb = pa / whole, pb / whole
         self.a += ka * error
         self.b += kb * error

@@ -69,15 +69,17 @@ def test_one_outlier_moves_the_line_little() -> None:
     assert line.at(1.0) == pytest.approx(before_s, rel=0.03)
 
 
-@pytest.mark.parametrize("factor", [1.8, 10.0])
-def test_two_outliers_on_one_side_are_a_change(factor: float) -> None:
-    """The second slow time in a row is believed for the most part; a few more are believed as a whole."""
+def test_two_outliers_on_one_side_are_a_change() -> None:
+    """The second slow time in a row is believed for the most part, though it at most doubles the line."""
     line = taught(noise=0.05)
     before_s = line.at(1.0)
-    news(line, factor, times=2)
-    assert (0.3 * factor + 0.7) * before_s < line.at(1.0) < 1.05 * factor * before_s
-    news(line, factor * before_s / line.at(1.0), times=6)
-    assert line.at(1.0) == pytest.approx(factor * before_s, rel=0.1)
+    news(line, 1.8, times=2)
+    assert line.at(1.0) > 1.5 * before_s
+    far = taught(noise=0.05)
+    news(far, 10.0, times=2)
+    assert before_s * 1.5 < far.at(1.0) < before_s * 2.2
+    news(far, 10.0 * before_s / far.at(1.0), times=6)
+    assert far.at(1.0) == pytest.approx(10.0 * before_s, rel=0.1)
 
 
 def test_outliers_with_an_expected_time_between_them_are_no_change() -> None:
@@ -149,7 +151,7 @@ def test_a_recovered_bandwidth_is_known_for_large_payloads_after_a_few_small_one
     assert line.at(1.0) > 0.36
     for _ in range(5):
         answer(rng.uniform(0.1, 0.3), 0.16)
-    assert 0.08 < line.at(1.0) < 0.34
+    assert 0.08 < line.at(1.0) < 0.32
     assert line.a >= 0.0
 
 
@@ -190,11 +192,11 @@ def test_the_slope_of_one_time_is_limited() -> None:
 
 
 def test_a_link_much_slower_than_the_first_guess_is_known_after_one_answer() -> None:
-    """The first slope is an eighth of the true one; the error of the next answer is the line's, not noise."""
-    line = Line(together=False, slope=0.01)
-    line.learn(1e-3, 0.04)
-    line.learn(0.75, 0.04 + 0.08 * 0.75)
-    assert line.at(0.5) == pytest.approx(0.08, rel=0.15)
+    """The first slope is a tenth of the true one; the error of the next answer is the line's, not noise."""
+    line = Line(together=False, slope=8e-5)
+    line.learn(1.0, 0.04)
+    line.learn(750.0, 0.04 + 8e-4 * 750.0)
+    assert line.at(500.0) == pytest.approx(0.44, rel=0.1)
 
 
 def test_times_that_begin_to_vary_are_noise_again() -> None:
