@@ -14,7 +14,7 @@ PEERS_READY := $(VENV)/.peers-ready
 EXAMPLES_BIN := .cache/examples/bin
 EXAMPLES_READY := .cache/examples/.ready
 
-.PHONY: help demo install format lint type test unit integration compose chaos state bench examples browser torch up down table lock wheel clean
+.PHONY: help demo install format lint type test unit pythons integration compose chaos state bench examples browser torch up down table lock wheel clean
 
 help: ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -46,6 +46,10 @@ test: $(DEV_READY) ## run every test that this machine can run; skipped tests sa
 
 unit: $(DEV_READY) ## run the tests without sockets
 	$(BIN)/pytest --numprocesses 2 tests/unit
+
+VERSIONS := 3.11 3.12 3.13
+pythons: ## run the unit tests on each supported Python, VERSIONS=3.13: on this one only
+	set -e; for version in $(VERSIONS); do $(MAKE) unit PYTHON=python$$version VENV=.cache/python$$version; done
 
 integration: $(DEV_READY) ## run the tests with real sockets and processes
 	$(BIN)/pytest tests/integration

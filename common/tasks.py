@@ -308,6 +308,9 @@ def _source_hash(function: Callable[..., Any], setup: Callable[[], Any] | None, 
 
 def _source(of: Any) -> str:
     try:
+        # Code of exec and of `python -c` has this file name. Python 3.13 keeps the source of -c under it.
+        if inspect.getfile(inspect.unwrap(of)) == "<string>":
+            return ""
         return textwrap.dedent(inspect.getsource(of))
     except (OSError, TypeError):
         return ""
