@@ -40,7 +40,7 @@ from offboard.robot_client.settings import Settings, check_types
 from offboard.robot_client.sites import heartbeat
 from offboard.robot_client.sites.absence import Absent, absent_sites, wait_for_sites
 from offboard.robot_client.sites.clock import Clock, SystemClock
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, TIMEOUT_S, Execution, Runner, checked_timeout
+from offboard.robot_client.sites.runner import ONBOARD, TIMEOUT_S, Execution, Runner, checked_timeout
 
 LATE_MAX = 64  # executions that ended after their task was answered, kept for the next record
 
@@ -127,13 +127,17 @@ class Offloader:
         check_types(cls.connect, locals())
         rare = settings or Settings()
         chosen, memories = rare.make_policy(policy), rare.make_memories(policy, window)
-        servers = ({CLOUD: endpoint} if endpoint else {}) | dict(sites or {})
         heartbeat_s = heartbeat.EVERY_S if rare.beats(policy) else 0.0
         with ExitStack() as opened:
             recording = Recording(trace=trace, metrics=metrics)
             opened.callback(recording.close)
             runners = make_runners(
-                servers, keys=keys, heartbeat_s=heartbeat_s, seed=rare.seed, states=rare.states
+                endpoint,
+                sites or {},
+                keys=keys,
+                heartbeat_s=heartbeat_s,
+                seed=rare.seed,
+                states=rare.states,
             )
             for runner in runners:
                 opened.callback(runner.close)

@@ -1,7 +1,7 @@
 """Tasks whose arguments or results cannot be sent. Robot and server load them as `tests.crossing_tasks`."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,6 +64,13 @@ def raising() -> Raising:
     return value
 
 
+class Sealed(list[Any]):
+    """Its items cannot be read."""
+
+    def __iter__(self) -> Iterator[Any]:
+        raise RuntimeError("sealed")
+
+
 # What cannot be sent, with a part of the reason.
 UNSENDABLE: dict[str, tuple[Callable[[], Any], str]] = {
     "a set": (lambda: {"poses": [Known(1), Known({2})]}, "['poses'][1].x: a value of type builtins.set"),
@@ -85,6 +92,11 @@ UNSENDABLE: dict[str, tuple[Callable[[], Any], str]] = {
         ": an array of 1 dimensions and dtype datetime",
     ),
     "a masked array": (lambda: np.ma.zeros(20_000), ": a value of type numpy.ma.MaskedArray"),
+    "a list that cannot be read": (lambda: Sealed([1]), ": a value of type tests.crossing_tasks.Sealed"),
+    "a view of terabytes": (
+        lambda: [np.broadcast_to(np.uint8(0), (2**42,))],
+        "[0]: an array of 4398046511104 bytes; at most ",
+    ),
     "too deep": (deep, "the value nests deeper than 32 levels"),
     "a circle": (circle, "the value nests deeper than 32 levels"),
     "too many arrays": (lambda: [np.zeros(1)] * 1001, ": the value holds more than 1000 arrays"),

@@ -31,7 +31,9 @@ ARRAYS_MAX = 1000  # arrays of one value that are sent in frames
 BLOBS_MAX = 64  # blobs that one value may refer to
 UNSCANNED_BYTES_MAX = 512  # of msgpack that is too short to announce a harmful number of items
 NESTING_MAX = 32
+DATACLASS_LEVELS = 3  # that a dataclass counts as: its message is a list with a map in it
 DIMENSIONS_MAX = 8
+ARRAY_BYTES_MAX = 2**31 - 1  # of one array: no message is larger
 PLACE_LENGTH_MAX = 80  # of the text that says where a bad part is
 
 _IN_FRAME, _IN_BLOB, _DATACLASS = 1, 2, 3
@@ -54,19 +56,21 @@ def encode(
     name: str = "",
     blobs: bool = False,
     along: Callable[[memoryview], bool] = lambda _: False,
+    array_bytes_max: int = ARRAY_BYTES_MAX,
 ) -> Body:
     """Encode None, bool, int, float, str, bytes, list, tuple, dict, arrays and dataclasses of `types`.
 
     With `blobs`, each array or bytes larger than BLOB_BYTES_MIN becomes a blob: the value holds only its
     digest. If `along` returns True for the bytes of an array, the array is sent in a frame instead.
-    Arrays are not copied, so do not change them before the frames are sent. BadValue says what cannot be
-    sent and where it is, such as `result['poses'][3].x`; `name` is its first word.
+    Arrays are not copied, so do not change them before the frames are sent. One that is not contiguous is
+    copied, unless it has more than `array_bytes_max`. BadValue says what cannot be sent and where it is, such
+    as `result['poses'][3].x`; `name` is its first word.
     """
-    encoder = _Encoder(types, use_blobs=blobs, along=along)
+    encoder = _Encoder(types, use_blobs=blobs, along=along, array_bytes_max=array_bytes_max)
     try:
         main = encoder.pack(value, 0)
     except BadValue as error:
-        place = name + _shortened(_place_of_bad(value, types, 0))
+        place = name + _shortened(_place_of_bad(value, encoder, 0))
         raise BadValue(f"{place}: {error}" if place else str(error)) from error
     if len(main) > VALUE_BYTES_MAX:
         raise BadValue(
@@ -103,11 +107,17 @@ class _Encoder:
     """Turns a value into a tree for msgpack, and collects the frames of arrays and the blobs."""
 
     def __init__(
-        self, types: Sequence[type], *, use_blobs: bool, along: Callable[[memoryview], bool]
+        self,
+        types: Sequence[type],
+        *,
+        use_blobs: bool,
+        along: Callable[[memoryview], bool],
+        array_bytes_max: int,
     ) -> None:
         self.types = types
         self.use_blobs = use_blobs
         self.along = along
+        self.array_bytes_max = array_bytes_max
         self.frames: list[Buffer] = []
         self.blobs: dict[bytes, memoryview] = {}
 
@@ -167,6 +177,9 @@ class _Encoder:
                 f"an array of {array.ndim} dimensions and dtype {array.dtype} cannot be sent; "
                 f"allowed are {DIMENSIONS_MAX} dimensions of numbers"
             )
+        # Such a view may have more bytes than there is memory.
+        if not array.flags.c_contiguous and array.nbytes > self.array_bytes_max:
+            raise BadValue(f"an array of {array.nbytes} bytes; at most {self.array_bytes_max} are allowed")
         raw = np.asarray(array, order="C").reshape(-1).view(np.uint8).data
         if self.use_blobs and raw.nbytes > BLOB_BYTES_MIN and not self.along(raw):
             return self._blob(array_digest(array, raw), raw, array.dtype.str, array.shape)
@@ -183,13 +196,14 @@ class _Encoder:
         return msgpack.ExtType(_IN_BLOB, msgpack.packb((digest, dtype, shape)))
 
 
-def _place_of_bad(value: Any, types: Sequence[type], depth: int) -> str:
+def _place_of_bad(value: Any, like: _Encoder, depth: int) -> str:
     """Where the part is that cannot be sent, such as `[0].pose['x']`. It is found by encoding each part."""
-    for place, part, deeper in _parts(value, types, depth) if depth <= NESTING_MAX else ():
+    for place, part, deeper in _parts(value, like.types, depth) if depth <= NESTING_MAX else ():
+        encoder = _Encoder(like.types, use_blobs=False, along=bool, array_bytes_max=like.array_bytes_max)
         try:
-            _Encoder(types, use_blobs=False, along=bool).pack(part, deeper)
+            encoder.pack(part, deeper)
         except BadValue:
-            return place + _place_of_bad(part, types, deeper)
+            return place + _place_of_bad(part, like, deeper)
     return ""
 
 
@@ -199,10 +213,10 @@ def _parts(value: Any, types: Sequence[type], depth: int) -> Iterator[tuple[str,
     if kind is list or kind is tuple:
         yield from ((f"[{index}]", one, depth + 1) for index, one in enumerate(value))
     elif kind is dict:
-        yield from ((f"[{key!r}]", one, depth + 1) for key, one in value.items())
+        yield from ((f"[{key!r}]", one, depth + 1) for key, one in value.items() if type(key) in (str, int))
     elif kind in types:
         with contextlib.suppress(BadValue):
-            yield from ((f".{name}", one, depth + 3) for name, one in fields_of(value).items())
+            yield from ((f".{name}", one, depth + DATACLASS_LEVELS) for name, one in fields_of(value).items())
 
 
 def _shortened(place: str) -> str:

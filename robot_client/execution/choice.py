@@ -13,7 +13,7 @@ from offboard.robot_client.sites.runner import ONBOARD
 
 def check_where(where: str, kind: Kind, sites: Collection[str]) -> None:
     """ConfigError unless a task of this kind may be pinned there."""
-    if where != BOTH and where not in sites:
+    if where != BOTH and where not in list(sites):
         raise ConfigError(f"where={where!r} is not one of {', '.join([*sites, BOTH])}")
     if where == BOTH and not kind.duplicate:
         raise ConfigError(f"where='both': task {kind.name} is declared duplicate=False")

@@ -33,7 +33,7 @@ from offboard.robot_client.sites.absence import CrossingPauses
 from offboard.robot_client.sites.background import Background
 from offboard.robot_client.sites.blob_uploads import BlobUploads
 from offboard.robot_client.sites.cloud_socket import MESSAGE_BYTES_MAX, CloudSocket, SocketEvent
-from offboard.robot_client.sites.connection import Action, Connection, HandshakeFailure
+from offboard.robot_client.sites.connection import LOG_PAUSE_S, Action, Connection, HandshakeFailure
 from offboard.robot_client.sites.heartbeat import EARLY_S, Heartbeat, ServerReport
 from offboard.robot_client.sites.pending_request import PendingRequest
 from offboard.robot_client.sites.runner import CLOUD, Condition, Execution, Lasting, check_endpoint
@@ -43,7 +43,7 @@ PENDING_MAX = 1024
 ATTEMPTS_MAX = 4  # sends of one request: the first, and one after each `need_blob`
 CLOSE_WAIT_S = 2.0
 IDLE_WAIT_S = 1.0
-LOG_PAUSE_S = 10.0  # at least, between two warnings about bad messages
+READ_MAX = 100  # messages read at once: a server that floods the robot must not keep tasks waiting
 
 log = logging.getLogger(__name__)
 
@@ -116,7 +116,14 @@ class CloudRunner:
         published_s = time.perf_counter()
         try:
             inline = self._uploads.inline_rule(task.kind.name, self._message_bytes_max)
-            body = wire.encode(list(task.args), task.kind.types, name="arguments", blobs=True, along=inline)
+            body = wire.encode(
+                list(task.args),
+                task.kind.types,
+                name="arguments",
+                blobs=True,
+                along=inline,
+                array_bytes_max=self._message_bytes_max,
+            )
         except Exception as error:  # noqa: BLE001 - whatever cannot be sent, onboard can answer
             why = str(error) if isinstance(error, BadValue) else f"arguments: {describe(error)}"
             return self._cannot_cross(task, why)
@@ -148,7 +155,10 @@ class CloudRunner:
         return pending.future
 
     def bytes_to_send(self, task: Task) -> int:
-        return payload_bytes(task.args, self._uploads.probably_carried)
+        try:
+            return payload_bytes(task.args, self._uploads.probably_carried)
+        except Exception:  # noqa: BLE001 - such as a list that another thread changes meanwhile
+            return 0
 
     def cancel(self, task: Task) -> None:
         self._cancelled.append(task.id)
@@ -204,7 +214,9 @@ class CloudRunner:
         self._socket.wait(wakes_s - now_s)
         with self._socket.lock:
             self._reader_wakes_s = None
-            while frames := self._socket.receive():
+            for _ in range(READ_MAX):
+                if (frames := self._socket.receive()) is None:
+                    break
                 self._read([frame.buffer for frame in frames], time.perf_counter())
 
     def _follow_connection(self) -> None:
@@ -286,7 +298,7 @@ class CloudRunner:
         try:
             self._take(wire.unpack(frames), received_s, wire.byte_count(frames))
         except wire.VersionMismatch as error:
-            self._connection.other_version(str(error))
+            self._connection.other_version(str(error), received_s)
         except ProtocolError as error:
             if received_s - self._warned_s >= LOG_PAUSE_S:
                 self._warned_s = received_s
@@ -300,7 +312,7 @@ class CloudRunner:
     def _take(self, message: wire.Message, received_s: float, bytes_in: int) -> None:
         if isinstance(message, wire.Hello):
             self._remote, self._message_bytes_max = message.tasks, message.message_bytes_max
-            if self._connection.hello_answered():
+            if self._connection.hello_answered(received_s):
                 self._heartbeat.start(received_s)
             return
         if not isinstance(message, wire.Pong | wire.Reply):

@@ -8,10 +8,13 @@ import math
 from dataclasses import dataclass
 from enum import Enum, auto
 
+from offboard.common.token_bucket import Bucket
 from offboard.robot_client.sites.runner import Lasting
 
 HELLO_EVERY_S = 1.0  # until it is answered
 CONNECT_EVERY_S = 1.0  # once libzmq has stopped trying
+LOG_LINES_MAX = 10  # about one connection; once they are used up, one in LOG_PAUSE_S
+LOG_PAUSE_S = 10.0
 
 log = logging.getLogger(__name__)
 
@@ -75,6 +78,7 @@ class Connection:
     def __init__(self, site: str, endpoint: str) -> None:
         self._site = site
         self._endpoint = endpoint
+        self._lines, self._logged_s = Bucket(1 / LOG_PAUSE_S, LOG_LINES_MAX), -math.inf
         self.state = State.CONNECTING
         self.why_absent: str | None = None
         self._move(State.CONNECTING)
@@ -84,7 +88,7 @@ class Connection:
 
     def handshake_failed(self, failure: HandshakeFailure, now_s: float) -> None:
         if failure.text == UNKNOWN_ROBOT != self._detail and self.state is not State.CLOSED:
-            log.warning("%s: %s: %s; asking again", self._site, self._endpoint, failure.text)
+            self._log(logging.WARNING, f"{self._endpoint}: {failure.text}; asking again", now_s)
         if failure.final:
             self._move(State.GIVEN_UP, failure.text, due_s=now_s + CONNECT_EVERY_S)
         else:
@@ -96,25 +100,25 @@ class Connection:
             self.due_s = now_s + CONNECT_EVERY_S
         elif self.state is not State.HANDSHAKE_FAILED:
             if self.state is State.UP:
-                log.warning("%s: connection to %s lost", self._site, self._endpoint)
+                self._log(logging.WARNING, f"connection to {self._endpoint} lost", now_s)
             self._move(State.LOST)
 
-    def hello_answered(self) -> bool:
+    def hello_answered(self, now_s: float) -> bool:
         """The server has answered `hello`. Returns whether that brought the site up.
 
         An answer that an earlier connection left behind does not.
         """
         if self.state not in (State.GREETING, State.INCOMPATIBLE):
             return False
-        log.info("%s: %s is up", self._site, self._endpoint)
+        self._log(logging.INFO, f"{self._endpoint} is up", now_s)
         self._move(State.UP)
         return True
 
-    def other_version(self, why: str) -> None:
+    def other_version(self, why: str, now_s: float) -> None:
         """A message came in another version of the wire format."""
         if self.state in (State.INCOMPATIBLE, State.GIVEN_UP, State.CLOSED):
             return
-        log.warning("%s: %s: tasks stay onboard", self._site, why)
+        self._log(logging.WARNING, f"{why}: tasks stay onboard", now_s)
         self._move(State.INCOMPATIBLE, why)
         self.why_absent = Lasting(why)
 
@@ -130,6 +134,15 @@ class Connection:
             return Action.SAY_HELLO
         self._move(State.HANDSHAKE_FAILED, self._detail)
         return Action.CONNECT_AGAIN
+
+    def _log(self, level: int, text: str, now_s: float) -> None:
+        """A server that comes and goes, or that lies, must not fill the log."""
+        self._lines.fill(now_s - self._logged_s)
+        self._logged_s = now_s
+        if self._lines.level >= 1:
+            self._lines.take(1)
+            rest = "" if self._lines.level >= 1 else f" (others within {LOG_PAUSE_S:g} s are not logged)"
+            log.log(level, "%s: %s%s", self._site, text, rest)
 
     def _move(self, state: State, detail: str = "", *, due_s: float = math.inf) -> None:
         if self.state is State.CLOSED:

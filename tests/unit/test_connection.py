@@ -9,6 +9,8 @@ import pytest
 from offboard.robot_client.sites.connection import (
     CONNECT_EVERY_S,
     HELLO_EVERY_S,
+    LOG_LINES_MAX,
+    LOG_PAUSE_S,
     NO_HANDSHAKE,
     UNKNOWN_ROBOT,
     Action,
@@ -28,8 +30,8 @@ HANDSHAKE: Event = lambda one: one.handshake_succeeded(NOW_S)  # noqa: E731 - on
 HANDSHAKE_BROKEN: Event = lambda one: one.handshake_failed(BROKEN, NOW_S)  # noqa: E731
 REFUSAL: Event = lambda one: one.handshake_failed(UNKNOWN, NOW_S)  # noqa: E731
 DISCONNECT: Event = lambda one: one.disconnected(NOW_S)  # noqa: E731
-HELLO: Event = lambda one: one.hello_answered()  # noqa: E731
-OTHER_VERSION: Event = lambda one: one.other_version(VERSIONS)  # noqa: E731
+HELLO: Event = lambda one: one.hello_answered(NOW_S)  # noqa: E731
+OTHER_VERSION: Event = lambda one: one.other_version(VERSIONS, NOW_S)  # noqa: E731
 CLOSE: Event = lambda one: one.close()  # noqa: E731
 EVENTS = [HANDSHAKE, HANDSHAKE_BROKEN, REFUSAL, DISCONNECT, HELLO, OTHER_VERSION, CLOSE]
 
@@ -111,7 +113,7 @@ def test_hello_is_said_at_once_and_again_until_it_is_answered() -> None:
     assert connection.take_due(NOW_S) is Action.SAY_HELLO
     assert connection.take_due(NOW_S + 0.99 * HELLO_EVERY_S) is None
     assert connection.take_due(NOW_S + HELLO_EVERY_S) is Action.SAY_HELLO
-    assert connection.hello_answered()
+    assert connection.hello_answered(NOW_S)
     assert connection.take_due(NOW_S + 10 * HELLO_EVERY_S) is None
 
 
@@ -134,12 +136,12 @@ def test_a_refused_robot_connects_again_after_a_pause() -> None:
 def test_only_the_first_answer_to_hello_brings_the_site_up() -> None:
     """A second answer changes nothing, and neither does one that a lost connection left behind."""
     connection = led_to(GREETING)
-    assert connection.hello_answered()
-    assert not connection.hello_answered()
+    assert connection.hello_answered(NOW_S)
+    assert not connection.hello_answered(NOW_S)
     connection.disconnected(NOW_S)
-    assert not connection.hello_answered()
+    assert not connection.hello_answered(NOW_S)
     connection.handshake_succeeded(NOW_S)
-    assert connection.hello_answered()
+    assert connection.hello_answered(NOW_S)
 
 
 def test_the_log_says_each_change_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -157,3 +159,17 @@ def test_the_log_says_each_change_once(caplog: pytest.LogCaptureFixture) -> None
         f"cloud: {ENDPOINT}: {UNKNOWN_ROBOT}; asking again",
         f"cloud: {VERSIONS}: tasks stay onboard",
     ]
+
+
+def test_a_server_that_comes_and_goes_does_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    """The first lines are logged, and then one in LOG_PAUSE_S, which says that others are not."""
+    connection = Connection("cloud", ENDPOINT)
+    pauses = 3
+    with caplog.at_level(logging.INFO):
+        for number in range(1001):
+            connection.handshake_succeeded(NOW_S)
+            connection.other_version(VERSIONS, NOW_S + number / 1000 * (pauses + 0.5) * LOG_PAUSE_S)
+    lines = [record.getMessage() for record in caplog.records]
+    left_out = [line for line in lines if line.endswith("(others within 10 s are not logged)")]
+    assert len(lines) == LOG_LINES_MAX + pauses
+    assert left_out == lines[LOG_LINES_MAX - 1 :]

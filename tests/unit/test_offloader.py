@@ -1,6 +1,7 @@
 """The offloader answers every task, whether its sites are good, late, failing or missing."""
 
 import asyncio
+import re
 import threading
 from collections.abc import Callable
 
@@ -154,6 +155,14 @@ def test_an_unavailable_site_gets_no_task(make: Make) -> None:
     assert len(cloud.tasks) == 1
 
 
+def test_a_wait_for_sites_that_is_no_number_ends_at_once(make: Make) -> None:
+    """It says why a site is absent, and does not wait for ever."""
+    cloud = cloud_answers()
+    cloud.absent = "not connected"
+    with make(cloud, OnboardRunner()) as offload:
+        assert offload.wait_for_sites(add_one, float("nan"))[CLOUD] == "not connected"
+
+
 def test_where_pins_a_call(make: Make) -> None:
     """`onboard` stays on the robot, `both` runs on every site, and an unknown site is an error."""
     cloud = cloud_answers()
@@ -163,8 +172,11 @@ def test_where_pins_a_call(make: Make) -> None:
         offload(add_one, 1, where="both")
         assert offload.last is not None
         assert [one.site for one in offload.last.executions] == [CLOUD, ONBOARD]
-        with pytest.raises(ConfigError, match="'edge' is not one of cloud, onboard, both"):
-            offload(add_one, 1, where="edge")
+        for wrong in ("edge", ["cloud"], 5):
+            with pytest.raises(
+                ConfigError, match=f"{re.escape(repr(wrong))} is not one of cloud, onboard, both"
+            ):
+                offload(add_one, 1, where=wrong)  # type: ignore[arg-type]
 
 
 def test_a_task_declared_duplicate_false_never_runs_twice(make: Make) -> None:

@@ -135,6 +135,24 @@ def test_a_wrong_type_is_one_error_of_connect(given: dict[str, Any], says: str) 
         Offloader.connect(**given)
 
 
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"keys": "k"}, "keys: k needs an endpoint, the server to use"),
+        ({"keys": Path("k"), "sites": {}}, "keys: k needs an endpoint, the server to use"),
+        ({"endpoint": ""}, "cloud: '' is not tcp://HOST:PORT with a port 1 to 65535"),
+        (
+            {"endpoint": "tcp://h:1", "sites": {"cloud": "tcp://h:2"}},
+            "sites: 'cloud' is the name of the server at tcp://h:1; choose another one",
+        ),
+    ],
+)
+def test_a_missing_or_ambiguous_server_is_one_error_of_connect(given: dict[str, Any], says: str) -> None:
+    """Keys without a server, an empty endpoint, or two servers of one name are not what the user meant."""
+    with pytest.raises(ConfigError, match=f"^{re.escape(says)}$"):
+        Offloader.connect(**given)
+
+
 @pytest.mark.parametrize(("given", "says"), WRONG_SETTINGS)
 def test_a_wrong_type_is_one_error_of_the_settings(given: dict[str, Any], says: str) -> None:
     """Settings are checked when they are made."""

@@ -1,6 +1,7 @@
 """Encoding and decoding values, and ProtocolError for malformed ones."""
 
 import hashlib
+import re
 import tracemalloc
 from typing import Any
 
@@ -171,6 +172,19 @@ def test_the_place_of_what_cannot_be_sent_is_named(value: Any, place: str) -> No
     assert str(caught.value).startswith(f"result{place}")
 
 
+class Unshown:
+    """A key whose text cannot be read."""
+
+    def __repr__(self) -> str:
+        raise SystemExit
+
+
+def test_a_key_that_cannot_be_shown_is_no_place() -> None:
+    """The error is that of the key."""
+    with pytest.raises(BadValue, match=r"^\[0\]: a dict key of type Unshown cannot be sent"):
+        wire.encode([{Unshown(): {1}}], [Pose])
+
+
 def nested(levels: int) -> list[Any]:
     value: list[Any] = [b""]
     for _ in range(levels):
@@ -192,6 +206,37 @@ def test_nesting_is_limited_on_both_sides() -> None:
     circle.append(circle)
     with pytest.raises(BadValue, match="32 levels"):
         wire.encode(circle)
+
+
+@pytest.mark.parametrize("count", [1, 10])
+def test_a_dataclass_counts_as_several_levels(count: int) -> None:
+    """With DATACLASS_LEVELS for each, the deepest value is sent, and one level more is refused."""
+
+    def within(value: Any) -> Any:
+        for _ in range(count):
+            value = Pose(value, 0, [])
+        return value
+
+    left = values.NESTING_MAX - count * values.DATACLASS_LEVELS
+    deepest = within(nested(left))
+    assert wire.decode(wire.encode(deepest, [Pose]).frames, [Pose], {}) == deepest
+    with pytest.raises(BadValue, match="32 levels"):
+        wire.encode(within(nested(left + 1)), [Pose])
+
+
+@pytest.mark.parametrize("code", np.typecodes["AllInteger"] + np.typecodes["AllFloat"] + "?")
+@pytest.mark.parametrize("order", "<>")
+def test_numbers_of_up_to_8_bytes_are_sent(code: str, order: str) -> None:
+    """Arrays of each type are, and complex numbers of 16 bytes; `longdouble` and `clongdouble` are not."""
+    dtype = np.dtype(code).newbyteorder(order)
+    if dtype.itemsize <= 8 * (1 + (dtype.kind == "c")):
+        array = np.arange(3).astype(dtype)
+        got = wire.decode(wire.encode(array).frames, [], {})
+        assert (got.dtype, got.tolist()) == (dtype, array.tolist())
+    else:
+        assert code in "gG"
+        with pytest.raises(BadValue, match=f"dtype {re.escape(str(dtype))} cannot be sent"):
+            wire.encode(np.zeros(3, dtype))
 
 
 def place(*what: Any, code: int = 1) -> bytes:

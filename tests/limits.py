@@ -1,0 +1,193 @@
+"""The limits that `docs/operations.md` names: for each row of the table, the constants behind its numbers.
+
+`unit/test_limits.py` compares them with the table.
+"""
+
+from dataclasses import fields
+from typing import Any
+
+from offboard.cloud_server import (
+    authorisation,
+    http_api,
+    rate_limit,
+    robot_socket,
+    scheduler,
+    server,
+    tcp_connections,
+    worker,
+    worker_pool,
+)
+from offboard.cloud_server.config import ServerConfig
+from offboard.common import task_states, tasks, tracebacks
+from offboard.common.planning import maps, planner
+from offboard.common.security import bounded_http, private_files
+from offboard.common.wire import channel, messages, values
+from offboard.loadgen.relay import control_api, link_schedule
+from offboard.loadgen.relay.link import delay_samples
+from offboard.loadgen.relay.tcp import forwarder, link_record
+from offboard.loadgen.relay.toxiproxy import toxiproxy_api
+from offboard.loadgen.relay.wan import WanConfig
+from offboard.loadgen.robot import run, workload
+from offboard.loadgen.robot.run_settings import RunSettings
+from offboard.loadgen.scenario import event_timeline, scenario
+from offboard.loadgen.table import measured_rows
+from offboard.loadgen.testbed import docker_engine, docker_images
+from offboard.robot_client import lifetime, offloader
+from offboard.robot_client.execution import placement
+from offboard.robot_client.learning import store
+from offboard.robot_client.policies import allowance
+from offboard.robot_client.predictors import base, window
+from offboard.robot_client.records import trace
+from offboard.robot_client.sites import absence, cloud, cloud_socket, connection, onboard, runner
+
+
+def default(config: type, name: str) -> Any:
+    """The default of a setting."""
+    return next(field.default for field in fields(config) if field.name == name)
+
+
+def most(config: type, name: str) -> Any:
+    """The largest value that a setting may have."""
+    return next(field.metadata["maximum"] for field in fields(config) if field.name == name)
+
+
+def same(*numbers: float) -> float:
+    """The number that several constants have in common."""
+    (number,) = set(numbers)
+    return number
+
+
+ROBOT = {
+    "tasks of one process; the name of a task; the numbers of a size": [
+        tasks.KINDS_MAX,
+        tasks.NAME_LENGTH_MAX,
+        tasks.SIZE_NUMBERS_MAX,
+    ],
+    "arguments, or the result, of one task": [
+        values.VALUE_BYTES_MAX,
+        values.ARRAYS_MAX,
+        values.BLOBS_MAX,
+        values.BLOB_BYTES_MIN,
+        values.NESTING_MAX,
+        values.DATACLASS_LEVELS,
+        values.DIMENSIONS_MAX,
+    ],
+    "one message: the arguments, the result, or one large argument": [
+        default(ServerConfig, "message_mib"),
+        cloud_socket.MESSAGE_BYTES_MAX,
+    ],
+    "calls in a row whose values cannot be sent": [
+        absence.PAUSE_AFTER,
+        absence.PAUSE_S,
+        2 * absence.PAUSE_S,
+        absence.PAUSE_MAX_S,
+    ],
+    "waiting for the answer of a server": [runner.TIMEOUT_S, runner.TIMEOUT_MAX_S],
+    "sends of one task, if the server has forgotten large arguments": [cloud.ATTEMPTS_MAX],
+    "tasks in flight to one server; of a batch": [cloud.PENDING_MAX, placement.SERVER_IN_FLIGHT_MAX],
+    "an attempt to connect; unacknowledged bytes": [
+        cloud_socket.CONNECT_MS / 1e3,
+        cloud_socket.UNACKNOWLEDGED_MS / 1e3,
+        cloud_socket.RECONNECT_MS / 1e3,
+        cloud_socket.RECONNECT_MAX_MS / 1e3,
+    ],
+    "free files and threads for `connect`": [channel.FILES, channel.THREADS],
+    "cancelled onboard runs that go on": [onboard.ABANDONED_MAX],
+    "calls of `Offloader.run` at a time": [lifetime.ASYNC_CALLS_MAX],
+    "a setup that raised": [task_states.SETUP_AGAIN_S],
+    "`--in-flight`: tasks of a run that were not answered yet": [
+        default(RunSettings, "in_flight"),
+        most(RunSettings, "in_flight"),
+    ],
+    "tasks and inputs that are made ahead of their time": [
+        run.MADE_MAX,
+        run.MADE_FIRST_MAX,
+        run.LARGE_MADE_MAX,
+    ],
+    "second runs saved up, or owed": [allowance.DUPLICATES_MAX],
+    "observations of a kind on a site": [window.WINDOW_MAX, base.REMEMBERED],
+    "late executions that the next record names": [offloader.LATE_MAX],
+    "records that wait for the disk of `trace`": [trace.WAITING_MAX, trace.ROOM_WAIT_S],
+    "`close`: runs onboard; each server; trace; memory": [
+        onboard.CLOSE_WAIT_S,
+        cloud.CLOSE_WAIT_S,
+        trace.CLOSE_WAIT_S,
+        store.WRITE_WAIT_S,
+        2 * store.WRITE_WAIT_S,
+    ],
+    "the memory file": [store.FILE_BYTES_MAX],
+    "log lines about bad messages; about the connection to a server": [
+        connection.LOG_PAUSE_S,
+        connection.LOG_LINES_MAX,
+        connection.LOG_PAUSE_S,
+    ],
+    "messages that are read at once from a server": [cloud.READ_MAX],
+    "rows of a CSV file of sizes, or of a dataset": [same(workload.ROWS_MAX, measured_rows.ROWS_MAX)],
+}
+
+SERVER = {
+    "requests waiting": [default(ServerConfig, "queue_max")],
+    "large arguments kept": [default(ServerConfig, "blob_mib")],
+    "one message": [default(ServerConfig, "message_mib")],
+    "bytes that a robot sends": [
+        default(ServerConfig, "robot_mib_s"),
+        rate_limit.MESSAGE_BYTES,
+        default(ServerConfig, "robot_mib_s") * 2**20 / rate_limit.MESSAGE_BYTES,
+        rate_limit.BUSY_A_S,
+    ],
+    "bytes that a robot sends beyond that": [rate_limit.EXCESS_S, rate_limit.CUT_OFF_S],
+    "bytes sent but not yet read by the server": [tcp_connections.MESSAGES_UNREAD],
+    "replies that a robot does not read": [robot_socket.PEER_MESSAGES_MAX],
+    "robots that a server knows": [authorisation.ROBOTS_MAX],
+    "a handshake": [robot_socket.HANDSHAKE_S],
+    "a robot that vanished silently": [
+        robot_socket.KEEPALIVE_IDLE_S + robot_socket.KEEPALIVE_EVERY_S * robot_socket.KEEPALIVE_PROBES
+    ],
+    "free files and threads at the start": [channel.FILES, channel.THREADS],
+    "a key file; the token": [private_files.PRIVATE_BYTES_MAX, private_files.TOKEN_CHARS_MIN],
+    "HTTP connections": [
+        bounded_http.CONNECTIONS_MAX,
+        http_api.CONNECTIONS_A_S,
+        http_api.CONNECTIONS_AT_ONCE,
+        bounded_http.REQUEST_S,
+    ],
+    "worker processes": [
+        worker_pool.SPARES,
+        worker.RESTART_PAUSE_S,
+        worker.FAILED_PAUSE_S,
+        worker.START_S_MAX,
+    ],
+    "memory of a worker process": [default(ServerConfig, "worker_memory") * 2**20],
+    "a task in a worker process": [worker.OVERTIME_S],
+    "workers that one request costs": [scheduler.CRASHES_MAX],
+    "the text of an error; its traceback": [messages.ERROR_LENGTH_MAX, tracebacks.TRACEBACK_LENGTH_MAX],
+    "log lines about bad messages, and about refused robots": [
+        same(server.LOG_PAUSE_S, authorisation.LOG_PAUSE_S)
+    ],
+    "time to finish tasks after SIGTERM": [default(ServerConfig, "drain_s")],
+}
+
+BENCH = {
+    "a map": [round(maps.CELLS_MAX, -6)],
+    "a scan; the radius of a robot": [planner.BEAMS_MAX, planner.RADIUS_CELLS_MAX],
+    "maps that the planner keeps ready": [planner.PREPARED_MAX, round(planner.PREPARED_CELLS_MAX, -6)],
+    "connections of the relay": [default(WanConfig, "connections_max")],
+    "bytes in the relay": [default(WanConfig, "buffer_bytes"), forwarder.CHUNKS_MAX],
+    "a request to the relay": [control_api.BODY_BYTES_MAX, toxiproxy_api.BODY_BYTES_MAX],
+    "events of a schedule or a scenario; samples of a delay": [
+        same(event_timeline.EVENTS_MAX, link_schedule.EVENTS_MAX),
+        delay_samples.SAMPLES_MAX,
+    ],
+    "the record of the link": [link_record.WAITING_BYTES_MAX],
+    "robots of a scenario": [scenario.ROBOTS_MAX],
+    "Docker": [docker_engine.ANSWER_S, docker_images.BUILD_S],
+}
+
+CONSTANTS = ROBOT | SERVER | BENCH
+
+# Why there is no constant.
+WITHOUT = {
+    "tasks that run onboard at a time": "the runner of the robot has one worker thread",
+    "`trace` and `memory`": "it is a kind of file, not a number",
+    "connections of robots": "the kernel sets this limit",
+}
