@@ -127,17 +127,12 @@ class Offloader:
         check_types(cls.connect, locals())
         rare = settings or Settings()
         chosen, memories = rare.make_policy(policy), rare.make_memories(policy, window)
-        heartbeat_s = heartbeat.EVERY_S if rare.beats(policy) else 0.0
+        beat_s = heartbeat.EVERY_S if rare.beats(policy) else 0.0
         with ExitStack() as opened:
             recording = Recording(trace=trace, metrics=metrics)
             opened.callback(recording.close)
             runners = make_runners(
-                endpoint,
-                sites or {},
-                keys=keys,
-                heartbeat_s=heartbeat_s,
-                seed=rare.seed,
-                states=rare.states,
+                endpoint, sites or {}, keys=keys, heartbeat_s=beat_s, seed=rare.seed, states=rare.states
             )
             for runner in runners:
                 opened.callback(runner.close)

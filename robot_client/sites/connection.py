@@ -142,7 +142,7 @@ class Connection:
         if self._lines.level >= 1:
             self._lines.take(1)
             rest = "" if self._lines.level >= 1 else f" (others within {LOG_PAUSE_S:g} s are not logged)"
-            log.log(level, "%s: %s%s", self._site, text, rest)
+            log.log(level, "%s: %s", self._site, text + rest)
 
     def _move(self, state: State, detail: str = "", *, due_s: float = math.inf) -> None:
         if self.state is State.CLOSED:
