@@ -26,8 +26,12 @@ def payload_bytes(value: Any, known: Known = lambda _: False) -> int:
     """The bytes of arrays, texts and numbers; small integers count as much as large ones.
 
     A large array or `bytes` for which `known` returns True counts as nothing: the other side has it already.
+    A value that cannot be read, such as a list that another thread changes, counts as a number.
     """
-    return _bytes(value, known, LOOKS_MAX, 0)
+    try:
+        return _bytes(value, known, LOOKS_MAX, 0)
+    except Exception:  # noqa: BLE001 - the code of such a value may raise anything, and sending it says what
+        return NUMBER_BYTES
 
 
 def _bytes(value: Any, known: Known, looks: int, depth: int) -> int:

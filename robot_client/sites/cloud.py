@@ -155,10 +155,7 @@ class CloudRunner:
         return pending.future
 
     def bytes_to_send(self, task: Task) -> int:
-        try:
-            return payload_bytes(task.args, self._uploads.probably_carried)
-        except Exception:  # noqa: BLE001 - such as a list that another thread changes meanwhile
-            return 0
+        return payload_bytes(task.args, self._uploads.probably_carried)
 
     def cancel(self, task: Task) -> None:
         self._cancelled.append(task.id)
