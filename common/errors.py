@@ -14,7 +14,8 @@ def describe(error: BaseException) -> str:
     except BaseException as unreadable:  # a user's __str__ may raise anything
         if is_interrupt(unreadable):
             raise
-        return f"{type(error).__name__}: (it has no readable text)"
+        name = type.__dict__["__name__"].__get__(type(error))  # its own class may hide it
+        return f"{name}: (it has no readable text)"
 
 
 def of_task(kind: str, text: str) -> str:

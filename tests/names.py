@@ -16,7 +16,7 @@ from pathlib import Path
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.sites.runner import CLOUD
 from tests.cables import START_S, server, shell, wait_for_cloud
-from tests.leftovers import left
+from tests.leftovers import left, left_for_good
 
 SIX, FOUR = "fd77::2", "10.77.0.2"
 LOOKUP_S = 30.0  # glibc asks for up to 10 s for each kind of address
@@ -54,7 +54,7 @@ def kinds() -> dict[str, tuple[float, int]]:
 
 def silent() -> tuple[float, tuple[int, int]]:
     Offloader.connect("tcp://127.0.0.1:9").close()  # opens what stays open
-    before = left()
+    before = left_for_good()
     with socket.socket(type=socket.SOCK_DGRAM) as dns:
         dns.bind((FOUR, 53))
         offload = Offloader.connect("tcp://unknown:5555", policy=CLOUD)

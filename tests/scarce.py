@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -32,26 +32,35 @@ FILES_TRIED, THREADS_TRIED = 32, 12
 THREAD_BYTES = resource.getrlimit(resource.RLIMIT_STACK)[0] + (1 << 16)
 SPARE_BYTES = 4 << 20
 MIB = 1 << 20
+ATTEMPT_S = 1.5  # after which libzmq has closed the file of an attempt to connect that was under way
 AWAY_S = 3.0  # longer than the pauses between attempts to connect
 NOTHING_THERE = "tcp://127.0.0.1:9"
 WAITING_SERVER = 'read _; exec "$0" -m offboard.cloud_server "$@"'
 
 
 @contextmanager
-def files_left(count: int) -> Iterator[None]:
-    """All files but `count` are open."""
+def files_left(count: int, *, watch_s: float = 0.0) -> Iterator[None]:
+    """All files but `count` are open, also those that libzmq closes within this time."""
     held: list[int] = []
-    try:
-        while True:
-            held.append(os.open(os.devnull, os.O_RDONLY))
-    except OSError:
-        for _ in range(count):
-            os.close(held.pop())
+    end_s = time.monotonic() + watch_s
+    while take_files(held) or time.monotonic() < end_s:
+        time.sleep(0.001)
+    for _ in range(count):
+        os.close(held.pop())
     try:
         yield
     finally:
         for file in held:
             os.close(file)
+
+
+def take_files(held: list[int]) -> bool:
+    """Open all files that are left. Whether there were any."""
+    before = len(held)
+    with suppress(OSError):
+        while True:
+            held.append(os.open(os.devnull, os.O_RDONLY))
+    return len(held) > before
 
 
 @contextmanager
@@ -123,7 +132,7 @@ def reconnect() -> str:
             servers[0].kill()
             while used(offload) == CLOUD:
                 pass
-            with files_left(0), files_left(0), files_left(0):  # libzmq opens and closes one now and then
+            with files_left(0, watch_s=ATTEMPT_S):
                 start(servers[1])
                 end_s = time.monotonic() + AWAY_S
                 while time.monotonic() < end_s:

@@ -15,7 +15,7 @@ from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD
-from tests.leftovers import left
+from tests.leftovers import left, left_for_good
 from tests.probes import echo, nap
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(240)]
@@ -28,8 +28,7 @@ SETTLED_S = 5.0  # for a thread that has just ended, on a busy machine
 def check_nothing_left(cycle: Callable[[int], None]) -> None:
     """Run the cycle once to load what stays loaded, then CYCLES times, and compare."""
     cycle(-1)
-    time.sleep(0.5)
-    before = left()
+    before = left_for_good()
     for number in range(CYCLES):
         cycle(number)
     end_s = time.monotonic() + SETTLED_S

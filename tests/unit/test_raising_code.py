@@ -29,6 +29,18 @@ class Unreadable(Exception):
         raise SystemExit("no text")
 
 
+class Nameless(type):
+    """A class whose name cannot be read."""
+
+    @property
+    def __name__(cls) -> str:  # type: ignore[override]
+        raise SystemExit("no name")
+
+
+class Hidden(Exception, metaclass=Nameless):
+    """An error that does not say what it is."""
+
+
 RAISED: list[BaseException] = [
     ValueError("text"),
     SystemExit(3),
@@ -119,6 +131,17 @@ def test_what_a_function_of_a_task_raises_is_one_error_with_its_name(error: Base
 
 
 @pytest.mark.usefixtures("fresh")
+def test_an_error_whose_class_has_no_name_is_one_error_too() -> None:
+    """It has a name all the same."""
+    with Offloader.connect() as offload:
+        raised.append(Hidden())
+        with pytest.raises(TaskFailed, match=r"^task fails: Hidden: \(it has no readable text\)$"):
+            offload(fails, 7)
+        raised.clear()
+        assert offload(sound, 7) == 7
+
+
+@pytest.mark.usefixtures("fresh")
 @pytest.mark.parametrize("way", CALLS)
 @pytest.mark.parametrize("error", RAISED, ids=lambda error: type(error).__name__)
 def test_what_an_observer_or_work_raises_costs_no_answer(
@@ -204,3 +227,4 @@ def test_an_error_of_the_cloud_names_the_task_once() -> None:
 def test_a_text_that_cannot_be_read_is_described() -> None:
     """The type is named, and the end of the process in `__str__` is not obeyed."""
     assert describe(Unreadable()) == "Unreadable: (it has no readable text)"
+    assert describe(Hidden()) == "Hidden: (it has no readable text)"
