@@ -168,19 +168,6 @@ def test_the_first_error_is_raised_when_all_tasks_have_ended(make: Make) -> None
     assert sorted(one.args[0] for one in cloud.tasks + onboard.tasks) == [-13, -2, 1, 5, 8]
 
 
-def test_every_site_is_warmed_up_with_different_tasks(make: Make) -> None:
-    """Each site first gets WARM_UP tasks of different sizes, one at a time, and no task runs twice."""
-    records: list[Record] = []
-    cloud, onboard = ScriptedRunner(CLOUD, answers(CLOUD)), ScriptedRunner(ONBOARD, answers(ONBOARD, 10.0))
-    make(cloud, onboard, records=records).map(doubled, range(20, 60))
-    warming = [record for record in records if record.decision.reason.startswith("warm-up")]
-    for site in (ONBOARD, CLOUD):
-        sizes = [record.size for record in warming if record.decision.site == site]
-        assert len(sizes) == WARM_UP
-        assert max(sizes) - min(sizes) >= 10
-    assert len({one.args[0] for one in cloud.tasks + onboard.tasks}) == len(cloud.tasks + onboard.tasks) == 40
-
-
 @pytest.fixture
 def mapped() -> Iterator[Mapped]:
     """Runs `map` in a thread, so that the test can release held tasks."""
@@ -190,6 +177,37 @@ def mapped() -> Iterator[Mapped]:
             return pool.submit(offload.map, *args, **options)
 
         yield start
+
+
+def release_all(done: "Future[list[Any]]", *runners: HeldRunner) -> list[Any]:
+    """Answer held tasks, first where most are held, until the batch is done."""
+    while not done.done():
+        with_tasks = [runner for runner in runners if runner.held]
+        if with_tasks:
+            max(with_tasks, key=lambda runner: len(runner.held)).release()
+    return done.result(WAIT_S)
+
+
+def test_every_site_is_warmed_up_with_different_tasks(make: Make, mapped: Mapped) -> None:
+    """Each site first gets WARM_UP tasks of different sizes, one at a time, and no task runs twice."""
+    records: list[Record] = []
+    cloud, onboard = HeldRunner(CLOUD, answers(CLOUD)), HeldRunner(ONBOARD, answers(ONBOARD, 10.0))
+    cloud.holding = onboard.holding = True  # otherwise one site may run most tasks before the other is warm
+    offload = make(cloud, onboard, records=records, allowance=Allowance(duplicates=0.0))
+    done = mapped(offload, doubled, range(20, 60))
+    for _ in range(WARM_UP - 1):
+        onboard.release()
+        cloud.release()
+    onboard.wait_for(1)
+    cloud.wait_for(1)
+    assert onboard.most == cloud.most == 1
+    release_all(done, onboard, cloud)
+    warming = [record for record in records if record.decision.reason.startswith("warm-up")]
+    for site in (ONBOARD, CLOUD):
+        sizes = [record.size for record in warming if record.decision.site == site]
+        assert len(sizes) == WARM_UP
+        assert max(sizes) - min(sizes) >= 10
+    assert len({one.args[0] for one in cloud.tasks + onboard.tasks}) == len(cloud.tasks + onboard.tasks) == 40
 
 
 def test_the_largest_tasks_come_first(make: Make, mapped: Mapped) -> None:
@@ -219,11 +237,7 @@ def test_a_server_never_has_more_than_its_limit(make: Make, mapped: Mapped) -> N
     warm(offload)
     cloud.holding = onboard.holding = True
     done = mapped(offload, doubled, [20] * 60)
-    while not done.done():
-        with_tasks = [runner for runner in (cloud, onboard) if runner.held]
-        if with_tasks:
-            max(with_tasks, key=lambda runner: len(runner.held)).release()
-    assert done.result(WAIT_S) == [40] * 60
+    assert release_all(done, cloud, onboard) == [40] * 60
     assert 2 < cloud.most <= SERVER_IN_FLIGHT_MAX
     assert onboard.most == 1
 
@@ -344,12 +358,19 @@ def test_caps_hold_for_a_batch(make: Make) -> None:
 
 
 @pytest.mark.parametrize("failure", [CloudBroken("gone"), CloudTimeout("late")])
-def test_a_failing_site_costs_no_answer(make: Make, failure: Exception) -> None:
+def test_a_failing_site_costs_no_answer(make: Make, mapped: Mapped, failure: Exception) -> None:
     """Tasks that fail in the cloud run onboard, and the batch has all its results."""
     records: list[Record] = []
-    cloud = ScriptedRunner(CLOUD, lambda _: Execution(CLOUD, 2.0, failure=failure))  # type: ignore[arg-type]
-    offload = make(cloud, ScriptedRunner(ONBOARD, answers(ONBOARD)), records=records)
-    assert offload.map(doubled, range(40)) == [2 * one for one in range(40)]
+    cloud = HeldRunner(CLOUD, lambda _: Execution(CLOUD, 2.0, failure=failure))  # type: ignore[arg-type]
+    onboard = HeldRunner(ONBOARD, answers(ONBOARD, 10_000.0))  # never slower than the failing cloud
+    cloud.holding = onboard.holding = True
+    done = mapped(make(cloud, onboard, records=records), doubled, range(40))
+    for _ in range(WARM_UP):
+        cloud.release()
+        onboard.wait_for(2)  # its own task, and the one that failed in the cloud
+        onboard.release()
+        onboard.release()
+    assert release_all(done, cloud, onboard) == [2 * one for one in range(40)]
     tried = sum(len(record.executions) > 1 for record in records)
     assert WARM_UP <= tried <= 8, tried
 
