@@ -45,7 +45,7 @@ def make_runners(
             )
             runners.append(server)
         runners.append(OnboardRunner(states=states, background=background))
-    except BaseException:
+    except BaseException:  # also after Ctrl-C, no thread or socket of the others is left
         for runner in runners:
             runner.close()
         raise
