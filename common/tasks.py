@@ -136,7 +136,7 @@ def task(
     If `size` returns several numbers, the predictor `least-squares` uses all of them, and every other one
     uses the first; `parts` predicts from the work instead if the kind tells it (by the first number too).
     """
-    if not name or len(name) > NAME_LENGTH_MAX or not name.isidentifier():
+    if not isinstance(name, str) or len(name) > NAME_LENGTH_MAX or not name.isidentifier():
         raise ConfigError(f"task name {name!r} is not an identifier of at most {NAME_LENGTH_MAX} characters")
     if len(_kinds) >= KINDS_MAX:
         raise ConfigError(f"task {name}: {KINDS_MAX} tasks are registered already, the most allowed")

@@ -22,6 +22,7 @@ from offboard.robot_client.policies.allowance import DUPLICATES, Allowance
 from offboard.robot_client.policies.decision import Named
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.objectives import Mean, Objective
+from offboard.robot_client.predictors.window import checked_length
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,7 +78,7 @@ class Settings:
         A wrong predictor or window is an error now, and not at the first task.
         """
         name = self.predictor_for(policy)
-        make = partial(predictors.make, name, window, self.seed)
+        make = partial(predictors.make, name, checked_length(window), self.seed)
         made = make()
         return Memories(
             make,
@@ -116,7 +117,7 @@ def _fits(value: object, hint: Any) -> bool:
         return any(_fits(value, one) for one in parts)
     if kind in (int, float):  # numbers of numpy too
         return isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
-    if not isinstance(value, kind):
+    if not isinstance(value, kind) or (kind is Iterable and isinstance(value, str)):
         return False
     items = [*value.keys(), *value.values()] if isinstance(value, Mapping) else value
     return not isinstance(items, list | tuple) or all(_fits(one, parts[0]) for one in items)

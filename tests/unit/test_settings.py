@@ -110,6 +110,7 @@ WRONG = [
     ({"keys": 5}, "keys 5: must be a path or a string or None"),
     ({"observers": print}, "observers <built-in function print>: must be a list of functions"),
     ({"observers": [5]}, "observers [5]: must be a list of functions"),
+    ({"observers": "print"}, "observers 'print': must be a list of functions"),
     ({"metrics": 9100}, "metrics 9100: must be a string or None"),
     ({"trace": 5}, "trace 5: must be a path or a string or None"),
     ({"settings": {"seed": 1}}, "settings {'seed': 1}: must be Settings or None"),
@@ -151,6 +152,13 @@ def test_a_missing_or_ambiguous_server_is_one_error_of_connect(given: dict[str, 
     """Keys without a server, an empty endpoint, or two servers of one name are not what the user meant."""
     with pytest.raises(ConfigError, match=f"^{re.escape(says)}$"):
         Offloader.connect(**given)
+
+
+@pytest.mark.parametrize("policy", ["default", "paper"])
+def test_a_wrong_window_is_an_error_of_connect(policy: str) -> None:
+    """Also with a predictor that has no window."""
+    with pytest.raises(ConfigError, match=r"^window 1: must be from 2 to 1000000$"):
+        Offloader.connect(policy=policy, window=1)
 
 
 @pytest.mark.parametrize(("given", "says"), WRONG_SETTINGS)

@@ -53,8 +53,8 @@ def test_code_made_by_exec_has_no_source_hash(monkeypatch: pytest.MonkeyPatch) -
     assert kind_named("made_up").source_hash == ""
 
 
-@pytest.mark.parametrize("name", ["", "a b", "x" * 65, "1st", "../x", "a\nb"])
-def test_a_bad_name_is_refused(name: str) -> None:
+@pytest.mark.parametrize("name", ["", "a b", "x" * 65, "1st", "../x", "a\nb", 5, None, b"x"])
+def test_a_bad_name_is_refused(name: Any) -> None:
     """Names are short identifiers, because they appear in logs, metrics and messages."""
     with pytest.raises(ConfigError, match="is not an identifier"):
         task(name, size=lambda: 0.0)
