@@ -28,6 +28,7 @@ CONNECT_S = 60.0
 LATE_S = 60.0  # for which a run that missed its deadline is waited for
 DEADLINE_S_MIN = 0.001
 BEYOND = 0.25  # of the width of the interval: so far outside of it are the earliest and the latest deadline
+BEGIN_S = 0.05  # in which a run that is only measured begins
 GUESS = (0.5, 2.0)  # times the expected time, while there is no interval
 
 Call = tuple[Any, ...]
@@ -145,6 +146,8 @@ def _deadline_s(
 
 def _settle(offload: Offloader) -> None:
     """Wait for the runs that go on after the answer, so that they do not disturb the next call."""
+    if offload.last is not None and offload.last.decision.measured is not None:
+        time.sleep(BEGIN_S)
     until_s = time.monotonic() + LATE_S
     while any(offload._flights.count(site) for site in (ONBOARD, CLOUD)):
         if time.monotonic() > until_s:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 from offboard.common.errors import DeadlineMissed
 from offboard.robot_client.policies.forecast import Forecast, Outlook
-from offboard.robot_client.policies.objectives import Expected, probability_to_miss
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,12 +55,11 @@ def _expectation(outlook: Outlook, deadline_s: float | None) -> Expectation:
     seconds, low_s, high_s = outlook.predicted_s, outlook.low_s, outlook.high_s
     if seconds is None:
         return Expectation()
-    missed = None
+    missed_share = None
     if deadline_s is not None:
-        expected = Expected(seconds, outlook.spread_s, outlook.joules)
-        missed = probability_to_miss(expected, outlook.errors, deadline_s)
+        missed_share = outlook.errors.share_above(max(0.0, seconds), deadline_s, outlook.spread_s)
     return Expectation(
         seconds=seconds,
         interval=None if low_s is None or high_s is None else (low_s, high_s),
-        in_time=None if missed is None else 1.0 - missed,
+        in_time=None if missed_share is None else 1.0 - missed_share,
     )

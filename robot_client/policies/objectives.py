@@ -3,7 +3,6 @@
 The joules that an objective weighs are estimated in `energy`.
 """
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -52,7 +51,7 @@ class Deadline:
 
     def cost(self, expected: Expected, errors: PredictionErrors) -> float:
         expected_s = max(0.0, expected.seconds)
-        missed = probability_to_miss(expected, errors, self.deadline_s)
+        missed = errors.share_above(expected_s, self.deadline_s, expected.spread_s)
         if missed is None:
             missed = float(expected_s > self.deadline_s)
         return missed + 1e-3 * expected_s / (expected_s + self.deadline_s)
@@ -66,18 +65,6 @@ class TimeAndEnergy:
 
     def cost(self, expected: Expected, errors: PredictionErrors) -> float:  # noqa: ARG002
         return expected.seconds + self.s_a_joule * expected.joules
-
-
-def probability_to_miss(expected: Expected, errors: PredictionErrors, deadline_s: float) -> float | None:
-    """The probability that a task takes longer than its deadline; None while nothing says how far off it is.
-
-    It comes from past errors. While they are too few, they are taken to be normal, with the spread.
-    """
-    seconds, spread_s = max(0.0, expected.seconds), expected.spread_s
-    missed = errors.share_above(seconds, deadline_s)
-    if missed is not None or not spread_s:
-        return missed
-    return 0.5 * math.erfc((deadline_s - seconds) / (math.sqrt(2.0) * spread_s))
 
 
 def weighed(forecast: Forecast, objective: Objective) -> Forecast:

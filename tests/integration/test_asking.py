@@ -108,5 +108,5 @@ def test_the_saving_of_a_faster_server_is_estimated(
     assert found.mean_s == pytest.approx(true_s, rel=TOLERANCE)
     assert found.sent > 0.9
     last = list(read_trace(path))[-1]
-    assert last["savings"]["probes"] == found.probes >= 10
+    assert 10 <= last["savings"]["probes"] <= found.probes
     assert last["decision"]["advised"] == CLOUD

@@ -1,5 +1,6 @@
 """An offloader that only observes: it answers every task onboard, and probes say what others would save."""
 
+from collections.abc import Callable
 from random import Random
 from statistics import fmean
 
@@ -20,7 +21,7 @@ from offboard.robot_client.records.trace import Record
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.outlooks import decide, known
-from tests.policy_checks import EDGE, SILENT
+from tests.policy_checks import CONTRACT, EDGE, SILENT
 from tests.virtual import VirtualClock, VirtualRunner
 
 KIND = "observed_echo"
@@ -178,6 +179,12 @@ def test_a_pinned_call_does_not_count() -> None:
     robot.offload(observed_echo, 1.0, where=ONBOARD)
     robot.offload(observed_echo, 1.0, where=CLOUD)
     assert robot.saved() == before
+
+
+@pytest.mark.parametrize("check", CONTRACT)
+def test_observing_is_a_policy_like_any_other(check: Callable[[Callable[[], Observe]], None]) -> None:
+    """It keeps the contract of all policies."""
+    check(lambda: Observe(policies.make(policies.DEFAULT, seed=3)))
 
 
 def test_connect_observes_with_the_policy_that_is_named() -> None:
