@@ -79,6 +79,7 @@ class Offloader:
         if BOTH in self._runners:
             raise ConfigError(f"a site cannot be named {BOTH!r}: where={BOTH!r} means all sites")
         self._policy, self._memories = policy, memories
+        self._observes = isinstance(policy, Observe)
         self._allowance = allowance or Allowance()
         self._timeout_s = checked_timeout(timeout_s)
         self._observers = tuple(observers)
@@ -208,7 +209,7 @@ class Offloader:
         kind = kind_of(function)
         tasks = [Task(kind, args, kind.size_of(args)) for args in arguments(kind, items)]
         sites = tuple(self._runners)
-        if isinstance(self._policy, Observe):
+        if self._observes:
             where = where or ONBOARD
         if where is not None:
             check_where(where, kind, self._runners)
@@ -243,10 +244,7 @@ class Offloader:
     def expect(
         self, function: Callable[..., Any], *args: Any, deadline_s: float | None = None, **kwargs: Any
     ) -> dict[str, Expectation]:
-        """What this call should take on each site. Nothing runs, and nothing is counted.
-
-        With `deadline_s`, also the probability that each site answers within it.
-        """
+        """What this call should take on each site, and how likely it is in time; nothing runs or counts."""
         if self._life.forked:
             self._life.refuse()
         if deadline_s is not None:
@@ -375,8 +373,9 @@ class Offloader:
             self._runs.learn(pending, executions)
             if not self._life.closed and self._memories.due(self._clock.now_s()):
                 self._memories.save_soon()
-            late, regret = self._runs.take_late(), self._learner.regret.estimate()
-            saved = self._learner.saved(task.kind)
+            late = self._runs.take_late() if self._runs.late else ()
+            regret = self._learner.regret.estimate()
+            saved = self._learner.saved(task.kind) if self._observes else None
         ended_s = self._clock.now_s()
         record = self.last = record_of(
             pending, executions, answer, ended_s=ended_s, late=late, regret=regret, savings=saved
@@ -386,7 +385,7 @@ class Offloader:
             self._crossing.hear(task.kind, executions)
         if len(self._runners) > 1 and answer.failure is None:
             self._crossing.check_result(task.kind, answer.value)
-            if (site := pending.decision.measured) is not None:
+            if self._observes and (site := pending.decision.measured) is not None:
                 self._life.call_beside(partial(self._runs.measure, pending, site))
         return answer, record
 

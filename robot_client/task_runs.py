@@ -23,7 +23,10 @@ LATE_MAX = 64  # executions that ended after their task was answered, kept for t
 
 
 class TaskRuns:
-    """Carries out decisions. `lock` is that of the offloader: under it everything is learnt and counted."""
+    """Carries out decisions. `lock` is that of the offloader: under it everything is learnt and counted.
+
+    `late`: the executions that ended after their task was answered; the next record takes them.
+    """
 
     def __init__(
         self,
@@ -43,7 +46,7 @@ class TaskRuns:
         self._allowance = allowance
         self._learner = learner
         self._life = life
-        self._late: deque[Late] = deque(maxlen=LATE_MAX)
+        self.late: deque[Late] = deque(maxlen=LATE_MAX)
         self._begun_onboard = 0
 
     def execute(self, pending: PendingTask) -> tuple[Execution, ...]:
@@ -64,7 +67,9 @@ class TaskRuns:
             if decision.policy != PINNED:  # a measurement is the choice of the caller, not of the policy
                 self._take_duplicates(len(first) - 1)
         try:
-            second = None if decision.measured else decision.second
+            second = decision.second
+            if second is not None and decision.measured:
+                second = None
             return race.run(Plan(first, second, all=decision.both, call=pending.call))
         except BaseException:  # closed during the task, or Ctrl-C: nobody waits for what still runs
             with self._lock:
@@ -92,9 +97,9 @@ class TaskRuns:
             self._learner.learn(pending, executions)
 
     def take_late(self) -> tuple[Late, ...]:
-        """The executions that have ended late since the last call. Called under the lock."""
-        late = tuple(self._late)
-        self._late.clear()
+        """Empty `late`. Called under the lock."""
+        late = tuple(self.late)
+        self.late.clear()
         return late
 
     def _begun(self, pending: PendingTask, site: str) -> None:
@@ -119,7 +124,7 @@ class TaskRuns:
     ) -> None:
         """A run has ended after its task was answered; called in any thread."""
         with self._lock:
-            self._late.append(Late.of(pending.id, site, execution))
+            self.late.append(Late.of(pending.id, site, execution))
             self._flights.end(site, pending.task.id)
             if execution.started and not self._life.closed:
                 self._learner.learn_late(pending, execution, beside=beside)

@@ -87,7 +87,7 @@ class Learner:
             work=work,
             beside=beside,
         )
-        if isinstance(decision.second, Probe):
+        if isinstance(decision.second, Probe) and site in (decision.site, decision.second.site):
             pending.ended[site] = execution
             if len(pending.ended) == 2:
                 self._compare(pending, pending.ended[decision.site], pending.ended[decision.second.site])
