@@ -3,6 +3,7 @@
 It is started by a testbed, so that its CPU is limited and its link is that of the scenario.
 """
 
+import argparse
 import json
 import queue
 import sys
@@ -17,7 +18,7 @@ from typing import Any, TextIO
 
 from benchmarks.application_runs import find_kind
 from offboard import DeadlineMissed, Offloader, Record, Settings
-from offboard.common.command_line import CommandParser, run_command
+from offboard.common.command_line import run_command
 from offboard.common.errors import OffloadError
 from offboard.common.task_states import TaskStates
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
@@ -35,7 +36,7 @@ Call = tuple[Any, ...]
 
 
 def main() -> int:
-    parser = CommandParser(prog=PROG, description=__doc__)
+    parser = argparse.ArgumentParser(prog=PROG, description=__doc__)
     parser.add_argument("doing", choices=(ASK, OBSERVE))
     for name in ("cloud", "application", "lines"):
         parser.add_argument(f"--{name}", required=True)
