@@ -69,7 +69,14 @@ class SavingsEstimate:
             mean = saved.mean + errors.mean
             half = student_90(errors.count - 1) * math.hypot(saved.error, errors.error)
         sent = saved.count / tasks
-        return Savings(sent * mean, sent * (mean - half), sent * (mean + half), tasks, sent, errors.count)
+        return Savings(
+            mean_s=sent * mean,
+            low_s=sent * (mean - half),
+            high_s=sent * (mean + half),
+            tasks=tasks,
+            sent=sent,
+            probes=errors.count,
+        )
 
 
 class _Moments:
