@@ -148,10 +148,10 @@ def _thinks(offload: Offloader) -> Callable[[int], None]:
 
     def think(count: int) -> None:
         for n, one in enumerate(tasks[:count]):
-            asked = offload._ask(one, "", absent={}, where=None, timeout_s=2.0, placed=None)
+            asked = offload._begin(one, None, 2.0)
             decision = asked.decision
             probed = [decision.second.site] if isinstance(decision.second, Probe) else []
-            offload._learn(asked, [ran[site][n] for site in (decision.site, *probed)])
+            offload._runs.learn(asked, [ran[site][n] for site in (decision.site, *probed)])
 
     return think
 

@@ -1,6 +1,8 @@
 """All errors that Offboard raises, and what happens when each one is caught."""
 
 import threading
+from collections.abc import Mapping
+from typing import Any
 
 
 class OffloadError(Exception):
@@ -65,6 +67,17 @@ class TaskFailed(TaskError):
 
 class BadValue(TaskError):
     """A value cannot be sent, or an input size is none. A call raises it for the size only."""
+
+
+class DeadlineMissed(OffloadError):
+    """A call with `deadline_s` had no answer in time. Its task runs to its end, and its time is learnt.
+
+    `expected` is what was expected of each site when the call began: an `Expectation` by site.
+    """
+
+    def __init__(self, message: str, expected: Mapping[str, Any]) -> None:
+        super().__init__(message)
+        self.expected = expected
 
 
 class CloudError(OffloadError):

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         CloudTimeout,
         ConfigError,
         DataError,
+        DeadlineMissed,
         MissingExtra,
         OffloadError,
         ProtocolError,
@@ -27,8 +28,10 @@ if TYPE_CHECKING:
     )
     from offboard.common.tasks import task
     from offboard.common.wanted import check_wanted
+    from offboard.robot_client.learning.savings import Savings
     from offboard.robot_client.offloader import Offloader
     from offboard.robot_client.policies import Decision, Forecast, Outlook
+    from offboard.robot_client.policies.expectation import Expectation
     from offboard.robot_client.predictors import Prediction, Predictor
     from offboard.robot_client.records.trace import Record, Trace
     from offboard.robot_client.settings import Settings
@@ -42,8 +45,10 @@ __all__ = [
     "CloudTimeout",
     "ConfigError",
     "DataError",
+    "DeadlineMissed",
     "Decision",
     "Execution",
+    "Expectation",
     "Forecast",
     "MissingExtra",
     "OffloadError",
@@ -54,6 +59,7 @@ __all__ = [
     "ProtocolError",
     "Record",
     "Runner",
+    "Savings",
     "Settings",
     "TaskError",
     "TaskFailed",
@@ -68,6 +74,7 @@ __all__ = [
 _HOMES = {
     "Decision": "robot_client.policies",
     "Execution": "robot_client.sites.runner",
+    "Expectation": "robot_client.policies.expectation",
     "Forecast": "robot_client.policies",
     "Offloader": "robot_client.offloader",
     "Outlook": "robot_client.policies",
@@ -75,6 +82,7 @@ _HOMES = {
     "Predictor": "robot_client.predictors",
     "Record": "robot_client.records.trace",
     "Runner": "robot_client.sites.runner",
+    "Savings": "robot_client.learning.savings",
     "Settings": "robot_client.settings",
     "Trace": "robot_client.records.trace",
     "check_wanted": "common.wanted",

@@ -19,7 +19,8 @@ from offboard.robot_client.sites.onboard import inside_a_task
 from offboard.robot_client.sites.runner import Runner
 
 ASYNC_NAME = "run"
-ASYNC_CALLS_MAX = 32  # calls of `Offloader.run` at a time; each has a thread while it waits for its answer
+ASYNC_CALLS_MAX = 32  # calls of `submit` and `run` at a time; each has a thread while it waits for its answer
+LATE_NAME = "deadline"
 
 T = TypeVar("T")
 
@@ -36,6 +37,7 @@ class Lifetime:
         self.forked = False
         self.recording: Recording | None = None
         self._async_calls = CallThreads(ASYNC_CALLS_MAX, ASYNC_NAME)
+        self._late_calls = CallThreads(ASYNC_CALLS_MAX, LATE_NAME)
         self._runners = runners
         self._memories = memories
         self._lock = lock
@@ -48,14 +50,12 @@ class Lifetime:
         )
 
     def call_in_thread(self, call: Callable[[], T]) -> "Future[T]":
-        """For asyncio. The code of a task gets a thread of its own: the others may all wait for that task."""
-        if not inside_a_task():
-            return self._async_calls.start(call)
-        own = CallThreads(1, ASYNC_NAME)
-        try:
-            return own.start(call)
-        finally:
-            own.close(wait=False)
+        """Make a call of `submit` or `run`."""
+        return self._start(self._async_calls, call)
+
+    def call_beside(self, call: Callable[[], T]) -> "Future[T]":
+        """Make a call whose caller may leave at a deadline. That caller may be a call of `submit`."""
+        return self._start(self._late_calls, call)
 
     def close_when_dropped(self, offloader: object) -> None:
         """Close, with a ResourceWarning, when nothing refers to the offloader any more."""
@@ -70,11 +70,22 @@ class Lifetime:
             last = self._memories.snapshot() if first else None
         for runner in self._runners:
             runner.close()
-        self._async_calls.close(wait=False)
+        for calls in (self._async_calls, self._late_calls):
+            calls.close(wait=False)
         if last is not None:
             self._memories.save_last(last)
         if self.recording is not None:
             self.recording.close()
+
+    def _start(self, calls: CallThreads, call: Callable[[], T]) -> "Future[T]":
+        """The code of a task gets a thread of its own: the others may all wait for that task."""
+        if not inside_a_task():
+            return calls.start(call)
+        own = CallThreads(1, ASYNC_NAME)
+        try:
+            return own.start(call)
+        finally:
+            own.close(wait=False)
 
     def _dropped(self) -> None:
         """Called by any thread at any moment, so that another thread must take the locks."""

@@ -22,7 +22,7 @@ from offboard.robot_client.policies.allowance import DUPLICATES, Allowance
 from offboard.robot_client.policies.decision import Named
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.objectives import Mean, Objective
-from offboard.robot_client.predictors.window import checked_length
+from offboard.robot_client.predictors.window import WINDOW, checked_length
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,6 +30,7 @@ class Settings:
     """Rare options of an offloader; the defaults suit most robots.
 
     `predictor`: how times are predicted, by name (None: the predictor that the policy is meant for).
+    `window`: the last times of each kind on each site that predictors with a window use.
     `heartbeats`: whether to ask each server twice a second if it is there (None: as the policy needs it).
     `objective`: what the policy makes small; see `policies.objectives`.
     `energy`: what computing, waiting and sending take from the battery, in watts and joules per byte.
@@ -42,6 +43,7 @@ class Settings:
     """
 
     predictor: str | None = None
+    window: int = WINDOW
     heartbeats: bool | None = None
     objective: Objective = Mean()
     energy: Energy = Energy()
@@ -72,13 +74,13 @@ class Settings:
         """Whether the servers are sent heartbeats."""
         return policies.heartbeats(policy) if self.heartbeats is None else self.heartbeats
 
-    def make_memories(self, policy: str, window: int) -> Memories:
+    def make_memories(self, policy: str) -> Memories:
         """What is known of each kind: nothing yet, or what the file `memory` holds.
 
         A wrong predictor or window is an error now, and not at the first task.
         """
         name = self.predictor_for(policy)
-        make = partial(predictors.make, name, checked_length(window), self.seed)
+        make = partial(predictors.make, name, checked_length(self.window), self.seed)
         made = make()
         return Memories(
             make,

@@ -1,8 +1,9 @@
 """Calls of an offloader, with the types that a type checker must see. Mypy reads this file; it never runs."""
 
+from concurrent.futures import Future
 from typing import Any, assert_type
 
-from offboard import Offloader, TaskFailed, task
+from offboard import Expectation, Offloader, Savings, TaskFailed, task
 
 
 class Detector:
@@ -37,6 +38,9 @@ async def calls(offload: Offloader) -> None:
     assert_type(offload(untyped, 5), Any)
     assert_type(offload.map(count, [1, (2, 3.0)]), list[str])
     assert_type(offload.map(detect, [b"frame"], where="both"), list[list[int]])
+    assert_type(offload.submit(count, 5, deadline_s=1.0), Future[str])
+    assert_type(offload.expect(count, 5, deadline_s=1.0), dict[str, Expectation])
+    assert_type(offload.savings(), dict[str, Savings | None])
     assert_type(await offload.run(count, 5, where="onboard"), str)
     assert_type(await offload.run(detect, b"frame"), list[int])
     assert_type(count(5), str)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Mapping
 
 from offboard.common.errors import ConfigError
 from offboard.common.tasks import Kind
-from offboard.robot_client.policies import BOTH, PINNED, Decision, Forecast, Policy
+from offboard.robot_client.policies import ALONE, BOTH, PINNED, Decision, Forecast, Policy
 from offboard.robot_client.sites.runner import ONBOARD
 
 
@@ -44,7 +44,7 @@ def decided(
     """
     if len(forecast.sites) == 1:
         why = "; ".join(f"{site}: {why}" for site, why in absent.items()) or "no other site"
-        return Decision(ONBOARD, why, "none")
+        return Decision(ONBOARD, why, ALONE)
     decision = policy.decide(forecast)
     if kind.duplicate:
         return decision

@@ -69,13 +69,13 @@ class Race:
             if plan.second is not None:
                 self._start_second(plan.second)
             self._wait_for_answer(plan.call)
-        executions = {site: _finished(site, run) for site, (run, _) in self._runs.items() if run.done()}
+        executions = {site: result_of(site, run) for site, (run, _) in self._runs.items() if run.done()}
         if ONBOARD not in self._runs and all(
             _may_fall_back(one, self._task.kind) for one in executions.values()
         ):
             self._start(ONBOARD)
             self._wait_for_all()
-            executions[ONBOARD] = _finished(ONBOARD, self._runs[ONBOARD][0])
+            executions[ONBOARD] = result_of(ONBOARD, self._runs[ONBOARD][0])
         for site, (run, began_s) in self._runs.items():
             if site not in executions:
                 keep = isinstance(plan.second, Probe)
@@ -106,7 +106,7 @@ class Race:
             for site, (run, _) in self._runs.items():
                 if not run.done():
                     pending.append(run)
-                elif _is_answer(_finished(site, run)):
+                elif _is_answer(result_of(site, run)):
                     return
             if not pending:
                 return
@@ -126,7 +126,7 @@ class Race:
 
     def _leave(self, site: str, run: "Future[Execution]", began_s: float, *, keep: bool) -> Execution:
         """Leave a run that lost the race; it is cancelled, unless its whole time is wanted (`keep`)."""
-        run.add_done_callback(lambda done: self._late(site, _finished(site, done)))
+        run.add_done_callback(lambda done: self._late(site, result_of(site, done)))
         if not keep:
             self._runners[site].cancel(self._task)
         failure = Overtaken("another site answered first")
@@ -143,7 +143,7 @@ def answer_of(executions: tuple[Execution, ...]) -> Execution:
     return (own or list(executions))[-1]
 
 
-def _finished(site: str, future: "Future[Execution]") -> Execution:
+def result_of(site: str, future: "Future[Execution]") -> Execution:
     """The result of a run. A runner ends every run within its budget; `close` cancels the future instead."""
     try:
         return future.result()

@@ -8,7 +8,7 @@ import operator
 from bisect import bisect_left, insort
 from collections import deque
 
-from offboard.robot_client.policies.forecast import ERRORS_MIN, SPREADS_90, PredictionErrors, unit_s
+from offboard.robot_client.policies.forecast import ERRORS_MIN, PredictionErrors, unit_s
 from offboard.robot_client.predictors.line import RATE, RunningMean
 
 COVERAGE = 0.9  # share of the times that an interval should hold
@@ -60,7 +60,8 @@ class Conformal:
         if len(self._sorted) < ERRORS_MIN:
             if spread_s is None:
                 return None
-            return max(0.0, predicted_s - SPREADS_90 * spread_s), predicted_s + SPREADS_90 * spread_s
+            half_s = self.errors.half_90_s(predicted_s, spread_s)
+            return max(0.0, predicted_s - half_s), predicted_s + half_s
         unit, (low, high) = unit_s(predicted_s, self._usual_s.value), self._ends or self._interval()
         low_s = predicted_s + unit * low if low < 0 else predicted_s
         high_s = predicted_s + unit * high if high > 0 else predicted_s

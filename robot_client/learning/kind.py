@@ -90,6 +90,12 @@ class KindMemory:
             self._work.learn(first_number(size), work)
             self.worked.append((first_number(size), work))
 
+    def move_to(self, site: str, reason: str) -> None:
+        """Tasks are sent to another site from now on."""
+        if self.last_site is not None:
+            log.info("%s moves to %s: %s", self.kind.name, site, reason)
+        self.last_site = site
+
     def count_task(self) -> None:
         """Count one more task of this kind, wherever it ran."""
         for memory in self.sites.values():

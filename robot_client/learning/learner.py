@@ -4,13 +4,16 @@ What is learned of one site is in `site`.
 """
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field
+from datetime import datetime
 
 from offboard.common.errors import Overtaken
-from offboard.common.tasks import Size, Task
+from offboard.common.tasks import Kind, Size, Task
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.regret import RegretEstimate
-from offboard.robot_client.policies import Decision, Forecast, Probe
+from offboard.robot_client.learning.savings import Savings, SavingsEstimate
+from offboard.robot_client.policies import ALONE, Decision, Forecast, Probe
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.sites.runner import ONBOARD, Execution, Runner
 
@@ -19,16 +22,25 @@ from offboard.robot_client.sites.runner import ONBOARD, Execution, Runner
 class PendingTask:
     """A task that is under way, and what was known when it was decided.
 
-    `amount`: what the predictors were asked for. `seconds`: the times of the sites that have answered.
+    `amount`: what the predictors were asked for. `absent`: why sites are not in the forecast.
+    `started_s`: by the clock of the offloader. `call`: may name one more site while the task runs.
+    `ended`: the runs that a probe is compared by.
     """
 
     task: Task
+    i: int
     id: str
     memory: KindMemory
     forecast: Forecast
     amount: Size | None
     decision: Decision
-    seconds: dict[str, float] = field(default_factory=dict)
+    timeout_s: float
+    started_s: float
+    started_at: datetime
+    absent: Mapping[str, str]
+    call: "Future[str] | None" = None
+    deadline_s: float | None = None
+    ended: dict[str, Execution] = field(default_factory=dict)
 
 
 class Learner:
@@ -36,6 +48,7 @@ class Learner:
 
     def __init__(self, runners: Mapping[str, Runner], allowance: Allowance) -> None:
         self.regret = RegretEstimate()
+        self._savings: dict[str, SavingsEstimate] = {}  # by kind; empty unless the policy only observes
         self._runners = runners
         self._allowance = allowance
 
@@ -49,15 +62,22 @@ class Learner:
         for execution in ended:
             self._learn_one(pending, execution, work)
 
-    def learn_late(self, pending: PendingTask, execution: Execution) -> None:
-        """Learn a run that ended after another site had answered."""
-        self._learn_one(pending, execution, pending.memory.work_of(execution))
+    def learn_late(self, pending: PendingTask, execution: Execution, *, beside: bool | None = None) -> None:
+        """Learn a run that ended after another site had answered.
 
-    def _learn_one(self, pending: PendingTask, execution: Execution, work: float | None) -> None:
+        `beside`: the robot ran tasks itself meanwhile (None: by the decision).
+        """
+        self._learn_one(pending, execution, pending.memory.work_of(execution), beside=beside)
+
+    def _learn_one(
+        self, pending: PendingTask, execution: Execution, work: float | None, *, beside: bool | None = None
+    ) -> None:
         self._spend(pending, execution)
         site, decision = execution.site, pending.decision
         memory = pending.memory.site(site)
-        second_here = decision.second is not None and decision.second.site == site
+        if beside is None:
+            second_here = decision.second is not None and decision.second.site == site
+            beside = site != ONBOARD and decision.site == ONBOARD and (decision.both or second_here)
         memory.learn(
             pending.amount if work is None else work,
             execution,
@@ -65,12 +85,48 @@ class Learner:
             silent=not execution.ok and memory.measured and self._held_up(site),
             size=pending.task.size,
             work=work,
-            beside=site != ONBOARD and decision.site == ONBOARD and (decision.both or second_here),
+            beside=beside,
         )
-        if execution.ok and isinstance(decision.second, Probe):
-            pending.seconds[site] = execution.seconds
-            if len(pending.seconds) == 2:
-                self.regret.learn(pending.seconds[decision.site], pending.seconds[decision.second.site])
+        if isinstance(decision.second, Probe) and site in (decision.site, decision.second.site):
+            pending.ended[site] = execution
+            if len(pending.ended) == 2:
+                self._compare(pending, pending.ended[decision.site], pending.ended[decision.second.site])
+        if site == decision.site and (
+            decision.advised is not None or (self._savings and decision.policy == ALONE)
+        ):
+            self._note_saving(pending, execution)
+
+    def _compare(self, pending: PendingTask, chosen: Execution, probed: Execution) -> None:
+        """Both runs of a probe have ended."""
+        if chosen.ok and probed.ok:
+            self.regret.learn(chosen.seconds, probed.seconds)
+        expected_s = _advised_s(pending)
+        if chosen.ok and expected_s is not None and pending.decision.advised == probed.site:
+            # Without an answer of the site, the task would have run onboard after this time.
+            took_s = probed.seconds if probed.ok else probed.seconds + chosen.seconds
+            self._savings_of(pending).probe(expected_s - took_s)
+
+    def _note_saving(self, pending: PendingTask, execution: Execution) -> None:
+        """A task that is only observed was answered."""
+        decision, expected_s = pending.decision, _advised_s(pending)
+        if not execution.ok:
+            return
+        if decision.advised in (execution.site, None):  # None: no other site was there
+            self._savings_of(pending).stay()
+        elif expected_s is not None:
+            self._savings_of(pending).move(execution.seconds - expected_s)
+
+    def _savings_of(self, pending: PendingTask) -> SavingsEstimate:
+        return self._savings.setdefault(pending.task.kind.name, SavingsEstimate())
+
+    def savings(self) -> dict[str, Savings | None]:
+        """The present estimate for each kind."""
+        return {kind: one.estimate() for kind, one in self._savings.items()}
+
+    def saved(self, kind: Kind) -> Savings | None:
+        """The present estimate for a kind."""
+        found = self._savings.get(kind.name)
+        return None if found is None else found.estimate()
 
     def _held_up(self, site: str) -> bool:
         """Whether the site does not answer heartbeats, or may be about to."""
@@ -82,3 +138,9 @@ class Learner:
             site = execution.site
             moved = 0 if site == ONBOARD else execution.bytes_out + execution.bytes_in
             self._allowance.spend(moved, pending.memory.site(site).joules(execution))
+
+
+def _advised_s(pending: PendingTask) -> float | None:
+    """The predicted time on the site where the policy would have sent a task that is only observed."""
+    advised = pending.decision.advised
+    return None if advised is None else pending.forecast.sites[advised].predicted_s

@@ -7,7 +7,7 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-from offboard.robot_client.policies.forecast import SPREADS_90
+from offboard.robot_client.policies.forecast import student_90
 from offboard.robot_client.predictors.base import REMEMBERED, WARM_UP
 
 
@@ -48,9 +48,3 @@ class RegretEstimate:
         variance = math.fsum((one - mean) ** 2 for one in self._regrets) / (count - 1)
         half = student_90(count - 1) * math.sqrt(variance / count)
         return Regret(mean, max(0.0, mean - half), mean + half, count)
-
-
-def student_90(freedom: int) -> float:
-    """The 95 % quantile of Student's t, to 2 % from 4 degrees of freedom (Abramowitz, Stegun 26.7.5)."""
-    z = SPREADS_90
-    return z + (z**3 + z) / (4 * freedom) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * freedom**2)

@@ -14,10 +14,11 @@ from offboard.common.errors import ConfigError
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 if TYPE_CHECKING:
-    from offboard.robot_client.policies.decision import BOTH, PINNED, Decision, Hedge, Policy, Probe
+    from offboard.robot_client.policies.decision import ALONE, BOTH, PINNED, Decision, Hedge, Policy, Probe
     from offboard.robot_client.policies.forecast import Forecast, Outlook
 
 __all__ = [
+    "ALONE",
     "BOTH",
     "DEFAULT",
     "HELP",

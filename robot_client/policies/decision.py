@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol
 from offboard.robot_client.policies.forecast import Forecast
 
 PINNED = "pinned"  # stands for the policy where the caller said where to run
+ALONE = "none"  # stands for the policy where only onboard was there
 BOTH = "both"  # `where=BOTH`: the caller measures the task on all sites
 
 
@@ -18,9 +19,11 @@ class Probe:
     """Run the task on `site` too, from the start, to learn how long it takes there.
 
     The first good answer is used. The slower run goes on to its end, so that its time is learnt.
+    Without `answers` it starts after the task was answered: it delays nothing, and its answer is not used.
     """
 
     site: str
+    answers: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +42,7 @@ class Decision(NamedTuple):
 
     `why` is the reason for people, or a function that makes it: few reasons are ever read.
     `policy` names who decided: the rule, or the whole policy once it is `Named`. `second` is a second run on
-    another site.
+    another site. `advised` is where the policy would send a task that `Observe` runs onboard.
     """
 
     site: str
@@ -48,6 +51,13 @@ class Decision(NamedTuple):
     both: bool = False
     second: Probe | Hedge | None = None
     spared: tuple[str, ...] = ()
+    advised: str | None = None
+
+    @property
+    def measured(self) -> str | None:
+        """The site of a probe without `answers`."""
+        second = self.second
+        return None if not isinstance(second, Probe) or second.answers else second.site
 
     @property
     def reason(self) -> str:

@@ -14,7 +14,7 @@ from offboard.common.tasks import Size
 from offboard.robot_client.predictors.base import WARM_UP
 from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition
 
-ERRORS_MIN = 10  # with fewer errors, only the spread says how far a prediction may be off
+ERRORS_MIN = 10  # with fewer errors, they are taken to be normal, and the spread counts as one of them
 SPREADS_90 = 1.645  # standard deviations on each side that hold 90 % of the times, and above which 5 % are
 TAIL_SHARE = 0.2  # of the errors, the largest ones: they say how much longer a late task may take
 BEYOND = 0.25  # of the distance from the median to the largest error: later than that, no task has ended
@@ -25,7 +25,7 @@ class PredictionErrors:
     """How wrong the last predictions for one site were; a value that never changes.
 
     `scores`: the error of each prediction in units of `unit_s`, sorted. `usual_s`: the usual time of a task.
-    The methods return None while fewer than ERRORS_MIN errors are known.
+    The methods return None while fewer than ERRORS_MIN errors are known, unless a spread helps.
     """
 
     scores: tuple[float, ...] = ()
@@ -46,14 +46,21 @@ class PredictionErrors:
                 score = latest
         return max(0.0, predicted_s + unit * score)
 
-    def share_above(self, predicted_s: float, limit_s: float) -> float | None:
+    def share_above(self, predicted_s: float, limit_s: float, spread_s: float | None = None) -> float | None:
         """The share of tasks with this prediction that should take longer than `limit_s`."""
         count = len(self.scores)
         if count < ERRORS_MIN:
-            return None
+            if not spread_s:
+                return None
+            t = (limit_s - predicted_s) / self._scale_s(predicted_s, spread_s)
+            return 0.5 * math.erfc(normal_of_student(t, count + 1) / math.sqrt(2.0))
         score = (limit_s - predicted_s) / unit_s(predicted_s, self.usual_s)
         # Never 0 or 1: a limit that no error has reached yet may still be missed.
         return (count - bisect_left(self.scores, score) + 0.5) / (count + 1)
+
+    def half_90_s(self, predicted_s: float, spread_s: float) -> float:
+        """Half of the width of a 90 % interval while few errors are known."""
+        return student_90(len(self.scores) + 1) * self._scale_s(predicted_s, spread_s)
 
     def below(self, predicted_s: float, share: float) -> float | None:
         """The time in seconds that this share of tasks with this prediction should stay below."""
@@ -62,6 +69,12 @@ class PredictionErrors:
             return None
         rank = min(count - 1, math.ceil(share * (count + 1)) - 1)
         return max(0.0, predicted_s + unit_s(predicted_s, self.usual_s) * self.scores[rank])
+
+    def _scale_s(self, predicted_s: float, spread_s: float) -> float:
+        """The root mean square of the errors and the spread."""
+        unit = unit_s(predicted_s, self.usual_s)
+        squares = math.fsum((unit * score) ** 2 for score in self.scores)
+        return math.sqrt((squares + spread_s * spread_s) / (len(self.scores) + 1))
 
     @cached_property
     def _late(self) -> tuple[float, float]:
@@ -147,6 +160,18 @@ class Forecast(NamedTuple):
     def only(self, sites: Collection[str]) -> "Forecast":
         """The same forecast with these sites only."""
         return self._replace(sites={name: one for name, one in self.sites.items() if name in sites})
+
+
+def student_90(freedom: int) -> float:
+    """The 95 % quantile of Student's t, to 2 % from 2 degrees of freedom (Wallace 1959)."""
+    z = SPREADS_90 * (8 * freedom + 3) / (8 * freedom + 1)
+    return math.sqrt(freedom * math.expm1(z * z / freedom))
+
+
+def normal_of_student(t: float, freedom: int) -> float:
+    """The normal deviate that is as likely to be exceeded as this `t`, by the same approximation."""
+    z = math.sqrt(freedom * math.log1p(t * t / freedom)) * (8 * freedom + 1) / (8 * freedom + 3)
+    return math.copysign(z, t)
 
 
 def unit_s(predicted_s: float, usual_s: float) -> float:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from offboard.common.errors import ConfigError
-from offboard.robot_client.policies.forecast import SPREADS_90, PredictionErrors
+from offboard.robot_client.policies.forecast import SPREADS_90, Forecast, PredictionErrors
 
 
 class Expected(NamedTuple):
@@ -51,7 +51,7 @@ class Deadline:
 
     def cost(self, expected: Expected, errors: PredictionErrors) -> float:
         expected_s = max(0.0, expected.seconds)
-        missed = errors.share_above(expected_s, self.deadline_s)
+        missed = errors.share_above(expected_s, self.deadline_s, expected.spread_s)
         if missed is None:
             missed = float(expected_s > self.deadline_s)
         return missed + 1e-3 * expected_s / (expected_s + self.deadline_s)
@@ -65,6 +65,16 @@ class TimeAndEnergy:
 
     def cost(self, expected: Expected, errors: PredictionErrors) -> float:  # noqa: ARG002
         return expected.seconds + self.s_a_joule * expected.joules
+
+
+def weighed(forecast: Forecast, objective: Objective) -> Forecast:
+    """The same forecast with the costs of this objective. A site whose time is unknown keeps its cost."""
+    sites = dict(forecast.sites)
+    for site, one in forecast.sites.items():
+        if one.predicted_s is not None:
+            expected = Expected(one.predicted_s, one.spread_s, one.joules)
+            sites[site] = one._replace(cost=objective.cost(expected, one.errors))
+    return forecast._replace(sites=sites)
 
 
 OBJECTIVES = ("mean", "p95", "deadline", "energy")

@@ -1,4 +1,4 @@
-"""The trace and the metrics that an offloader writes by itself, and how observers get a record.
+"""The trace and the metrics that an offloader writes by itself; how a record is made and observers get it.
 
 What is written is in `trace` and `metrics`.
 """
@@ -10,7 +10,11 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from offboard.common.errors import is_interrupt
-from offboard.robot_client.records.trace import Record, Trace
+from offboard.robot_client.learning.learner import PendingTask
+from offboard.robot_client.learning.regret import Regret
+from offboard.robot_client.learning.savings import Savings
+from offboard.robot_client.records.trace import Late, Record, Trace
+from offboard.robot_client.sites.runner import Execution
 
 Observer = Callable[[Record], None]
 
@@ -49,6 +53,36 @@ class Recording:
     def close(self) -> None:
         """Write the waiting records, and stop serving metrics. Safe to call twice."""
         self._opened.close()
+
+
+def record_of(
+    pending: PendingTask,
+    executions: tuple[Execution, ...],
+    answer: Execution,
+    *,
+    ended_s: float,
+    late: tuple[Late, ...],
+    regret: Regret | None,
+    savings: Savings | None,
+) -> Record:
+    """The record of a task that was answered at `ended_s`, on the clock of the offloader."""
+    return Record(
+        i=pending.i,
+        id=pending.id,
+        kind=pending.task.kind.name,
+        size=pending.task.size,
+        sites=pending.forecast.sites,
+        decision=pending.decision,
+        executions=tuple(execution.without_value() for execution in executions),
+        used=answer.site if answer.ok else None,
+        waited_s=ended_s - pending.started_s,
+        amount=pending.amount,
+        late=late,
+        regret=regret,
+        started_at=pending.started_at,
+        deadline_s=pending.deadline_s,
+        savings=savings,
+    )
 
 
 def tell(observers: Iterable[Observer], record: Record) -> None:

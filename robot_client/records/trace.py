@@ -17,6 +17,7 @@ from typing import Any, Self
 from offboard.common.errors import describe
 from offboard.common.tasks import Size
 from offboard.robot_client.learning.regret import Regret
+from offboard.robot_client.learning.savings import Savings
 from offboard.robot_client.policies import Decision, Hedge, Outlook
 from offboard.robot_client.records.lines import VERSION, Lines
 from offboard.robot_client.sites.runner import UNMEASURED, Condition, Execution
@@ -67,6 +68,9 @@ class Record:
     amount: what the predictors of the sites were asked with: the size, or the work that was expected for it.
     late: executions of earlier tasks that have ended since the record before.
     regret: the present estimate, if there is one.
+    deadline_s: of the call, if it had one. The call missed it if `waited_s`, the time until the answer, is
+    longer.
+    savings: the present estimate for this kind, if there is one.
     """
 
     i: int
@@ -82,9 +86,13 @@ class Record:
     late: tuple[Late, ...] = ()
     regret: Regret | None = None
     started_at: datetime = field(default_factory=lambda: datetime.now(UTC))
+    deadline_s: float | None = None
+    savings: Savings | None = None
 
 
-_LATE_FIELDS, _REGRET_FIELDS = (tuple(one.name for one in fields(of)) for of in (Late, Regret))
+_LATE_FIELDS, _REGRET_FIELDS, _SAVINGS_FIELDS = (
+    tuple(one.name for one in fields(of)) for of in (Late, Regret, Savings)
+)
 
 
 class Trace(Lines):
@@ -171,8 +179,10 @@ def as_dict(record: Record) -> dict[str, Any]:
         "executions": [_values(one, _EXECUTION_FIELDS) for one in record.executions],
         "used": record.used,
         "waited_s": record.waited_s,
+        "deadline_s": record.deadline_s,
         "late": [_values(one, _LATE_FIELDS) for one in record.late],
         "regret": _values(record.regret, _REGRET_FIELDS) if record.regret else None,
+        "savings": _values(record.savings, _SAVINGS_FIELDS) if record.savings else None,
     }
 
 
@@ -201,6 +211,7 @@ def _decision(decision: Decision) -> dict[str, Any]:
         "second": None if second is None else second.site,
         "second_after_s": second.after_s if isinstance(second, Hedge) else 0.0,
         "spared": decision.spared,
+        "advised": decision.advised,
     }
 
 

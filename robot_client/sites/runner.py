@@ -125,14 +125,14 @@ class Runner(Protocol):
         """Stop, and give up the tasks in flight. Safe to call twice."""
 
 
-def checked_timeout(timeout_s: float) -> float:
+def checked_timeout(timeout_s: float, name: str = "timeout_s") -> float:
     """The same number; ConfigError unless it is a time that a task may have, in seconds."""
     try:
         allowed = 0 < timeout_s <= TIMEOUT_MAX_S
     except TypeError:  # it is no number
         allowed = False
     if not allowed:
-        raise ConfigError(f"timeout_s {timeout_s!r}: must be above 0 and at most {TIMEOUT_MAX_S:g}")
+        raise ConfigError(f"{name} {timeout_s!r}: must be above 0 and at most {TIMEOUT_MAX_S:g}")
     return timeout_s
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.stateful import precondition, rule
 
-from offboard import CloudError, Offloader, TaskFailed
+from offboard import CloudError, DeadlineMissed, Offloader, TaskFailed
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.state import served
 from tests.state.calls import Tally
@@ -79,6 +79,26 @@ class CallRules(Run):
                 return "cancelled"
 
         self.begin("cancelled async call", lambda do: asyncio.run(cancel(do)), "cancelled", wait=wait)
+
+    @asking
+    @rule(number=numbers, deadline_s=st.sampled_from([1e-3, 0.05, 2 * NAP_S]), where=wheres, wait=waits)
+    def call_with_deadline(self, number: int, deadline_s: float, where: str | None, wait: bool) -> None:
+        """It is answered or missed; what was expected before it is a number or unknown."""
+
+        def act(do: Offloader) -> int:
+            do.expect(served.twice, number, deadline_s=deadline_s)
+            return do(served.twice, number, where=where, deadline_s=deadline_s)
+
+        words = f"call with a deadline of {deadline_s:g} s"
+        self.begin(words, act, 2 * number, wait=wait, allowed=lambda error: issubclass(error, DeadlineMissed))
+
+    @asking
+    @rule(number=numbers, where=wheres, wait=waits)
+    def submit(self, number: int, where: str | None, wait: bool) -> None:
+        def act(do: Offloader) -> int:
+            return do.submit(served.twice, number, where=where).result()
+
+        self.begin("submitted call", act, 2 * number, wait=wait)
 
     @asking
     @rule(number=numbers, depth=st.integers(1, 2), batch=st.booleans(), where=wheres, wait=waits)

@@ -62,6 +62,10 @@ USES: dict[str, Callable[[Offloader], object]] = {
     "pinned": lambda offload: offload(square, 3, where="onboard"),
     "map": lambda offload: offload.map(square, [1, 2]),
     "asyncio": lambda offload: asyncio.run(offload.run(square, 3)),
+    "submit": lambda offload: offload.submit(square, 3),
+    "deadline": lambda offload: offload(square, 3, deadline_s=WAIT_S),
+    "expect": lambda offload: offload.expect(square, 3),
+    "savings": lambda offload: offload.savings(),
     "wait_for_sites": lambda offload: offload.wait_for_sites(square, WAIT_S),
 }
 

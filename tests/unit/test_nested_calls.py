@@ -60,6 +60,8 @@ WAYS: dict[str, Callable[[Callable[..., int], int], int]] = {
     "pinned": lambda function, number: bench.offload(function, number, where=ONBOARD),
     "map": lambda function, number: bench.offload.map(function, [number] * 3)[2],
     "asyncio": lambda function, number: asyncio.run(together(function, number)),
+    "submitted": lambda function, number: bench.offload.submit(function, number).result(),
+    "deadline": lambda function, number: bench.offload(function, number, deadline_s=WAIT_S),
 }
 
 

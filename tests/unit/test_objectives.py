@@ -64,6 +64,12 @@ def test_with_few_errors_the_prediction_decides_about_the_deadline() -> None:
     assert cost("deadline", expected(0.4), deadline_s=0.5) < 1e-3
 
 
+def test_with_few_errors_the_spread_says_how_likely_a_miss_is() -> None:
+    """Of two sites with the same prediction, the one with the larger spread costs more."""
+    steady, unsteady = (cost("deadline", expected(0.4, one), deadline_s=0.5) for one in (0.05, 0.2))
+    assert 1e-3 < steady < unsteady < 0.5
+
+
 @pytest.mark.parametrize("seconds", [-0.5, -2.0])
 def test_a_negative_prediction_is_no_negative_cost(seconds: float) -> None:
     """A line may predict a time below 0; it counts as 0."""

@@ -113,6 +113,7 @@ WRONG = [
     ({"observers": "print"}, "observers 'print': must be a list of functions"),
     ({"metrics": 9100}, "metrics 9100: must be a string or None"),
     ({"trace": 5}, "trace 5: must be a path or a string or None"),
+    ({"observe": 1}, "observe 1: must be True or False"),
     ({"settings": {"seed": 1}}, "settings {'seed': 1}: must be Settings or None"),
 ]
 WRONG_SETTINGS = [

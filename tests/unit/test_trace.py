@@ -16,6 +16,7 @@ import pytest
 from offboard.common.errors import CloudTimeout, ConfigError, DataError
 from offboard.loadgen.robot_files import read_trace
 from offboard.robot_client.learning.regret import Regret
+from offboard.robot_client.learning.savings import Savings
 from offboard.robot_client.policies import Decision, Hedge, Outlook
 from offboard.robot_client.records.trace import WAITING_MAX, Late, Record, Trace
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution
@@ -44,6 +45,8 @@ def record(i: int = 0) -> Record:
         late=(Late("s-7", CLOUD, 0.4, True, False),),
         regret=Regret(0.01, 0.0, 0.02, 9),
         started_at=datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC),
+        deadline_s=2.0,
+        savings=Savings(0.03, 0.02, 0.04, tasks=50, sent=0.5, probes=8),
     )
 
 
@@ -96,6 +99,7 @@ def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
             "second": "onboard",
             "second_after_s": 0.5,
             "spared": [],
+            "advised": None,
         },
         "executions": [
             {
@@ -127,8 +131,17 @@ def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
         ],
         "used": "onboard",
         "waited_s": 2.1,
+        "deadline_s": 2.0,
         "late": [{"id": "s-7", "site": "cloud", "seconds": 0.4, "ok": True, "censored": False}],
         "regret": {"mean_s": 0.01, "low_s": 0.0, "high_s": 0.02, "probes": 9},
+        "savings": {
+            "mean_s": 0.03,
+            "low_s": 0.02,
+            "high_s": 0.04,
+            "tasks": 50,
+            "sent": 0.5,
+            "probes": 8,
+        },
     }
 
 

@@ -1,0 +1,130 @@
+"""The runs of a task, from the decision to what they teach: starts them, counts second runs, hears late ones.
+
+What is decided is in `policies`; when each run of one task starts is in `execution/race.py`.
+"""
+
+import threading
+from collections import deque
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+from offboard.common.errors import Overtaken
+from offboard.robot_client.execution.race import Plan, Race, result_of
+from offboard.robot_client.learning.learner import Learner, PendingTask
+from offboard.robot_client.learning.runs_in_flight import Flights
+from offboard.robot_client.lifetime import Lifetime
+from offboard.robot_client.policies import PINNED
+from offboard.robot_client.policies.allowance import Allowance
+from offboard.robot_client.records.trace import Late
+from offboard.robot_client.sites.clock import Clock
+from offboard.robot_client.sites.runner import ONBOARD, Execution, Runner
+
+LATE_MAX = 64  # executions that ended after their task was answered, kept for the next record
+
+
+class TaskRuns:
+    """Carries out decisions. `lock` is that of the offloader: under it everything is learnt and counted.
+
+    `late`: the executions that ended after their task was answered; the next record takes them.
+    """
+
+    def __init__(
+        self,
+        runners: Mapping[str, Runner],
+        clock: Clock,
+        lock: threading.Lock,
+        *,
+        flights: Flights,
+        allowance: Allowance,
+        learner: Learner,
+        life: Lifetime,
+    ) -> None:
+        self._runners = runners
+        self._clock = clock
+        self._lock = lock
+        self._flights = flights
+        self._allowance = allowance
+        self._learner = learner
+        self._life = life
+        self.late: deque[Late] = deque(maxlen=LATE_MAX)
+        self._begun_onboard = 0
+
+    def execute(self, pending: PendingTask) -> tuple[Execution, ...]:
+        """Run the task on the sites of its decision."""
+        decision, sites = pending.decision, pending.forecast.sites
+        race = Race(
+            pending.task,
+            self._runners,
+            self._clock,
+            pending.timeout_s,
+            begun=partial(self._begun, pending),
+            allowed=self._take_duplicate,
+            late=partial(self._ended_late, pending),
+        )
+        first: tuple[str, ...] = (decision.site,)
+        if decision.both:
+            first = tuple(site for site in sites if site not in decision.spared)
+            if decision.policy != PINNED:  # a measurement is the choice of the caller, not of the policy
+                self._take_duplicates(len(first) - 1)
+        try:
+            second = decision.second
+            if second is not None and decision.measured:
+                second = None
+            return race.run(Plan(first, second, all=decision.both, call=pending.call))
+        except BaseException:  # closed during the task, or Ctrl-C: nobody waits for what still runs
+            with self._lock:
+                self._flights.end_all(pending.task.id)
+            raise
+
+    def measure(self, pending: PendingTask, site: str) -> None:
+        """Run a task that was answered on another site too, if a second run may start, and learn its time."""
+        if not self._take_duplicate():
+            return
+        before = self._begun_onboard
+        busy = self._flights.count(ONBOARD) > 0
+        self._begun(pending, site)
+        run = self._runners[site].submit(pending.task, pending.timeout_s)
+        self._clock.wait([run])
+        beside = busy or self._begun_onboard != before
+        self._ended_late(pending, site, result_of(site, run), beside=beside)
+
+    def learn(self, pending: PendingTask, executions: Sequence[Execution]) -> None:
+        """Learn the runs that have ended by now. Called under the lock."""
+        for one in executions:
+            if not isinstance(one.failure, Overtaken):
+                self._flights.end(one.site, pending.task.id)
+        if not self._life.closed:  # a run that `close` gave up says nothing about its site
+            self._learner.learn(pending, executions)
+
+    def take_late(self) -> tuple[Late, ...]:
+        """Empty `late`. Called under the lock."""
+        late = tuple(self.late)
+        self.late.clear()
+        return late
+
+    def _begun(self, pending: PendingTask, site: str) -> None:
+        outlook = pending.forecast.sites.get(site)
+        predicted_s = (outlook.predicted_s if outlook else None) or 0.0
+        with self._lock:
+            self._flights.begin(site, pending.task.id, predicted_s=predicted_s, now_s=self._clock.now_s())
+            self._begun_onboard += site == ONBOARD
+
+    def _take_duplicates(self, count: int) -> None:
+        with self._lock:
+            for _ in range(count):
+                self._allowance.duplicate()
+
+    def _take_duplicate(self) -> bool:
+        """Whether a second run may start; it is then counted. A fallback needs no permission."""
+        with self._lock:
+            return self._allowance.take_duplicate()
+
+    def _ended_late(
+        self, pending: PendingTask, site: str, execution: Execution, *, beside: bool | None = None
+    ) -> None:
+        """A run has ended after its task was answered; called in any thread."""
+        with self._lock:
+            self.late.append(Late.of(pending.id, site, execution))
+            self._flights.end(site, pending.task.id)
+            if execution.started and not self._life.closed:
+                self._learner.learn_late(pending, execution, beside=beside)
