@@ -7,6 +7,8 @@ from offboard.common.empty_task import EMPTY
 from offboard.common.errors import ConfigError
 from offboard.common.tasks import Kind, kinds, load_modules
 from offboard.robot_client.check.outcome import StepFailed
+from offboard.robot_client.sites.absence import difference
+from offboard.robot_client.sites.runner import CLOUD
 
 HASH_SHOWN = 8  # characters of a source hash
 PLANNER = "offboard.common.planning.planner"
@@ -39,6 +41,8 @@ def compare(tasks: Sequence[Kind], there: Mapping[str, str], *, chosen: bool) ->
                 f"the server has no task {kind.name}; it has {known}",
                 f"start the server with --tasks {module}",
             )
+        if kind.variants and (why := difference(kind, CLOUD, there)) is not None:
+            raise StepFailed(why, f"install the same version of {module} on both sides, and restart the server")
         if not kind.source_hash == there[kind.name] != "":
             hashes = f"{_short(kind.source_hash)} here, {_short(there[kind.name])} on the server"
             raise StepFailed(
