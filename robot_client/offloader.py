@@ -22,9 +22,9 @@ from offboard.common.errors import ConfigError, Overtaken
 from offboard.common.tasks import Task, kind_of
 from offboard.robot_client import policies
 from offboard.robot_client.execution.batch import Batch, Placed, arguments
-from offboard.robot_client.execution.choice import check_where, decided, pinned
+from offboard.robot_client.execution.choice import check_where, decided, pinned, plan_of
 from offboard.robot_client.execution.crossing_check import CrossingCheck
-from offboard.robot_client.execution.race import Plan, Race, answer_of
+from offboard.robot_client.execution.race import Race, answer_of
 from offboard.robot_client.learning.forecaster import Forecaster
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.learner import Learner, PendingTask
@@ -269,7 +269,7 @@ class Offloader:
                 placed=placed,
             )
         executions = self._execute(pending, budget_s, placed.call if placed else None)
-        answer = answer_of(executions)
+        answer = answer_of(executions, task.kind)
         with self._lock:
             self._learn(pending, executions)
             if not self._life.closed and self._memories.due(self._clock.now_s()):
@@ -345,7 +345,7 @@ class Offloader:
     def _execute(
         self, pending: PendingTask, timeout_s: float, call: "Future[str] | None"
     ) -> tuple[Execution, ...]:
-        decision, sites = pending.decision, pending.forecast.sites
+        decision = pending.decision
         race = Race(
             pending.task,
             self._runners,
@@ -355,13 +355,11 @@ class Offloader:
             allowed=self._take_duplicate,
             late=partial(self._ended_late, pending),
         )
-        first: tuple[str, ...] = (decision.site,)
-        if decision.both:
-            first = tuple(site for site in sites if site not in decision.spared)
-            if decision.policy != PINNED:  # a measurement is the choice of the caller, not of the policy
-                self._take_duplicates(len(first) - 1)
+        plan = plan_of(decision, pending.forecast, call)
+        if plan.all and decision.policy != PINNED:  # a measurement is the caller's choice, not the policy's
+            self._take_duplicates(len(plan.first) - 1)
         try:
-            return race.run(Plan(first, decision.second, all=decision.both, call=call))
+            return race.run(plan)
         except BaseException:  # closed during the task, or Ctrl-C: nobody waits for what still runs
             with self._lock:
                 self._flights.end_all(pending.task.id)

@@ -102,6 +102,8 @@ class Batch:
         if not self._waiting or all(len(one.running) >= one.limit for one in self._queues.values()):
             return None
         first = _usable(self._look(self._waiting[0]))
+        for site, one in first.items():
+            self._queues[site].lost_s = one.quality.lost_s
         cold = _cold(first)
         for site in cold:
             if not self._queues[site].running:

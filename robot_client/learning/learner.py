@@ -19,7 +19,8 @@ from offboard.robot_client.sites.runner import ONBOARD, Execution, Runner
 class PendingTask:
     """A task that is under way, and what was known when it was decided.
 
-    `amount`: what the predictors were asked for. `seconds`: the times of the sites that have answered.
+    `amount`: what the predictors were asked for.
+    `seconds`: the times of the sites that have answered, with the worth of their lost quality.
     """
 
     task: Task
@@ -68,7 +69,7 @@ class Learner:
             beside=site != ONBOARD and decision.site == ONBOARD and (decision.both or second_here),
         )
         if execution.ok and isinstance(decision.second, Probe):
-            pending.seconds[site] = execution.seconds
+            pending.seconds[site] = execution.seconds + pending.forecast.sites[site].quality.lost_s
             if len(pending.seconds) == 2:
                 self.regret.learn(pending.seconds[decision.site], pending.seconds[decision.second.site])
 
