@@ -143,13 +143,10 @@ class DecisionSettings:
                 raise ConfigError(f"--{flag}: {value:g} needs --objective {name}")
         if self.objective != MEAN and not policies.weighs_cost(self.policy):
             raise ConfigError(f"--objective: {self.objective} changes nothing with --policy {self.policy}")
-        if self.s_per_quality != S_PER_QUALITY:
-            for weighs, flag in (
-                (policies.weighs_cost(self.policy), f"--policy {self.policy}"),
-                (self.objective != "deadline", "--objective deadline"),
-            ):
-                if not weighs:
-                    raise ConfigError(f"--s-per-quality: {self.s_per_quality:g} changes nothing with {flag}")
+        by_deadline = self.objective == "deadline"
+        if self.s_per_quality != S_PER_QUALITY and (by_deadline or not policies.weighs_cost(self.policy)):
+            ignored_by = "--objective deadline" if by_deadline else f"--policy {self.policy}"
+            raise ConfigError(f"--s-per-quality: {self.s_per_quality:g} changes nothing with {ignored_by}")
 
     def settings(self, seed: int) -> Settings:
         """The rare options of the offloader."""
