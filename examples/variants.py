@@ -22,7 +22,7 @@ except MissingExtra as error:
     raise missing(__name__, "apriltags") from error
 
 SHAPES = ((720, 1280), (1080, 1920))  # rows, columns
-HALF_QUALITY = 0.6  # the share of the tags that `tags_at_half_size` finds; tests/unit/test_examples.py measures it
+HALF_QUALITY = 0.6  # the share of the tags that `tags_at_half_size` finds; tests/unit/test_variant_example.py measures it
 CALLS = 60
 
 same = apriltags.same
