@@ -76,13 +76,13 @@ class Kind:
         return without_state(inspect.signature(self.function), self.setup)
 
     def at(self, site: str) -> "Kind":
-        """What this site runs: the kind itself, or the variant of the site, for most servers that of `cloud`."""
+        """What this site runs: the kind itself or its variant. `cloud` stands for servers without one."""
         if not self.variants:
             return self
         return self.variants.get(site) or self.variants[CLOUD]
 
     def on_servers(self) -> "tuple[Kind, ...]":
-        """What servers run: the kind itself, or its variants for servers, as far as this computer has them."""
+        """What servers run: the kind itself, or those of its variants that this computer has."""
         if not self.variants:
             return (self,)
         return tuple(one for site, one in self.variants.items() if site != ONBOARD and one.present)

@@ -1,7 +1,7 @@
 """Finds AprilTags with one variant for each site: at half the size onboard, at full size on a server.
 
-Half the size takes about a quarter of the time, but small tags are missed: that is the lost quality. The program
-says which share of the tags each site found, and after which time.
+Half the size takes about a quarter of the time, but small tags are missed: that is the lost quality. The
+program says which share of the tags each site found, and after which time.
 """
 
 import io
@@ -22,7 +22,7 @@ except MissingExtra as error:
     raise missing(__name__, "apriltags") from error
 
 SHAPES = ((720, 1280), (1080, 1920))  # rows, columns
-HALF_QUALITY = 0.6  # the share of the tags that `tags_at_half_size` finds; tests/unit/test_variant_example.py measures it
+HALF_QUALITY = 0.6  # share of the tags that are found; tests/unit/test_variant_example.py measures it
 CALLS = 60
 
 same = apriltags.same

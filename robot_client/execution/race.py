@@ -23,7 +23,7 @@ class Plan:
     `first`: the sites that start at once. `second`: a second run.
     `all`: wait for every run, not for the first answer.
     `call`: a future that may name one more site while the task runs; that site then starts too.
-    `patience_s`: how long the answer of a second site waits for that of the first, which is of higher quality.
+    `patience_s`: how long the answer of a second site waits for the better one of the first site.
     """
 
     first: tuple[str, ...]

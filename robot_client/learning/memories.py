@@ -44,7 +44,7 @@ class Memories:
         self._shared_work = shared_work
         self._objective = objective or Mean()
         self._energy = energy or Energy()
-        # The objective `deadline` weighs quality against the chance to miss it, and needs no worth in seconds.
+        # The objective `deadline` weighs quality against the chance to miss it, not against seconds.
         self._s_per_quality = 0.0 if isinstance(objective, Deadline) else s_per_quality
         self._store = store
         self._kinds: dict[str, KindMemory] = {}

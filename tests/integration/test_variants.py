@@ -20,7 +20,11 @@ from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.variant_tasks import grade, only_there
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
+pytestmark = [
+    pytest.mark.integration,
+    pytest.mark.timeout(120),
+    pytest.mark.filterwarnings("default::DeprecationWarning", "default::SyntaxWarning"),  # of pupil_apriltags
+]
 
 Beds = Callable[..., LocalTestbed]
 CONNECT_S = 20.0
@@ -104,7 +108,7 @@ def test_the_shipped_scenario_shows_quality_and_time(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """AprilTags at full size before the outage, at half the size during it, at full size again after it."""
-    pytest.importorskip("pupil_apriltags", reason="needs the extra 'apriltags': pip install 'offboard[apriltags]'")
+    pytest.importorskip("pupil_apriltags", reason="needs the extra 'apriltags'")
     played = play(read_scenario(find_scenario("variants-outage")), tmp_path)
     played.check_robots()
     said = capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""The variants of docs/own_task.md and of `examples/variants.py`: they run, and their quality is what was measured."""
+"""The variants of docs/own_task.md and of `examples/variants.py`: they run, and their quality is measured."""
 
 import importlib
 import itertools
@@ -16,6 +16,11 @@ PAGE = (Path(__file__).parents[2] / "docs" / "own_task.md").read_text(encoding="
 FRAMES = 8
 TOLERANCE = 0.1
 
+pytestmark = [
+    pytest.mark.timeout(60),
+    pytest.mark.filterwarnings("default::DeprecationWarning", "default::SyntaxWarning"),  # of pupil_apriltags
+]
+
 
 def test_the_page_shows_a_task_that_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Onboard runs the rough function with the small model, and every server the decorated one."""
@@ -32,7 +37,7 @@ def test_the_page_shows_a_task_that_runs(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_the_quality_of_the_example_is_measured() -> None:
     """It is the share of the tags of both resolutions that the variant at half the size finds."""
-    pytest.importorskip("pupil_apriltags", reason="needs the extra 'apriltags': pip install 'offboard[apriltags]'")
+    pytest.importorskip("pupil_apriltags", reason="needs the extra 'apriltags'")
     variants = importlib.import_module("examples.variants")
     kind, states = kind_of(variants.find_tags), TaskStates(workers=1)
     found = {ONBOARD: 0, CLOUD: 0}

@@ -1,4 +1,4 @@
-"""Variants: which function a site runs, what is refused when they are registered, and what a hello compares."""
+"""Variants: which function a site runs, what is refused when they are registered, what a hello compares."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -53,6 +53,9 @@ def no_parameter() -> int:
 
 async def later(number: int) -> int:
     return number
+
+
+HERE = {"onboard": small}
 
 
 def register(
@@ -182,7 +185,7 @@ def test_check_compares_the_variant_of_the_cloud() -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"variants": {"onboard": small}}, "quality= is None; a task with variants needs variants= and quality="),
+        ({"variants": HERE}, "quality= is None; a task with variants needs variants= and quality="),
         ({"quality": GRADES}, "variants= is None; a task with variants needs variants= and quality="),
         ({"variants": {}, "quality": GRADES}, "variants= is {}; a task with variants needs"),
         ({"variants": [small], "quality": GRADES}, r"variants= is \[.*; a task with variants needs"),
@@ -199,11 +202,11 @@ def test_check_compares_the_variant_of_the_cloud() -> None:
             {"variants": {"onboard": small, 7: small}, "quality": GRADES | {7: 0.9}},
             f"quality= names 7, which is not the name of a site, 1 to {SITE_LENGTH_MAX} characters",
         ),
-        ({"variants": {"onboard": small}, "quality": GRADES | {"cloud": 1.1}}, "quality of 'cloud' is 1.1; "),
-        ({"variants": {"onboard": small}, "quality": GRADES | {"cloud": -1}}, "quality of 'cloud' is -1; it must"),
-        ({"variants": {"onboard": small}, "quality": GRADES | {"cloud": math.nan}}, "must be a number 0 to 1"),
-        ({"variants": {"onboard": small}, "quality": GRADES | {"cloud": True}}, "quality of 'cloud' is True; "),
-        ({"variants": {"onboard": small}, "quality": GRADES | {"cloud": "1"}}, "quality of 'cloud' is '1'; "),
+        ({"variants": HERE, "quality": GRADES | {"cloud": 1.1}}, "quality of 'cloud' is 1.1; it must be"),
+        ({"variants": HERE, "quality": GRADES | {"cloud": -1}}, "quality of 'cloud' is -1; it must be"),
+        ({"variants": HERE, "quality": GRADES | {"cloud": math.nan}}, "is nan; it must be a number 0 to 1"),
+        ({"variants": HERE, "quality": GRADES | {"cloud": True}}, "quality of 'cloud' is True; it must be"),
+        ({"variants": HERE, "quality": GRADES | {"cloud": "1"}}, "quality of 'cloud' is '1'; it must be"),
         ({"variants": {"onboard": 3}, "quality": GRADES}, "variants= has 3 for 'onboard', no function"),
         (
             {"variants": {"onboard": scaled}, "quality": GRADES},
@@ -236,8 +239,8 @@ def test_defaults_belong_to_the_parameters() -> None:
 @pytest.mark.parametrize(
     ("variant", "setup", "said"),
     [
-        (with_model, {"onboard": no_parameter}, "setup= by site must have one function for each of onboard, cloud"),
-        (with_model, {"onboard": no_parameter, "cloud": None}, "setup= by site must have one function for each"),
+        (with_model, {"onboard": no_parameter}, "must have one function for each of onboard, cloud"),
+        (with_model, {"onboard": no_parameter, "cloud": None}, "setup= by site must have one function for"),
         (no_parameter, no_parameter, "setup= needs a function whose first parameter takes its result"),
         (small, no_parameter, r"small, takes \(\), but the task takes \(number\)"),
     ],
