@@ -7,7 +7,7 @@ from typing import Any
 
 from offboard import task
 
-onboard_s, server_s = 0.02, 0.02  # how long the variants take
+ONBOARD_S, SERVER_S = 0.02, 0.01  # how long the variants take
 
 
 def small_model() -> str:
@@ -19,7 +19,7 @@ def large_model() -> str:
 
 
 def grade_roughly(model: str, number: int) -> list[Any]:
-    time.sleep(onboard_s)
+    time.sleep(ONBOARD_S)
     return [model, "rough", number, os.getpid()]
 
 
@@ -31,7 +31,7 @@ def grade_roughly(model: str, number: int) -> list[Any]:
     quality={"onboard": 0.8, "cloud": 1.0},
 )
 def grade(model: str, number: int) -> list[Any]:
-    time.sleep(server_s)
+    time.sleep(SERVER_S)
     return [model, "fine", number, os.getpid()]
 
 

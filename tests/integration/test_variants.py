@@ -1,6 +1,7 @@
-"""Variants with a real server behind a real relay: an outage in the middle, a batch, and other source there."""
+"""Variants with a real server behind a real relay: an outage in the middle, a batch, other source there."""
 
 import os
+import re
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,7 +30,7 @@ pytestmark = [
 Beds = Callable[..., LocalTestbed]
 CONNECT_S = 20.0
 TASKS = 40  # of each phase
-SETTLED = 10  # tasks after a change, before the robot must have noticed it
+LATE = 2  # answers of the small variant at most, because the cloud was late on a busy machine
 WITHIN = 30  # tasks after the outage, within which the better variant must be used again
 PAUSE_S = 0.05  # between two tasks
 TIMEOUT_S = 1.0
@@ -39,31 +40,31 @@ SERVED = {"tasks": "tests.variant_tasks", "workers": 1}
 
 def test_the_better_variant_is_used_before_and_after_an_outage(testbed: Beds) -> None:
     """Large before, small during the outage, large again within 30 tasks; every call is answered in time."""
-    bed, records = testbed(SERVED, delay_ms=15.0), list[Record]()
-
-    def ask(tasks: int) -> list[str]:
-        answers = []
-        for number in range(tasks):
-            answers.append(offload(grade, number))
-            time.sleep(PAUSE_S)
-        assert [one[2] for one in answers] == list(range(tasks))
-        assert all((one[3] == os.getpid()) == (one[:2] == ["small", "rough"]) for one in answers)
-        return [one[1] for one in answers]
-
+    bed, records, answers = testbed(SERVED, delay_ms=15.0), list[Record](), list[str]()
     with Offloader.connect(bed.endpoint, timeout_s=TIMEOUT_S, observers=[records.append]) as offload:
         assert offload.wait_for_sites(grade, CONNECT_S) == {}
-        before = ask(TASKS)
-        bed.set_link(outage=True)
-        during = ask(TASKS)
-        bed.set_link(outage=False)
-        after = ask(TASKS)
-    print("before", before, "during", during, "after", after, sep="\n")
-    assert before == ["fine"] * TASKS
-    assert during[SETTLED:] == ["rough"] * (TASKS - SETTLED)
-    assert after[WITHIN:] == ["fine"] * (TASKS - WITHIN)
+        for silent in (False, True, False):
+            bed.set_link(outage=silent)
+            for number in range(TASKS):
+                model, how, echoed, process = offload(grade, number)
+                assert (model, how) in (("small", "rough"), ("large", "fine"))
+                assert (echoed, process == os.getpid()) == (number, model == "small")
+                answers.append(model)
+                time.sleep(PAUSE_S)
+    before, during, after = (slice(n * TASKS, (n + 1) * TASKS) for n in range(3))
+    for phase in (before, during, after):
+        print(*map(shown, records[phase]), sep="\n")
+    assert answers[before].count("large") >= TASKS - LATE
+    assert answers[during] == ["small"] * TASKS
+    assert answers[after][WITHIN:].count("small") <= LATE
     assert max(record.waited_s for record in records) < TIMEOUT_S + 1.0
-    chosen = [record.sites[record.used or ONBOARD].quality.value for record in records[TASKS - 5 : TASKS]]
-    assert chosen == [1.0] * 5
+
+
+def shown(record: Record) -> str:
+    """The site, the quality and the time of an answer."""
+    assert record.used is not None
+    quality = record.sites[record.used].quality.value
+    return f"{record.used} quality {quality} {record.waited_s * 1e3:.0f} ms ({record.decision.reason})"
 
 
 def test_a_batch_stays_on_the_better_variant(testbed: Beds) -> None:
@@ -73,8 +74,9 @@ def test_a_batch_stays_on_the_better_variant(testbed: Beds) -> None:
         assert offload.wait_for_sites(grade, CONNECT_S) == {}
         answers = offload.map(grade, range(30))
         assert [one[2] for one in answers] == list(range(30))
-        assert [one[1] for one in offload.map(grade, range(5))] == ["fine"] * 5
-    assert [one[1] for one in answers].count("rough") <= WARM_UP
+        models = [one[0] for one in offload.map(grade, range(10))]
+    assert [one[0] for one in answers].count("small") <= WARM_UP + LATE
+    assert models.count("small") <= LATE
 
 
 def test_other_source_on_the_server_is_one_line(
@@ -109,6 +111,8 @@ def test_the_shipped_scenario_shows_quality_and_time(
 ) -> None:
     """AprilTags at full size before the outage, at half the size during it, at full size again after it."""
     pytest.importorskip("pupil_apriltags", reason="needs the extra 'apriltags'")
+    from examples.variants import HALF_QUALITY
+
     played = play(read_scenario(find_scenario("variants-outage")), tmp_path)
     played.check_robots()
     said = capsys.readouterr().out
@@ -118,10 +122,8 @@ def test_the_shipped_scenario_shows_quality_and_time(
     assert outage is not None
     used = [record["used"] for record in read_trace(tmp_path / TRACE)]
     began, ended = outage
-    assert used[began - 5 : began] == [CLOUD] * 5
+    assert used[began - 8 : began].count(CLOUD) >= 8 - LATE
     assert used[ended - 3 : ended] == [ONBOARD] * 3
     assert CLOUD in used[ended : ended + WITHIN]
-    for site, quality in (("onboard", 0.6), ("cloud", 1)):
-        assert f"answers of quality {quality:g} after" in next(
-            line for line in said.splitlines() if line.startswith(f"{site}: ")
-        )
+    for site, quality in ((ONBOARD, HALF_QUALITY), (CLOUD, 1)):
+        assert re.search(rf"^{site}: \d+ answers of quality {quality:g} after [\d.]+ ms", said, re.MULTILINE)

@@ -165,7 +165,7 @@ def test_a_difference_is_one_clear_line(
 
 
 def test_a_server_of_another_version_keeps_a_task_with_variants_onboard() -> None:
-    """It knows the task as one function, so its hash is another one; a plain robot meets variants likewise."""
+    """It knows the task as one function, with another hash. The same holds for a robot of another version."""
     plain = Kind("sort_out", sort_onboard, float, source_hash="a" * 64)
     assert difference(plain, CLOUD, hashes()) == "the source of task sort_out differs on the server"
     there = {"sort_out": "a" * 64}
@@ -212,7 +212,7 @@ def test_check_compares_the_variant_of_the_cloud() -> None:
             {"variants": {"onboard": scaled}, "quality": GRADES},
             r"the variant of 'onboard', scaled, takes \(number, scale=2\), but the task takes \(number\)",
         ),
-        ({"variants": {"cloud": large}, "quality": GRADES}, r"large, takes \(number, /\), but the task takes"),
+        ({"variants": {"cloud": large}, "quality": GRADES}, r"large, takes \(number, /\), but the task"),
         ({"variants": {"onboard": later}, "quality": GRADES}, "variant later is a coroutine or generator"),
         ({"variants": {"onboard": max}, "quality": GRADES}, "the variant of 'onboard' has no signature"),
         (
@@ -232,7 +232,8 @@ def test_what_does_not_fit_together_is_refused(options: dict[str, Any], said: st
 
 def test_defaults_belong_to_the_parameters() -> None:
     """The robot fills in the defaults of the decorated function, so another default would never be used."""
-    with pytest.raises(ConfigError, match=r"takes \(number, scale=3\), but the task takes \(number, scale=2\)"):
+    said = r"takes \(number, scale=3\), but the task takes \(number, scale=2\)"
+    with pytest.raises(ConfigError, match=said):
         register(scaled, variants={"onboard": doubled}, quality=GRADES)
 
 
