@@ -176,7 +176,7 @@ def test_check_compares_the_variant_of_the_cloud() -> None:
     """`robot-client check` passes, or names the difference and a remedy."""
     kind = kind_of(sort_out)
     assert compare([kind], hashes(), chosen=True).endswith("the same on both sides: sort_out")
-    with pytest.raises(StepFailed, match="the source of sort_out@cloud, .* differs on the server; remedy: "):
+    with pytest.raises(StepFailed, match=r"the source of sort_out@cloud, .* differs on the server; remedy: "):
         compare([kind], hashes() | {"sort_out@cloud": CHANGED}, chosen=True)
     with pytest.raises(StepFailed, match="the server has no task sort_out; it has none; remedy: "):
         compare([kind], {"sort_in@cloud": CHANGED}, chosen=True)
@@ -254,7 +254,7 @@ def test_every_variant_takes_what_its_setup_made(variant: Callable[..., Any], se
 
 def test_the_name_of_a_variant_fits_into_a_message() -> None:
     """The names of task and site together have a limit."""
-    with pytest.raises(ConfigError, match="'x{60}@onboard' has over 64 characters"):
+    with pytest.raises(ConfigError, match=r"'x{60}@onboard' has over 64 characters"):
         task("x" * 60, size=float, variants={"onboard": small}, quality=GRADES)(small)
 
 
