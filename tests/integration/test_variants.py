@@ -109,9 +109,9 @@ def test_a_server_may_lack_a_variant(testbed: Beds) -> None:
 def test_the_shipped_scenario_shows_quality_and_time(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """AprilTags at full size before the outage, at half the size during it, at full size again after it."""
+    """AprilTags at full size before the outage, in small pictures during it, at full size again after it."""
     pytest.importorskip("pupil_apriltags", reason="needs the extra 'apriltags'")
-    from examples.variants import HALF_QUALITY
+    from examples.variants import SMALL_QUALITY
 
     played = play(read_scenario(find_scenario("variants-outage")), tmp_path)
     played.check_robots()
@@ -125,5 +125,5 @@ def test_the_shipped_scenario_shows_quality_and_time(
     assert used[began - 8 : began].count(CLOUD) >= 8 - LATE
     assert used[ended - 3 : ended] == [ONBOARD] * 3
     assert CLOUD in used[ended : ended + WITHIN]
-    for site, quality in ((ONBOARD, HALF_QUALITY), (CLOUD, 1)):
+    for site, quality in ((ONBOARD, SMALL_QUALITY), (CLOUD, 1)):
         assert re.search(rf"^{site}: \d+ answers of quality {quality:g} after [\d.]+ ms", said, re.MULTILINE)

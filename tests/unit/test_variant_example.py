@@ -36,7 +36,7 @@ def test_the_page_shows_a_task_that_runs(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_the_quality_of_the_example_is_measured() -> None:
-    """It is the share of the tags of both resolutions that the variant at half the size finds."""
+    """It is the share of the tags of both resolutions that the variant of onboard finds."""
     pytest.importorskip("pupil_apriltags", reason="needs the extra 'apriltags'")
     variants = importlib.import_module("examples.variants")
     kind, states = kind_of(variants.find_tags), TaskStates(workers=1)
@@ -54,4 +54,4 @@ def test_the_quality_of_the_example_is_measured() -> None:
 
 
 def nearby(tag: dict, other: dict) -> bool:
-    return tag["id"] == other["id"] and np.allclose(tag["center"], other["center"], atol=2.0)
+    return tag["id"] == other["id"] and np.allclose(tag["center"], other["center"], atol=4.0)
