@@ -132,7 +132,7 @@ class Batch:
 
     def _end(self, site: str, finish_s: float) -> str:
         lost_s = self._queues[site].lost_s
-        more = f" + {lost_s * 1e3:.3g} ms for its quality" if lost_s else ""
+        more = f" + {lost_s * 1e3:g} ms for its quality" if lost_s else ""
         return f"{site} done in {finish_s * 1e3:.3g} ms{more}"
 
     def _start(self, threads: CallThreads, number: int, site: str, reason: str) -> None:

@@ -60,7 +60,7 @@ def _times(one: Outlook) -> str:
     if quality is WHOLE:
         return said
     if quality.lost_s:
-        return f"{said} + {quality.lost_s * 1e3:.3g} ms for quality {quality.value:g}"
+        return f"{said} + {quality.lost_s * 1e3:g} ms for quality {quality.value:g}"
     return f"{said}, quality {quality.value:g}"
 
 
