@@ -150,6 +150,8 @@ def answer_of(executions: tuple[Execution, ...], kind: Kind) -> Execution:
     The failure of the task itself comes first, and then the last failure of a site.
     """
     good = [execution for execution in executions if execution.ok]
+    if len(good) == 1:
+        return good[0]
     if good:
         return min(good, key=lambda one: (-kind.at(one.site).quality, one.seconds))
     own = [execution for execution in executions if isinstance(execution.failure, TaskError)]
