@@ -94,7 +94,9 @@ def create_app(
     @app.get("/tasks", summary="The tasks that this server runs")
     async def known_tasks() -> list[dict[str, Any]]:
         return [
-            {"name": k.name, "source_hash": k.source_hash, "duplicate": k.duplicate} for k in tasks.kinds()
+            {"name": one.name, "source_hash": one.source_hash, "duplicate": one.duplicate}
+            for kind in tasks.kinds()
+            for one in kind.on_servers()
         ]
 
     return app

@@ -262,8 +262,7 @@ class Server:
         return chosen
 
     def _hello(self) -> Hello:
-        known = {kind.name: kind.source_hash for kind in tasks.kinds()}
-        return Hello(known, VERSION, self._limits.message_bytes_max)
+        return Hello(tasks.hashes(), VERSION, self._limits.message_bytes_max)
 
     def _drop(self, reason: str, error: ProtocolError) -> None:
         self.metrics.dropped.labels(reason).inc()

@@ -87,7 +87,8 @@ def warm_kinds(states: TaskStates) -> None:
     """
     cpu_time.used_s()  # the first call looks for the cgroup
     for kind in tasks.kinds():
-        states.prepare(kind)
+        for one in kind.on_servers():
+            states.prepare(one)
         _warm(kind)
 
 

@@ -8,19 +8,28 @@ import inspect
 import itertools
 import math
 import sys
-import textwrap
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
-from offboard.common.dataclass_types import check_types, field_names
+from offboard.common.dataclass_types import check_types
 from offboard.common.errors import BadValue, ConfigError, UnknownTask, describe, is_interrupt
+from offboard.common.task_functions import (
+    check_first_parameter,
+    check_ordinary,
+    check_parameters,
+    check_variant,
+    contract_hash,
+    name_of,
+    source_hash,
+    without_state,
+)
+from offboard.common.variants import AT, CLOUD, ONBOARD, Variant, elsewhere, variants_of
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 NAME_LENGTH_MAX = 64
 KINDS_MAX = 256  # a `hello` message names all of them
-OPTIONS = ("deadline_s", "function", "observe", "timeout_s", "where")  # of a call, in this version or others
 SIZE_NUMBERS_MAX = 8  # a size sums up the arguments; with more numbers, a window says too little of each
 
 Size = float | tuple[float, ...]  # a tuple has 2 to SIZE_NUMBERS_MAX numbers
@@ -35,6 +44,9 @@ class Kind:
     is called once per process before the first task. A kind with `duplicate=False` never runs on two sites.
     `work` maps a result to the amount of work that it took, in any unit. `setup` is called once per worker;
     its result is the first argument of the function, which callers do not give.
+
+    `variants` holds a kind for each site, if sites run different functions, with the `quality` of its answers
+    from 0 to 1. `source_hash` then covers what they have in common: the parameters and the dataclasses.
     """
 
     name: str
@@ -47,6 +59,8 @@ class Kind:
     work: Callable[[Any], float] | None = None
     positional: int | None = None  # a call with this many positional arguments needs no binding
     setup: Callable[[], Any] | None = None
+    variants: "Mapping[str, Kind]" = field(default_factory=dict, compare=False)
+    quality: float = 1.0
     _counts: list[int] = field(default_factory=list, compare=False, repr=False)  # the first one holds for all
 
     def bind(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:
@@ -59,7 +73,24 @@ class Kind:
 
     def signature(self) -> inspect.Signature:
         """What a caller gives: the parameters of the function, without the first one if there is a setup."""
-        return _without_state(inspect.signature(self.function), self.setup)
+        return without_state(inspect.signature(self.function), self.setup)
+
+    def at(self, site: str) -> "Kind":
+        """What this site runs: the kind itself or its variant. `cloud` stands for servers without one."""
+        if not self.variants:
+            return self
+        return self.variants.get(site) or self.variants[CLOUD]
+
+    def on_servers(self) -> "tuple[Kind, ...]":
+        """What servers run: the kind itself, or those of its variants that this computer has."""
+        if not self.variants:
+            return (self,)
+        return tuple(one for site, one in self.variants.items() if site != ONBOARD and one.present)
+
+    @property
+    def present(self) -> bool:
+        """Whether this computer has the function."""
+        return self.function is not elsewhere
 
     def size_of(self, args: tuple[Any, ...]) -> Size:
         """The input size d of a call. BadValue unless it is finite, not negative and as long as before."""
@@ -117,6 +148,7 @@ class Task:
 
 
 _kinds: dict[str, Kind] = {}
+_on_servers: dict[str, Kind] = {}  # by the name that a request has
 
 
 def task(
@@ -127,7 +159,9 @@ def task(
     types: tuple[type, ...] = (),
     warm: Callable[[], None] | None = None,
     work: Callable[[Any], float] | None = None,
-    setup: Callable[[], Any] | None = None,
+    setup: Callable[[], Any] | Mapping[str, Callable[[], Any]] | None = None,
+    variants: Mapping[str, Callable[..., Any] | None] | None = None,
+    quality: Mapping[str, float] | None = None,
 ) -> Callable[[F], F]:
     """Register a function as a kind of task. It can still be called as an ordinary function.
 
@@ -135,32 +169,41 @@ def task(
     differs between them, the task stays onboard.
     If `size` returns several numbers, the predictor `least-squares` uses all of them, and every other one
     uses the first; `parts` predicts from the work instead if the kind tells it (by the first number too).
+
+    `variants`: the function of each site that does not run the decorated one; None: this computer does not
+    have it. `quality`: how good the answers of each site are, from 0 to 1. With variants, `setup` may be a
+    dictionary by site too.
     """
     if not isinstance(name, str) or len(name) > NAME_LENGTH_MAX or not name.isidentifier():
         raise ConfigError(f"task name {name!r} is not an identifier of at most {NAME_LENGTH_MAX} characters")
-    if len(_kinds) >= KINDS_MAX:
+    if sum(1 + len(kind.variants) for kind in _kinds.values()) + len(quality or ()) >= KINDS_MAX:
         raise ConfigError(f"task {name}: {KINDS_MAX} tasks are registered already, the most allowed")
 
     check_types(name, types)
 
     def register(function: F) -> F:
-        _check_ordinary(name, function=function, size=size, setup=setup, work=work, warm=warm)
+        found = variants_of(name, function, variants=variants, quality=quality, setup=setup)
+        own: Any = found[CLOUD].setup if found else setup
+        check_ordinary(name, function=function, size=size, setup=own, work=work, warm=warm)
         signature = inspect.signature(function)
-        if setup is not None:
-            _check_first_parameter(name, signature)
-        parameters = _without_state(signature, setup).parameters.values()
-        _check_parameters(name, parameters)
+        if own is not None:
+            check_first_parameter(name, signature)
+        parameters = without_state(signature, own).parameters.values()
+        check_parameters(name, parameters)
         fixed = all(parameter.kind != parameter.VAR_POSITIONAL for parameter in parameters)
         count = len(parameters) if fixed else None
         kind = Kind(
             name, function, size, duplicate,
-            types=tuple(types), warm=warm, source_hash=_source_hash(function, setup, types), work=work,
-            positional=count, setup=setup,
+            types=tuple(types), warm=warm, source_hash=source_hash(function, own, types), work=work,
+            positional=count, setup=own,
         )  # fmt: skip
+        if found:
+            kind = _with_variants(kind, found)
         known = _kinds.get(name)
         if known is not None:
             _check_same(known, kind)
         _kinds[name] = kind
+        _on_servers.update((one.name, one) for one in kind.on_servers())
         return function
 
     return register
@@ -186,14 +229,21 @@ def kind_of(function: Callable[..., Any]) -> Kind:
 
 
 def kind_named(name: str) -> Kind:
+    """What a server runs for a request with this name."""
     try:
-        return _kinds[name]
+        return _on_servers[name]
     except KeyError:
-        raise UnknownTask(f"no task named {name!r}; known: {', '.join(sorted(_kinds)) or 'none'}") from None
+        known = ", ".join(sorted(_on_servers)) or "none"
+        raise UnknownTask(f"no task named {name!r}; known: {known}") from None
 
 
 def is_kind(name: str) -> bool:
-    return name in _kinds
+    return name in _on_servers
+
+
+def hashes() -> dict[str, str]:
+    """What a `hello` says: the hash of each task, and of each variant that servers run."""
+    return {one.name: one.source_hash for kind in kinds() for one in (kind, *kind.on_servers())}
 
 
 def kinds() -> tuple[Kind, ...]:
@@ -212,6 +262,29 @@ def load_modules(names: Iterable[str]) -> None:
         except (Exception, SystemExit) as error:
             where = _where(name) if _is_missing(name, error) else ""
             raise ConfigError(f"task module {name!r} cannot be imported: {describe(error)}{where}") from error
+
+
+def _with_variants(kind: Kind, found: Mapping[str, Variant]) -> Kind:
+    """The kind with a kind for each site, named TASK@SITE."""
+    name, given = kind.name, kind.signature()
+    if kind.work is not None:
+        raise ConfigError(f"task {name}: work= cannot be used with variants=, which may do different work")
+    made = {}
+    for site, one in found.items():
+        function: Callable[..., Any] = elsewhere
+        own_hash = ""
+        if one.function is not None:
+            function = one.function
+            check_ordinary(name, variant=function, setup=one.setup)
+            check_variant(name, site, function, setup=one.setup, given=given)
+            own_hash = source_hash(function, one.setup, kind.types)
+        made[site] = replace(
+            kind, name=f"{name}{AT}{site}", function=function, setup=one.setup, source_hash=own_hash,
+            quality=one.quality,
+        )  # fmt: skip
+        if len(made[site].name) > NAME_LENGTH_MAX:
+            raise ConfigError(f"task {name}: {made[site].name!r} has over {NAME_LENGTH_MAX} characters")
+    return replace(kind, source_hash=contract_hash(given, kind.types), variants=made)
 
 
 def _meant(name: str) -> str:
@@ -234,83 +307,22 @@ def _where(name: str) -> str:
     return "; it is looked for in this folder and on PYTHONPATH"
 
 
-def _check_ordinary(name: str, **functions: Callable[..., Any] | None) -> None:
-    for place, function in functions.items():
-        for lazy in (inspect.iscoroutinefunction, inspect.isgeneratorfunction, inspect.isasyncgenfunction):
-            if lazy(function):
-                raise ConfigError(
-                    f"task {name}: {place} {_name(function)} is a coroutine or generator function; "
-                    "use an ordinary function that returns its result"
-                )
-
-
-def _check_parameters(name: str, parameters: Iterable[inspect.Parameter]) -> None:
-    for parameter in parameters:
-        if parameter.kind in (parameter.KEYWORD_ONLY, parameter.VAR_KEYWORD):
-            raise ConfigError(
-                f"task {name}: parameter {parameter.name!r} is keyword-only; make it positional"
-            )
-        if parameter.name in OPTIONS:
-            raise ConfigError(
-                f"task {name}: a parameter cannot be named {parameter.name!r}, "
-                "an option of the call; rename it"
-            )
-
-
 def _check_same(known: Kind, kind: Kind) -> None:
     """ConfigError unless both are one function, whose module was loaded again or is also the script."""
     first, second = known.function, kind.function
-    if _file(first) != _file(second) or _name(first) != _name(second):
-        by = f"by {first.__module__}.{_name(first)} and by {second.__module__}.{_name(second)}"
-    elif known.source_hash != kind.source_hash:
+    if _file(first) != _file(second) or name_of(first) != name_of(second):
+        by = f"by {first.__module__}.{name_of(first)} and by {second.__module__}.{name_of(second)}"
+    elif _sources(known) != _sources(kind):
         by = "with different source"
     else:
         return
     raise ConfigError(f"task {kind.name} is registered twice, {by}; rename one of them")
 
 
+def _sources(kind: Kind) -> list[str]:
+    return [kind.source_hash, *(one.source_hash for one in kind.variants.values())]
+
+
 def _file(function: Callable[..., Any]) -> str:
     module = function.__module__
     return getattr(sys.modules.get(module), "__file__", None) or module
-
-
-def _name(function: Callable[..., Any] | None) -> str:
-    return getattr(function, "__qualname__", None) or repr(function)
-
-
-def _check_first_parameter(name: str, signature: inspect.Signature) -> None:
-    first = next(iter(signature.parameters.values()), None)
-    if first is None or first.kind not in (first.POSITIONAL_ONLY, first.POSITIONAL_OR_KEYWORD):
-        raise ConfigError(f"task {name}: setup= needs a function whose first parameter takes its result")
-
-
-def _without_state(signature: inspect.Signature, setup: object) -> inspect.Signature:
-    if setup is None:
-        return signature
-    _, *given = signature.parameters.values()
-    return signature.replace(parameters=given)
-
-
-def _source_hash(function: Callable[..., Any], setup: Callable[[], Any] | None, types: Iterable[type]) -> str:
-    """SHA-256 of the source of a function, its setup and its dataclasses, with the names of their fields.
-
-    An empty text, which matches nothing, if the function has no source.
-    """
-    if not _source(function):
-        return ""
-    parts = [_source(function), _source(setup)]
-    for one in types:
-        parts += [_source(one), *sorted(field_names(one))]
-    import hashlib  # it loads OpenSSL, which --help does not need
-
-    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
-
-
-def _source(of: Any) -> str:
-    try:
-        # Code of exec and of `python -c` has this file name. Python 3.13 keeps the source of -c under it.
-        if inspect.getfile(inspect.unwrap(of)) == "<string>":
-            return ""
-        return textwrap.dedent(inspect.getsource(of))
-    except (OSError, TypeError):
-        return ""

@@ -20,7 +20,7 @@ from offboard.common.errors import ConfigError
 from offboard.common.tasks import Task, kind_of
 from offboard.robot_client import policies
 from offboard.robot_client.execution.batch import Batch, Placed, arguments
-from offboard.robot_client.execution.choice import check_where, decided, pinned
+from offboard.robot_client.execution.choice import check_where, decided, pinned, plan_of
 from offboard.robot_client.execution.crossing_check import CrossingCheck
 from offboard.robot_client.execution.race import answer_of
 from offboard.robot_client.learning.forecaster import Forecaster
@@ -364,7 +364,7 @@ class Offloader:
     def _finish(self, pending: PendingTask) -> tuple[Execution, Record]:
         """Execute, learn, record."""
         task, executions = pending.task, self._runs.execute(pending)
-        answer = answer_of(executions)
+        answer = answer_of(executions, task.kind)
         with self._lock:
             self._runs.learn(pending, executions)
             if not self._life.closed and self._memories.due(self._clock.now_s()):

@@ -3,6 +3,7 @@
 The common options are keywords of `Offloader.connect` itself.
 """
 
+import math
 import typing
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -21,8 +22,8 @@ from offboard.robot_client.policies import Policy
 from offboard.robot_client.policies.allowance import DUPLICATES, Allowance
 from offboard.robot_client.policies.decision import Named
 from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.objectives import Mean, Objective
 from offboard.robot_client.predictors.window import WINDOW, checked_length
+from offboard.robot_client.policies.objectives import S_PER_QUALITY, Mean, Objective
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,6 +34,7 @@ class Settings:
     `window`: the last times of each kind on each site that predictors with a window use.
     `heartbeats`: whether to ask each server twice a second if it is there (None: as the policy needs it).
     `objective`: what the policy makes small; see `policies.objectives`.
+    `s_per_quality`: what the whole quality of an answer is worth, in seconds, for tasks with variants.
     `energy`: what computing, waiting and sending take from the battery, in watts and joules per byte.
     `duplicates`: second runs per task in the long run, from 0 to 1: probes, hedges, warm-up.
     `bytes_a_minute`: the most bytes that tasks may send and receive in a minute (None: no cap).
@@ -46,6 +48,7 @@ class Settings:
     window: int = WINDOW
     heartbeats: bool | None = None
     objective: Objective = Mean()
+    s_per_quality: float = S_PER_QUALITY
     energy: Energy = Energy()
     duplicates: float = DUPLICATES
     bytes_a_minute: float | None = None
@@ -56,6 +59,8 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_types(Settings, {name: getattr(self, name) for name in self.__slots__})
+        if not 0 <= self.s_per_quality < math.inf:
+            raise ConfigError(f"s_per_quality {self.s_per_quality}: must be a time of 0 s or more")
 
     def allowance(self) -> Allowance:
         """A fresh allowance: what tasks may spend from now on."""
@@ -88,6 +93,7 @@ class Settings:
             shared_work=getattr(made, "per_work", False),
             objective=self.objective,
             energy=self.energy,
+            s_per_quality=self.s_per_quality,
             store=None if self.memory is None else Store(Path(self.memory)),
         )
 

@@ -9,7 +9,8 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 from offboard.common.errors import Overtaken
-from offboard.robot_client.execution.race import Plan, Race, result_of
+from offboard.robot_client.execution.choice import plan_of
+from offboard.robot_client.execution.race import Race, result_of
 from offboard.robot_client.learning.learner import Learner, PendingTask
 from offboard.robot_client.learning.runs_in_flight import Flights
 from offboard.robot_client.lifetime import Lifetime
@@ -51,7 +52,7 @@ class TaskRuns:
 
     def execute(self, pending: PendingTask) -> tuple[Execution, ...]:
         """Run the task on the sites of its decision."""
-        decision, sites = pending.decision, pending.forecast.sites
+        decision = pending.decision
         race = Race(
             pending.task,
             self._runners,
@@ -61,16 +62,11 @@ class TaskRuns:
             allowed=self._take_duplicate,
             late=partial(self._ended_late, pending),
         )
-        first: tuple[str, ...] = (decision.site,)
-        if decision.both:
-            first = tuple(site for site in sites if site not in decision.spared)
-            if decision.policy != PINNED:  # a measurement is the choice of the caller, not of the policy
-                self._take_duplicates(len(first) - 1)
+        plan = plan_of(decision, pending.forecast, pending.call)
+        if plan.all and decision.policy != PINNED:  # a measurement is the choice of the caller, not of the policy
+            self._take_duplicates(len(plan.first) - 1)
         try:
-            second = decision.second
-            if second is not None and decision.measured:
-                second = None
-            return race.run(Plan(first, second, all=decision.both, call=pending.call))
+            return race.run(plan)
         except BaseException:  # closed during the task, or Ctrl-C: nobody waits for what still runs
             with self._lock:
                 self._flights.end_all(pending.task.id)

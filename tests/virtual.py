@@ -113,6 +113,6 @@ class VirtualRunner:
     def _end(self, task: Task, failure: OffloadError | None, *, censored: bool = False) -> None:
         future, began_s = self._runs.pop(task.id, (None, 0.0))
         if future is not None:
-            value = None if failure else task.kind.function(*task.args)
+            value = None if failure else task.kind.at(self.site).function(*task.args)
             seconds = self._clock.now_s() - began_s
             future.set_result(Execution(self.site, seconds, value, failure, censored, **self.fields))

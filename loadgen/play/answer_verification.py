@@ -17,12 +17,13 @@ from offboard.common.planning.grid_kernels import covered
 from offboard.common.planning.maps import GridMap, passable
 from offboard.common.planning.planner import Plan, scan_hits
 from offboard.common.task_states import TaskStates
-from offboard.common.tasks import kind_of
+from offboard.common.tasks import Kind, kind_of
 from offboard.loadgen.robot import answers
 from offboard.loadgen.robot.calls import Calls
 from offboard.loadgen.robot.work import make_work
 from offboard.loadgen.scenario.outcome import Answered
 from offboard.loadgen.scenario.scenario import Workload
+from offboard.robot_client.sites.runner import ONBOARD
 
 COST_SHARE = 1e-6  # largest relative difference of two sums of the same steps
 
@@ -42,32 +43,34 @@ def verified(answered: Sequence[Answered], workload: Workload, seed: int) -> lis
 class _Repeated:
     """The tasks of a workload and seed, made again and run without Offboard.
 
-    The right answers of calls are kept, so each call runs once, even if many runs with the same tasks are
-    verified. Plans are not kept, because a path is checked against its whole request.
+    The right answers of calls are kept, so each variant of a call runs once, even if many runs with the same
+    tasks are verified. Plans are not kept, because a path is checked against its whole request.
     """
 
     def __init__(self, workload: Workload, seed: int) -> None:
         self._config = workload.robot(seed)
         self._states = TaskStates(workers=1)
         self._work, self._at = make_work(self._config), 0
-        self._right: dict[int, dict[str, Any]] = {}  # described answers, by the number of the task
+        # Described answers, by the number of the task and the name of the kind or variant.
+        self._right: dict[tuple[int, str], dict[str, Any]] = {}
 
     def judged(self, one: Answered) -> Answered:
         """The answer with `wrong` or `unverified` filled in."""
-        if one.i not in self._right:
-            request, expected = self._run(one.i)
+        kind = kind_of(self._work.function).at(one.used or ONBOARD)
+        if (one.i, kind.name) not in self._right:
+            request, expected = self._run(one.i, kind)
             if isinstance(expected, Plan):
                 return replace(one, wrong=wrong_plan(one.answer, expected, request))
-            self._right[one.i] = self._work.describe(expected)
-        described = self._right[one.i]
+            self._right[one.i, kind.name] = self._work.describe(expected)
+        described = self._right[one.i, kind.name]
         if one.answer["sha256"] == described["sha256"]:
             return one
         if isinstance(self._work, Calls) and self._work.same is not None:
             return _compared(one, self._work, described)
         return replace(one, wrong=f"{one.answer}, but {described} was expected")
 
-    def _run(self, i: int) -> tuple[tuple[Any, ...], Any]:
-        """The request of task `i` and its right answer."""
+    def _run(self, i: int, kind: Kind) -> tuple[tuple[Any, ...], Any]:
+        """The request of task `i` and its right answer by this kind."""
         if i < self._at:
             self._work, self._at = make_work(self._config), 0
         while self._at < i:
@@ -75,7 +78,7 @@ class _Repeated:
             self._at += 1
         request = self._work.request()
         try:
-            return request, self._states.call(kind_of(self._work.function), request)
+            return request, self._states.call(kind, request)
         except Exception as error:
             raise OffloadError(f"task {i} fails without Offboard: {describe(error)}") from error
 

@@ -178,10 +178,19 @@ def _findings(outcome: Outcome) -> Iterator[str]:
     if overhead_ms is not None and percent is not None:
         share = f"{percent:.2g} % of the mean time of a task"
         yield f"overhead of Offboard itself: {overhead_ms:.2f} ms per task (median), {share}"
+    yield from _by_quality(outcome)
     unverified = [one for one in outcome.answered if one.unverified is not None]
     if unverified:
         first = unverified[0]
         yield f"warning: {len(unverified)} answers are not verified; task {first.i}: {first.unverified}"
+
+
+def _by_quality(outcome: Outcome) -> Iterator[str]:
+    """Quality and time of a task with variants, for each site that answered."""
+    for site in sorted({one.used for one in outcome.answered if one.used and one.quality is not None}):
+        part = replace(outcome, answered=[one for one in outcome.answered if one.used == site])
+        quality, mean_ms = FIGURES["quality"].compute(part), FIGURES["mean_ms"].compute(part)
+        yield f"{site}: {len(part.answered)} answers of quality {quality:g} after {mean_ms:.3g} ms (mean)"
 
 
 def _say(text: str) -> None:

@@ -9,7 +9,7 @@ from offboard.robot_client import policies, predictors
 from offboard.robot_client.policies import objectives
 from offboard.robot_client.policies.allowance import DUPLICATES
 from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.objectives import OBJECTIVES
+from offboard.robot_client.policies.objectives import OBJECTIVES, S_PER_QUALITY
 from offboard.robot_client.predictors.window import WINDOW
 from offboard.robot_client.settings import Settings
 
@@ -68,6 +68,14 @@ class DecisionSettings:
     s_per_joule: float | None = setting(
         None,
         "with --objective energy: seconds that one joule is worth",
+        group=OBJECTIVE,
+        rare=True,
+        minimum=0.0,
+        maximum=1e6,
+    )
+    s_per_quality: float = setting(
+        S_PER_QUALITY,
+        "for tasks with variants: seconds that the whole quality of an answer is worth",
         group=OBJECTIVE,
         rare=True,
         minimum=0.0,
@@ -135,6 +143,10 @@ class DecisionSettings:
                 raise ConfigError(f"--{flag}: {value:g} needs --objective {name}")
         if self.objective != MEAN and not policies.weighs_cost(self.policy):
             raise ConfigError(f"--objective: {self.objective} changes nothing with --policy {self.policy}")
+        by_deadline = self.objective == "deadline"
+        if self.s_per_quality != S_PER_QUALITY and (by_deadline or not policies.weighs_cost(self.policy)):
+            ignored_by = "--objective deadline" if by_deadline else f"--policy {self.policy}"
+            raise ConfigError(f"--s-per-quality: {self.s_per_quality:g} changes nothing with {ignored_by}")
 
     def settings(self, seed: int) -> Settings:
         """The rare options of the offloader."""
@@ -142,6 +154,7 @@ class DecisionSettings:
             predictor=self.predictor,
             heartbeats=self.heartbeats,
             objective=objectives.make(self.objective, deadline_s=self.deadline_s, s_a_joule=self.s_per_joule),
+            s_per_quality=self.s_per_quality,
             energy=Energy(self.compute_watts, self.idle_watts, self.radio_joules_byte),
             duplicates=self.duplicates,
             bytes_a_minute=self.bytes_per_minute,

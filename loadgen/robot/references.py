@@ -65,7 +65,7 @@ class References(Lines):
         record: Record,
     ) -> None:
         """Run the request again on each site; `record` and `waited_s` say how the run itself fared."""
-        with contextlib.suppress(TaskError), self._states.lend(kind_of(function)):
+        with contextlib.suppress(TaskError), self._states.lend(kind_of(function).at(ONBOARD)):
             pass  # a run that lost its race may still use the state; no reference must wait for it
         order = self._orders[number // self._every]
         found = {site: self._alone(site, function, request) for site in order}

@@ -15,6 +15,7 @@ class Answered:
     """One answered task; times in seconds since the first task was due.
 
     `chosen` is the site that the policy chose, `sites` are all sites that the task ran on.
+    `used` is the site whose answer was used, and `quality` that of its variant; None if the task has none.
     `wrong` says why the answer is wrong; None if it is right or was not verified.
     `unverified` says why an answer whose bytes are not the expected ones could not be compared further.
     `intervals` are the prediction intervals of its executions.
@@ -36,6 +37,8 @@ class Answered:
     server_s: float | None = None
     unverified: str | None = None
     overhead_s: float | None = None
+    used: str | None = None
+    quality: float | None = None
 
     @property
     def response_s(self) -> float:

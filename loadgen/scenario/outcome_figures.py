@@ -94,6 +94,11 @@ def _regret_ms(run: Outcome) -> float | None:
     return 1e3 * sum(regrets) / len(regrets) if regrets else None
 
 
+def _quality(run: Outcome) -> float | None:
+    known = [one.quality for one in run.answered if one.quality is not None]
+    return sum(known) / len(known) if known else None
+
+
 def _overhead_ms(run: Outcome) -> float | None:
     known = [one.overhead_s for one in run.answered if one.overhead_s is not None]
     return 1e3 * statistics.median(known) if known else None
@@ -136,6 +141,7 @@ FIGURES: dict[str, Figure] = {
     "p95_ms": Figure("ms", "95 % of the tasks are answered within this time", _quantile_ms(95)),
     "p99_ms": Figure("ms", "99 % of the tasks are answered within this time", _quantile_ms(99)),
     "late_percent": Figure("%", "tasks answered after their deadline", _percent(_late), "deadline_ms"),
+    "quality": Figure("of 1", "mean quality of the variants that answered", _quality),
     "cloud_percent": Figure(
         "%", "share of the cloud in the tasks that were sent to one site", _percent(_in_the_cloud)
     ),

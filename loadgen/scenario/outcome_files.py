@@ -23,6 +23,7 @@ def read_answered(answers: Path, records: Path, robot: str) -> list[Answered]:
     for line in read_lines(answers):
         record = by_id.get(line["id"], {})
         decision, executions = record.get("decision", {}), record.get("executions", ())
+        used = record.get("used")
         found.append(
             Answered(
                 i=line["i"],
@@ -39,6 +40,8 @@ def read_answered(answers: Path, records: Path, robot: str) -> list[Answered]:
                     (one["run_s"] for one in executions if one["site"] == CLOUD and one["ok"]), None
                 ),
                 overhead_s=overhead_s(record) if record else None,
+                used=used,
+                quality=record["sites"][used].get("quality") if used else None,
             )
         )
     return found

@@ -11,7 +11,7 @@ from offboard.common import VERSION as SOFTWARE
 from offboard.common.empty_task import EMPTY
 from offboard.common.security.exposure import on_loopback
 from offboard.common.security.keys import ROBOT, SERVER, robot_keys
-from offboard.common.tasks import kinds
+from offboard.common.tasks import hashes
 from offboard.common.wire import messages as wire
 from offboard.robot_client.check.network import Address, Listener, connect, identify, reason, resolve
 from offboard.robot_client.check.outcome import FAIL, OK, SKIP, Line, StepFailed
@@ -160,7 +160,7 @@ class Check:
     def _say_hello(self) -> str:
         assert self._session is not None
         try:
-            self._server = self._session.hello({kind.name: kind.source_hash for kind in kinds()})
+            self._server = self._session.hello(hashes())
         except wire.VersionMismatch as error:
             remedy = f"install the same version of Offboard on both sides; this robot has {SOFTWARE}"
             raise StepFailed(str(error), remedy) from error

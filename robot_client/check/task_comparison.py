@@ -6,7 +6,10 @@ from collections.abc import Mapping, Sequence
 from offboard.common.empty_task import EMPTY
 from offboard.common.errors import ConfigError
 from offboard.common.tasks import Kind, kinds, load_modules
+from offboard.common.variants import AT
 from offboard.robot_client.check.outcome import StepFailed
+from offboard.robot_client.sites.absence import difference
+from offboard.robot_client.sites.runner import CLOUD
 
 HASH_SHOWN = 8  # characters of a source hash
 PLANNER = "offboard.common.planning.planner"
@@ -29,7 +32,7 @@ def compare(tasks: Sequence[Kind], there: Mapping[str, str], *, chosen: bool) ->
 
     A missing task is a failure only if the user has `chosen` the tasks to compare.
     """
-    known = ", ".join(sorted(there.keys() - {EMPTY})) or "none"
+    known = ", ".join(sorted(name for name in there if name != EMPTY and AT not in name)) or "none"
     for kind in tasks:
         module = kind.function.__module__
         if kind.name not in there:
@@ -39,12 +42,12 @@ def compare(tasks: Sequence[Kind], there: Mapping[str, str], *, chosen: bool) ->
                 f"the server has no task {kind.name}; it has {known}",
                 f"start the server with --tasks {module}",
             )
-        if not kind.source_hash == there[kind.name] != "":
+        remedy = f"install the same version of {module} on both sides, and restart the server"
+        if kind.variants and (why := difference(kind, CLOUD, there)) is not None:
+            raise StepFailed(why, remedy)
+        if not kind.variants and not kind.source_hash == there[kind.name] != "":
             hashes = f"{_short(kind.source_hash)} here, {_short(there[kind.name])} on the server"
-            raise StepFailed(
-                f"{kind.name} differs: its source is {hashes}",
-                f"install the same version of {module} on both sides, and restart the server",
-            )
+            raise StepFailed(f"{kind.name} differs: its source is {hashes}", remedy)
     if not tasks:
         return "none to compare; name modules with --tasks"
     names = ", ".join(kind.name for kind in tasks)

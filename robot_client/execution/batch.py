@@ -102,6 +102,8 @@ class Batch:
         if not self._waiting or all(len(one.running) >= one.limit for one in self._queues.values()):
             return None
         first = _usable(self._look(self._waiting[0]))
+        for site, one in first.items():
+            self._queues[site].lost_s = one.quality.lost_s
         cold = _cold(first)
         for site in cold:
             if not self._queues[site].running:
@@ -125,8 +127,13 @@ class Batch:
 
     def _reason(self, start: Start) -> str:
         order = sorted(start.finish_s, key=lambda site: (site != start.site, start.finish_s[site]))
-        said = " against ".join(f"{site} done in {start.finish_s[site] * 1e3:.3g} ms" for site in order)
+        said = " against ".join(self._end(site, start.finish_s[site]) for site in order)
         return f"{said}; {len(self._waiting)} tasks wait"
+
+    def _end(self, site: str, finish_s: float) -> str:
+        lost_s = self._queues[site].lost_s
+        more = f" + {lost_s * 1e3:g} ms for its quality" if lost_s else ""
+        return f"{site} done in {finish_s * 1e3:.3g} ms{more}"
 
     def _start(self, threads: CallThreads, number: int, site: str, reason: str) -> None:
         seconds = _seconds(self._look(number).sites).get(site, 0.0)

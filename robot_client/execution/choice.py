@@ -1,13 +1,15 @@
-"""The decision for one task: by the caller, who pins it to a site, or by the policy.
+"""The decision for one task, by the caller, who pins it to a site, or by the policy; and its plan.
 
-What a policy compares is in `policies`.
+What a policy compares is in `policies`; `race` carries the plan out.
 """
 
 from collections.abc import Callable, Collection, Mapping
+from concurrent.futures import Future
 
 from offboard.common.errors import ConfigError
 from offboard.common.tasks import Kind
-from offboard.robot_client.policies import ALONE, BOTH, PINNED, Decision, Forecast, Policy
+from offboard.robot_client.execution.race import Plan
+from offboard.robot_client.policies import ALONE, BOTH, PINNED, Decision, Forecast, Policy, Probe
 from offboard.robot_client.sites.runner import ONBOARD
 
 
@@ -54,3 +56,18 @@ def decided(
         site = min(heard, key=lambda site: (known(site), site != ONBOARD))
         return Decision(site, f"{decision.reason}; never on two sites", decision.policy)
     return decision if decision.second is None else decision._replace(second=None)
+
+
+def plan_of(decision: Decision, forecast: Forecast, call: "Future[str] | None") -> Plan:
+    """How the race carries out a decision; `call` may name one more site while the task runs."""
+    if decision.both:
+        first = tuple(site for site in forecast.sites if site not in decision.spared)
+        return Plan(first, decision.second, all=True, call=call)
+    if decision.measured is not None:  # that run starts after the answer
+        return Plan((decision.site,), call=call)
+    plan = Plan((decision.site,), decision.second, call=call)
+    if isinstance(decision.second, Probe):
+        # A hedge waits for nothing: it starts because the chosen site is late by more than this.
+        sites = forecast.sites
+        plan.patience_s = sites[decision.second.site].quality.lost_s - sites[decision.site].quality.lost_s
+    return plan

@@ -24,12 +24,14 @@ class Queue:
     """The tasks of a batch on one site, in the order of their start.
 
     `within_s`: a task that would end later than this is not added to other tasks.
+    `lost_s`: what the quality that the site loses is worth; another site may end a task later by this much.
     The pace of a site is the predicted time that it works off in one second. It is above 1 if the site runs
     several tasks at once, or if tasks travel while others run.
     """
 
     site: str
     within_s: float
+    lost_s: float = 0.0
     limit: int = 0
     running: dict[int, float] = field(
         default_factory=dict
@@ -122,7 +124,7 @@ def next_start(
         finish_s = {site: queues[site].finish_s(one, now_s, behind_s[site]) for site, one in seconds.items()}
         if not finish_s:
             continue
-        best = min(finish_s, key=lambda site: (finish_s[site], site != ONBOARD))
+        best = min(finish_s, key=lambda site: (finish_s[site] + queues[site].lost_s, site != ONBOARD))
         if queues[best].can_begin(seconds[best], now_s):
             return Start(place, best, finish_s)
         behind_s[best] += seconds[best]
@@ -132,7 +134,7 @@ def next_start(
 def takeover(
     predicted: Mapping[int, Mapping[str, float]], queues: Mapping[str, Queue], now_s: float
 ) -> tuple[int, str] | None:
-    """The running task for which an idle site would save most time, and that site; None if no site would.
+    """The running task for which an idle site would save most, and that site; None if no site would.
 
     `predicted` holds the seconds by site of the tasks that may run twice.
     """
@@ -141,6 +143,7 @@ def takeover(
         for queue in queues.values():
             for task in queue.running.keys() & predicted.keys():
                 if idle.site in predicted[task]:
-                    saved_s[task, idle.site] = queue.end_s(task, now_s) - predicted[task][idle.site]
+                    here_s = predicted[task][idle.site] + idle.lost_s
+                    saved_s[task, idle.site] = queue.end_s(task, now_s) + queue.lost_s - here_s
     best = max(saved_s, key=saved_s.__getitem__, default=None)
     return best if best is not None and saved_s[best] > 0 else None

@@ -23,12 +23,14 @@ class Plan:
     `first`: the sites that start at once. `second`: a second run.
     `all`: wait for every run, not for the first answer.
     `call`: a future that may name one more site while the task runs; that site then starts too.
+    `patience_s`: how long the answer of a second site waits for the better one of the first site.
     """
 
     first: tuple[str, ...]
     second: Probe | Hedge | None = None
     all: bool = False
     call: "Future[str] | None" = None
+    patience_s: float = 0.0
 
 
 class Race:
@@ -69,6 +71,8 @@ class Race:
             if plan.second is not None:
                 self._start_second(plan.second)
             self._wait_for_answer(plan.call)
+            if plan.patience_s > 0:
+                self._wait_for_better(plan)
         executions = {site: result_of(site, run) for site, (run, _) in self._runs.items() if run.done()}
         if ONBOARD not in self._runs and all(
             _may_fall_back(one, self._task.kind) for one in executions.values()
@@ -116,6 +120,12 @@ class Race:
             else:
                 self._clock.wait(pending if call is None else [*pending, call])
 
+    def _wait_for_better(self, plan: Plan) -> None:
+        """Wait on for the first site, if the second one has answered before it."""
+        run, _ = self._runs[plan.first[0]]
+        if not run.done():
+            self._clock.wait([run], plan.patience_s)
+
     def _answer_call(self, site: str) -> None:
         if site not in self._runs and self._allowed():
             self._start(site)
@@ -134,11 +144,16 @@ class Race:
         return Execution(site, self._clock.now_s() - began_s - setup_s, failure=failure, censored=True)
 
 
-def answer_of(executions: tuple[Execution, ...]) -> Execution:
-    """The fastest good answer, or else the failure of the task itself, or else the last failure."""
+def answer_of(executions: tuple[Execution, ...], kind: Kind) -> Execution:
+    """The good answer of the highest quality, and of several the fastest; or else a failure.
+
+    The failure of the task itself comes first, and then the last failure of a site.
+    """
     good = [execution for execution in executions if execution.ok]
+    if len(good) == 1:
+        return good[0]
     if good:
-        return min(good, key=lambda execution: execution.seconds)
+        return min(good, key=lambda one: (-kind.at(one.site).quality, one.seconds))
     own = [execution for execution in executions if isinstance(execution.failure, TaskError)]
     return (own or list(executions))[-1]
 

@@ -12,6 +12,7 @@ from offboard.common.tasks import Kind, Size, first_number
 from offboard.robot_client.learning.shared_work import SharedWork
 from offboard.robot_client.learning.site import SiteMemory
 from offboard.robot_client.policies.energy import Energy
+from offboard.robot_client.policies.forecast import WHOLE, Quality
 from offboard.robot_client.policies.objectives import Objective
 from offboard.robot_client.predictors import Predictor
 from offboard.robot_client.predictors.base import REMEMBERED
@@ -25,7 +26,7 @@ class KindMemory:
 
     `make` makes the predictor of one site. With `shared_work`, and if the kind tells the work of its results,
     the sites learn seconds per unit of work instead of seconds per size. With `measured`, heartbeats and load
-    count too.
+    count too. The whole quality of an answer is worth `s_per_quality`.
     """
 
     def __init__(
@@ -37,6 +38,7 @@ class KindMemory:
         energy: Energy,
         shared_work: bool,
         measured: bool,
+        s_per_quality: float,
     ) -> None:
         self.sites: dict[str, SiteMemory] = {}
         self.last_site: str | None = None  # where the last task was sent
@@ -46,6 +48,7 @@ class KindMemory:
         self._objective = objective
         self._energy = energy
         self._measured = measured
+        self._s_per_quality = s_per_quality
         self._work = SharedWork() if shared_work and kind.work is not None else None
 
     @property
@@ -56,9 +59,20 @@ class KindMemory:
     def site(self, name: str) -> SiteMemory:
         if name not in self.sites:
             self.sites[name] = SiteMemory(
-                name, self._make, self._objective, self._energy, measured=self._measured
+                name,
+                self._make,
+                self._objective,
+                self._energy,
+                measured=self._measured,
+                quality=self._quality(name),
             )
         return self.sites[name]
+
+    def _quality(self, site: str) -> Quality:
+        if not self.kind.variants:
+            return WHOLE
+        value = self.kind.at(site).quality
+        return Quality(value, self._s_per_quality * (1.0 - value))
 
     def observations(self, site: str) -> int:
         """How many observations the predictor of a site rests on."""

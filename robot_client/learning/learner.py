@@ -99,7 +99,9 @@ class Learner:
     def _compare(self, pending: PendingTask, chosen: Execution, probed: Execution) -> None:
         """Both runs of a probe have ended."""
         if chosen.ok and probed.ok:
-            self.regret.learn(chosen.seconds, probed.seconds)
+            sites = pending.forecast.sites
+            lost_s = [sites[one.site].quality.lost_s for one in (chosen, probed)]
+            self.regret.learn(chosen.seconds + lost_s[0], probed.seconds + lost_s[1])
         expected_s = _advised_s(pending)
         if chosen.ok and expected_s is not None and pending.decision.advised == probed.site:
             # Without an answer of the site, the task would have run onboard after this time.

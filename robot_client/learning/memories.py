@@ -10,7 +10,7 @@ from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.memory_file import KeptKind
 from offboard.robot_client.learning.store import Store
 from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.objectives import Mean, Objective
+from offboard.robot_client.policies.objectives import S_PER_QUALITY, Deadline, Mean, Objective
 from offboard.robot_client.predictors import Predictor
 
 Snapshot = dict[str, KeptKind]
@@ -24,6 +24,7 @@ class Memories:
     `shared_work`: the sites learn seconds per unit of work for kinds that tell the work of their results.
     `objective`: what the policy makes small (None: the mean time).
     `energy`: what tasks take from the battery.
+    `s_per_quality`: what the whole quality of an answer is worth, in seconds, for tasks with variants.
     `store`: the file in which the memories outlive the process (None: they do not).
     """
 
@@ -35,6 +36,7 @@ class Memories:
         shared_work: bool = False,
         objective: Objective | None = None,
         energy: Energy | None = None,
+        s_per_quality: float = S_PER_QUALITY,
         store: Store | None = None,
     ) -> None:
         self._predictor = predictor
@@ -42,6 +44,8 @@ class Memories:
         self._shared_work = shared_work
         self._objective = objective or Mean()
         self._energy = energy or Energy()
+        # The objective `deadline` weighs quality against the chance to miss it, not against seconds.
+        self._s_per_quality = 0.0 if isinstance(objective, Deadline) else s_per_quality
         self._store = store
         self._kinds: dict[str, KindMemory] = {}
 
@@ -56,6 +60,7 @@ class Memories:
                 energy=self._energy,
                 shared_work=self._shared_work,
                 measured=self._measured,
+                s_per_quality=self._s_per_quality,
             )
             if self._store is not None:
                 self._store.recall(found, sites)

@@ -21,9 +21,13 @@ PER_SIZE, PER_WORK = "size", "work"
 
 @dataclass(frozen=True, slots=True)
 class KeptSite:
-    """The last observations of one kind on one site, oldest first; `saved_at` is a Unix time."""
+    """The last observations of one kind on one site, oldest first; `saved_at` is a Unix time.
+
+    `source`: the hash of the source of what the site runs: the kind, or the variant of the site.
+    """
 
     saved_at: float
+    source: str
     observations: tuple[Observation, ...]
 
 
@@ -31,7 +35,7 @@ class KeptSite:
 class KeptKind:
     """What is kept of one kind.
 
-    `source`: the hash of its source. `per`: PER_SIZE or PER_WORK, the unit of its amounts.
+    `source`: its hash, as in a `hello`. `per`: PER_SIZE or PER_WORK, the unit of its amounts.
     `worked`: pairs of size and work.
     """
 
@@ -80,13 +84,16 @@ def _kind(given: Any) -> KeptKind:
     if given["per"] not in (PER_SIZE, PER_WORK):
         raise ValueError(f"amounts per {given['per']!r}")
     worked = [(_number(size), _number(work)) for size, work in given["worked"]]
-    sites = {name: _site(site) for name, site in given["sites"].items()}
-    return KeptKind(str(given["source"]), given["per"], tuple(worked[-REMEMBERED:]), sites)
+    source = str(given["source"])
+    sites = {name: _site(site, source) for name, site in given["sites"].items()}
+    return KeptKind(source, given["per"], tuple(worked[-REMEMBERED:]), sites)
 
 
-def _site(given: Any) -> KeptSite:
+def _site(given: Any, kind_source: str) -> KeptSite:
+    """A file from before there were variants has no source for each site."""
     observations = [_observation(one) for one in given["observations"]]
-    return KeptSite(_number(given["saved_at"]), tuple(observations[-REMEMBERED:]))
+    source = str(given.get("source", kind_source))
+    return KeptSite(_number(given["saved_at"]), source, tuple(observations[-REMEMBERED:]))
 
 
 def _observation(given: Any) -> Observation:

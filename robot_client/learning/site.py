@@ -11,7 +11,7 @@ from offboard.common.errors import CannotCross, Overtaken, TaskError
 from offboard.common.tasks import Size, first_number
 from offboard.robot_client.learning.conformal import Conformal
 from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.forecast import Outlook
+from offboard.robot_client.policies.forecast import Outlook, Quality
 from offboard.robot_client.policies.objectives import Expected, Objective
 from offboard.robot_client.predictors import Prediction, Predictor
 from offboard.robot_client.predictors.base import REMEMBERED
@@ -53,6 +53,7 @@ class SiteMemory:
     """The memory of one kind on one site.
 
     With `measured`, the heartbeats and the load of the site count; without, only the times of its tasks.
+    `quality`: of what the site runs.
     """
 
     def __init__(
@@ -63,6 +64,7 @@ class SiteMemory:
         energy: Energy,
         *,
         measured: bool,
+        quality: Quality,
     ) -> None:
         predictor = self.predictor = make()
         self.age = 0  # tasks since the site last ran one
@@ -77,6 +79,7 @@ class SiteMemory:
         self._conformal = Conformal()
         self._objective = objective
         self._energy = energy
+        self._quality = quality
         self._bytes = RunningMean()
         self._bytes_in = RunningMean()
         self._cpu_s = RunningMean()
@@ -101,6 +104,7 @@ class SiteMemory:
                 failures=self._failures,
                 in_flight=in_flight,
                 condition=condition,
+                quality=self._quality,
             )
         seconds = found.seconds + condition.wait_s
         if condition.silent:
@@ -117,12 +121,13 @@ class SiteMemory:
             low_s=low_s,
             high_s=high_s,
             error_s=found.error_s,
-            cost=self._objective.cost(Expected(seconds, found.spread_s, joules), errors),
+            cost=self._objective.cost(Expected(seconds, found.spread_s, joules, self._quality), errors),
             in_flight=in_flight,
             bytes=self._bytes.value,
             joules=joules,
             condition=condition,
             errors=errors,
+            quality=self._quality,
         )
 
     def learn(

@@ -69,6 +69,9 @@ class Store:
         for name, site in kept.sites.items():
             if name not in sites:
                 self._away.setdefault(kind.name, {})[name] = site
+            elif not site.source == kind.at(name).source_hash != "":
+                text = "memory %s: %s on %s starts cold because the source of its variant has changed"
+                log.info(text, self.path, kind.name, name)
             elif observations := _as_learnt(self._believed(site), kept.per, memory.per_work):
                 memory.site(name).recall(observations, age=PROBE_EVERY)
                 log.info("%s on %s: %d observations recalled", kind.name, name, len(observations))
@@ -89,7 +92,8 @@ class Store:
             sites = dict(self._away.get(name, {}))
             for site, learnt in memory.sites.items():
                 if learnt.observations:
-                    sites[site] = KeptSite(now, tuple(learnt.observations))
+                    source = memory.kind.at(site).source_hash
+                    sites[site] = KeptSite(now, source, tuple(learnt.observations))
             per = PER_WORK if memory.per_work else PER_SIZE
             live[name] = KeptKind(memory.kind.source_hash, per, tuple(memory.worked), sites)
         return self._kept | live

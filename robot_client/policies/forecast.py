@@ -93,6 +93,16 @@ class PredictionErrors:
 NO_ERRORS = PredictionErrors()
 
 
+class Quality(NamedTuple):
+    """How good the answers of a site are, and what its lost quality is worth in seconds."""
+
+    value: float = 1.0
+    lost_s: float = 0.0
+
+
+WHOLE = Quality()  # of every site, for a task without variants
+
+
 class Outlook(NamedTuple):
     """What is known of one site before a task runs. None means that nothing was learnt yet.
 
@@ -104,6 +114,7 @@ class Outlook(NamedTuple):
     `in_flight`: tasks of any kind that run there now.
     `bytes`, `joules`: what running the task there should take.
     `condition`: what was measured of the site. `errors`: how wrong its past predictions were.
+    `quality`: of the variant that the site runs; WHOLE for a task without variants.
 
     Build it with keywords. It is a named tuple because every task needs one for each site, and a frozen
     dataclass takes twice as long to build.
@@ -124,6 +135,7 @@ class Outlook(NamedTuple):
     joules: float = 0.0
     condition: Condition = UNMEASURED
     errors: PredictionErrors = NO_ERRORS
+    quality: Quality = WHOLE
 
     @property
     def given_up(self) -> bool:

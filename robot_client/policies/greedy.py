@@ -7,7 +7,7 @@ from functools import partial
 
 from offboard.common.tasks import show_size
 from offboard.robot_client.policies.decision import Decision
-from offboard.robot_client.policies.forecast import Forecast, Outlook, cheapest, costs_of, home
+from offboard.robot_client.policies.forecast import WHOLE, Forecast, Outlook, cheapest, costs_of, home
 from offboard.robot_client.predictors.base import WARM_UP
 from offboard.robot_client.sites.runner import ONBOARD, Condition
 
@@ -55,6 +55,16 @@ def _is_cold(one: Outlook) -> bool:
 
 
 def _times(one: Outlook) -> str:
+    """The prediction, and the quality of the site's variant with its worth in time."""
+    said, quality = _predicted(one), one.quality
+    if quality is WHOLE:
+        return said
+    if quality.lost_s:
+        return f"{said} + {quality.lost_s * 1e3:g} ms for quality {quality.value:g}"
+    return f"{said}, quality {quality.value:g}"
+
+
+def _predicted(one: Outlook) -> str:
     if one.condition.silent:
         return "silent"
     if one.predicted_s is None:

@@ -7,15 +7,21 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from offboard.common.errors import ConfigError
-from offboard.robot_client.policies.forecast import SPREADS_90, Forecast, PredictionErrors
+from offboard.robot_client.policies.forecast import SPREADS_90, WHOLE, Forecast, PredictionErrors, Quality
+
+S_PER_QUALITY = 1.0  # seconds that the whole quality is worth
 
 
 class Expected(NamedTuple):
-    """What running a task on one site should take; `spread_s` is None while it is unknown."""
+    """What running a task on one site should take, and how good its answer is.
+
+    `spread_s` is None while it is unknown.
+    """
 
     seconds: float
     spread_s: float | None
     joules: float
+    quality: Quality = WHOLE
 
 
 @runtime_checkable
@@ -27,25 +33,30 @@ class Objective(Protocol):
 
 
 class Mean:
-    """The expected time, in seconds."""
+    """The expected time and the worth of the lost quality, in seconds."""
 
     def cost(self, expected: Expected, errors: PredictionErrors) -> float:  # noqa: ARG002
-        return expected.seconds
+        return expected.seconds + expected.quality.lost_s
 
 
 class Tail:
-    """The time that 95 % of such tasks stay below, in seconds."""
+    """The time that 95 % of such tasks stay below and the worth of the lost quality, in seconds."""
 
     SHARE = 0.95  # of the times; the others may take longer
 
     def cost(self, expected: Expected, errors: PredictionErrors) -> float:
         below_s = errors.below(expected.seconds, self.SHARE)
-        return expected.seconds + SPREADS_90 * (expected.spread_s or 0.0) if below_s is None else below_s
+        if below_s is None:
+            below_s = expected.seconds + SPREADS_90 * (expected.spread_s or 0.0)
+        return below_s + expected.quality.lost_s
 
 
 @dataclass(frozen=True)
 class Deadline:
-    """The probability to miss a deadline; between equal probabilities, the faster site wins."""
+    """The probability to miss a deadline; between equal probabilities, the faster site wins.
+
+    With variants, it is the expected loss of quality: an answer after the deadline is worth nothing.
+    """
 
     deadline_s: float
 
@@ -54,17 +65,18 @@ class Deadline:
         missed = errors.share_above(expected_s, self.deadline_s, expected.spread_s)
         if missed is None:
             missed = float(expected_s > self.deadline_s)
+        missed += (1.0 - expected.quality.value) * (1.0 - missed)
         return missed + 1e-3 * expected_s / (expected_s + self.deadline_s)
 
 
 @dataclass(frozen=True)
 class TimeAndEnergy:
-    """The expected time plus `s_a_joule` seconds for each joule."""
+    """The expected time plus `s_a_joule` seconds for each joule, and the worth of the lost quality."""
 
     s_a_joule: float
 
     def cost(self, expected: Expected, errors: PredictionErrors) -> float:  # noqa: ARG002
-        return expected.seconds + self.s_a_joule * expected.joules
+        return expected.seconds + self.s_a_joule * expected.joules + expected.quality.lost_s
 
 
 def weighed(forecast: Forecast, objective: Objective) -> Forecast:
@@ -72,7 +84,7 @@ def weighed(forecast: Forecast, objective: Objective) -> Forecast:
     sites = dict(forecast.sites)
     for site, one in forecast.sites.items():
         if one.predicted_s is not None:
-            expected = Expected(one.predicted_s, one.spread_s, one.joules)
+            expected = Expected(one.predicted_s, one.spread_s, one.joules, one.quality)
             sites[site] = one._replace(cost=objective.cost(expected, one.errors))
     return forecast._replace(sites=sites)
 

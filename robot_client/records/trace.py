@@ -19,6 +19,7 @@ from offboard.common.tasks import Size
 from offboard.robot_client.learning.regret import Regret
 from offboard.robot_client.learning.savings import Savings
 from offboard.robot_client.policies import Decision, Hedge, Outlook
+from offboard.robot_client.policies.forecast import WHOLE
 from offboard.robot_client.records.lines import VERSION, Lines
 from offboard.robot_client.sites.runner import UNMEASURED, Condition, Execution
 
@@ -174,7 +175,7 @@ def as_dict(record: Record) -> dict[str, Any]:
         "started_at": record.started_at.isoformat(timespec="milliseconds"),
         "size": record.size,
         "features": features(record),
-        "sites": {site: _values(outlook, _OUTLOOK_FIELDS) for site, outlook in record.sites.items()},
+        "sites": {site: _outlook(outlook) for site, outlook in record.sites.items()},
         "decision": _decision(record.decision),
         "executions": [_values(one, _EXECUTION_FIELDS) for one in record.executions],
         "used": record.used,
@@ -198,6 +199,12 @@ def features(record: Record) -> dict[str, float]:
                 if value is not None:
                     found[f"{site}.{name}"] = value
     return found
+
+
+def _outlook(outlook: Outlook) -> dict[str, Any]:
+    """Only a task with variants has a quality."""
+    quality = None if outlook.quality is WHOLE else outlook.quality.value
+    return _values(outlook, _OUTLOOK_FIELDS) | {"quality": quality}
 
 
 def _decision(decision: Decision) -> dict[str, Any]:

@@ -26,10 +26,10 @@ from offboard.common.errors import (
     describe,
 )
 from offboard.common.security.keys import RobotKeys
-from offboard.common.tasks import Kind, Task, kinds
+from offboard.common.tasks import Kind, Task, hashes
 from offboard.common.wire import messages as wire
 from offboard.common.wire.payload import payload_bytes
-from offboard.robot_client.sites.absence import CrossingPauses
+from offboard.robot_client.sites.absence import CrossingPauses, difference
 from offboard.robot_client.sites.background import Background
 from offboard.robot_client.sites.blob_uploads import BlobUploads
 from offboard.robot_client.sites.cloud_socket import MESSAGE_BYTES_MAX, CloudSocket, SocketEvent
@@ -52,7 +52,7 @@ class CloudRunner:
     """Runs tasks on the server at `endpoint` (tcp://HOST:PORT).
 
     The site is available for a kind once the server has answered `hello` on the present connection with
-    the same protocol version and the same source for that kind.
+    the same protocol version and the same source for that kind, or for the variant of this site.
 
     heartbeat_s: seconds between heartbeats; 0: none are sent, and only tasks are measured.
     keys: encrypt the connection, and connect only to the server of this key.
@@ -74,7 +74,7 @@ class CloudRunner:
         background = background or Background()
         self._heartbeat = Heartbeat(heartbeat_s, seed, background)
         self._heartbeat_wanted = False  # by `hurry`
-        self._remote: dict[str, str] = {}  # source hashes at the server, by kind
+        self._remote: dict[str, str] = {}  # source hashes at the server, by kind and variant
         self._message_bytes_max = MESSAGE_BYTES_MAX  # what the server takes, once it has said so
         self._warned: set[str] = set()  # kinds
         self._pending: dict[int, PendingRequest] = {}
@@ -100,13 +100,9 @@ class CloudRunner:
         absent = self._connection.why_absent
         if absent is not None:
             return absent
-        if self._remote.get(kind.name) == kind.source_hash != "":
+        why = difference(kind, self.site, self._remote)
+        if why is None:
             return self._pauses.why_absent(kind.name)
-        why = (
-            f"the source of task {kind.name} differs on the server"
-            if kind.name in self._remote
-            else f"the server has no task {kind.name}"
-        )
         if kind.name not in self._warned:
             self._warned.add(kind.name)
             log.warning("%s: %s: this task stays onboard", self.site, why)
@@ -232,8 +228,7 @@ class CloudRunner:
                         self._give_up(request_id, CloudBroken("the connection was lost"))
         match self._connection.take_due(time.perf_counter()):
             case Action.SAY_HELLO:
-                known = {kind.name: kind.source_hash for kind in kinds()}
-                self._send(wire.Hello(known, SOFTWARE, MESSAGE_BYTES_MAX))
+                self._send(wire.Hello(hashes(), SOFTWARE, MESSAGE_BYTES_MAX))
             case Action.CONNECT_AGAIN:
                 self._socket.connect_again()
 

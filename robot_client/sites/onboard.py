@@ -163,6 +163,7 @@ class OnboardRunner:
 
     def prepare(self, kind: Kind) -> "Future[None]":
         """Begin the setup of a kind in each worker, unless it was made. The future may hold TaskFailed."""
+        kind = kind.at(ONBOARD)
         with self._lock:
             known = self._preparing.get(kind.name)
             if known is not None and (not known.done() or known.exception() is None):
@@ -274,7 +275,7 @@ class OnboardRunner:
 
 def _run(run: _Run, states: TaskStates) -> Execution:
     try:
-        with states.lend(run.task.kind) as state:
+        with states.lend(run.task.kind.at(ONBOARD)) as state:
             if not run.wanted:  # cancelled during the setup
                 return _overtaken(run, started=False)
             return _call(run, state, states)
@@ -287,7 +288,8 @@ def _call(run: _Run, state: tuple[Any, ...], states: TaskStates) -> Execution:
     cpu_before_s, started_s = cpu_time.used_s(), time.perf_counter()
     value, failure = None, None
     try:
-        value = call_while(lambda: run.wanted, run.task.kind.function, (*state, *run.task.args))
+        function = run.task.kind.at(ONBOARD).function
+        value = call_while(lambda: run.wanted, function, (*state, *run.task.args))
     except BaseException as error:  # anything else that the function raises is the task's failure
         if is_interrupt(error):
             raise

@@ -47,7 +47,7 @@ class PendingRequest:
     def message(self, now_s: float) -> wire.Request:
         return wire.Request(
             id=self.task.id,
-            kind=self.task.kind.name,
+            kind=self.task.kind.at(self.site).name,
             budget_s=self.deadline_s - now_s,
             attempt=self.attempt,
             blobs=tuple(self.body.blobs),

@@ -7,6 +7,7 @@ import re
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
+from offboard.common import variants
 from offboard.common.errors import ConfigError, OffloadError
 
 if TYPE_CHECKING:  # --help needs only the names of the sites
@@ -14,8 +15,7 @@ if TYPE_CHECKING:  # --help needs only the names of the sites
 
     from offboard.common.tasks import Kind, Task
 
-ONBOARD = "onboard"
-CLOUD = "cloud"
+ONBOARD, CLOUD = variants.ONBOARD, variants.CLOUD
 TIMEOUT_S = 2.0  # default time that a remote site has for a task
 TIMEOUT_MAX_S = 24 * 3600.0
 PORT_MAX = 65_535

@@ -24,6 +24,7 @@ SEED = 3
 PLANS = Workload(map=MAP, tasks=8, jump=True, obstacles=4, radius_m=0.0)
 CALLS = Workload(task="offboard.loadgen.scenario.hash_tasks:hash_rounds", sizes=("uniform:10:1000",), tasks=8)
 INPUTS = Workload(task="tests.frames:brightness", inputs="tests.frames:frames", tasks=8)
+VARIANTS = Workload(task="tests.variant_tasks:sort_out", sizes=("uniform:10:1000",), tasks=8)
 LARGE = replace(INPUTS, task="tests.frames:copied")
 
 
@@ -53,6 +54,17 @@ def test_the_answer_of_another_task_is_wrong(workload: Workload) -> None:
     found = answered_rightly(workload)
     judged = verified([replace(found[3], answer=found[4].answer)], workload, SEED)
     assert judged[0].wrong is not None
+
+
+def test_an_answer_is_compared_with_that_of_the_variant_that_gave_it() -> None:
+    """What onboard answers rightly would be wrong from the cloud."""
+    work = make_work(VARIANTS.robot(SEED))
+    (number,) = work.request()
+    right = work.describe(f"onboard {number}")
+    one = Answered(0, "robot", 0.0, 0.1, None, right, "onboard", False, ("onboard",))
+    onboard, cloud = (verified([replace(one, used=site)], VARIANTS, SEED)[0] for site in ("onboard", "cloud"))
+    assert onboard.wrong is None
+    assert cloud.wrong is not None
 
 
 @pytest.mark.parametrize(

@@ -30,6 +30,7 @@ def memory(predictor: str = predictors.PARTS, *, shared_work: bool = False) -> K
         energy=Energy(),
         shared_work=shared_work,
         measured=predictor == predictors.PARTS,
+        s_per_quality=1.0,
     )
 
 

@@ -35,6 +35,7 @@ def run() -> Outcome:
             error="TaskFailed: no" if i == 4 else None,
             unverified="too large" if i == 5 else None,
             overhead_s=None if i < 2 else 0.001 * i,
+            quality=None if i < 5 else 0.5 if i < 7 else 1.0,
         )
         for i in range(9)
     ]
@@ -54,6 +55,7 @@ def run() -> Outcome:
         ("wrong", 1),
         ("unverified", 1),
         ("failed", 1),
+        ("quality", 0.75),
         ("mean_ms", 500),
         ("p95_ms", 900),
         ("p99_ms", 900),

@@ -36,6 +36,9 @@ def race_once(number: int) -> int:
     return number
 
 
+ECHO = kind_of(race_echo)
+
+
 class Course:
     """A clock, three sites, and the calls that the race made."""
 
@@ -87,7 +90,7 @@ def test_a_plan_for_all_waits_for_every_run(course: Course, onboard_s: float, cl
     executions = course.run(Plan((ONBOARD, CLOUD), all=True))
     assert [one.seconds for one in executions] == [onboard_s, cloud_s]
     assert course.clock.now_s() == max(onboard_s, cloud_s)
-    assert answer_of(executions).seconds == min(onboard_s, cloud_s)
+    assert answer_of(executions, ECHO).seconds == min(onboard_s, cloud_s)
     assert not course.late
 
 
@@ -109,7 +112,7 @@ def test_the_first_answer_of_a_hedge_counts_and_the_other_run_is_cancelled(
     executions = course.run(Plan((CLOUD,), Hedge(ONBOARD, 0.4)))
     assert course.begun == [(CLOUD, 0.0), (ONBOARD, 0.4)]
     assert course.clock.now_s() == pytest.approx(waited_s)
-    assert answer_of(executions).site == used
+    assert answer_of(executions, ECHO).site == used
     loser = ONBOARD if used == CLOUD else CLOUD
     (lost,) = (one for one in executions if one.site == loser)
     assert isinstance(lost.failure, Overtaken)
@@ -190,7 +193,7 @@ def test_the_task_runs_onboard_if_all_other_sites_failed(
     expected = lost if plan.second or plan.all else lost[:1]
     assert told(executions) == [*expected, (ONBOARD, None)]
     assert course.begun[-1] == (ONBOARD, 0.5 if len(expected) == 2 else 0.3)
-    assert answer_of(executions).value == 7
+    assert answer_of(executions, ECHO).value == 7
 
 
 def test_a_failed_site_does_not_wait_for_its_hedge(course: Course) -> None:
@@ -226,7 +229,7 @@ def test_a_failure_of_the_task_itself_ends_the_race(course: Course, plan: Plan) 
     course.sites[CLOUD].failure = TaskFailed("ValueError: no")
     executions = course.run(plan)
     assert course.clock.now_s() == 0.2
-    assert isinstance(answer_of(executions).failure, TaskFailed)
+    assert isinstance(answer_of(executions, ECHO).failure, TaskFailed)
     assert told(executions) == [(CLOUD, "TaskFailed"), (ONBOARD, "Overtaken")]
 
 
@@ -243,11 +246,11 @@ def test_the_answer_is_the_fastest_good_one() -> None:
     failed = TaskFailed("no")
     slow, fast = Execution(ONBOARD, 0.5, 1), Execution(CLOUD, 0.2, 1)
     lost = Execution(EDGE, 2.0, failure=CloudTimeout("late"))
-    assert answer_of((lost, slow, fast)) is fast
-    assert answer_of((lost, Execution(CLOUD, 0.1, failure=failed), slow)) is slow
-    assert answer_of((Execution(CLOUD, 0.1, failure=failed), lost)).failure is failed
-    assert answer_of((slow, Execution(CLOUD, 0.1, failure=CannotCross("a set")))) is slow
-    assert answer_of((lost,)) is lost
+    assert answer_of((lost, slow, fast), ECHO) is fast
+    assert answer_of((lost, Execution(CLOUD, 0.1, failure=failed), slow), ECHO) is slow
+    assert answer_of((Execution(CLOUD, 0.1, failure=failed), lost), ECHO).failure is failed
+    assert answer_of((slow, Execution(CLOUD, 0.1, failure=CannotCross("a set"))), ECHO) is slow
+    assert answer_of((lost,), ECHO) is lost
 
 
 def test_a_closed_runner_counts_as_broken(course: Course) -> None:

@@ -14,7 +14,7 @@ from offboard.loadgen.robot_files import read_trace
 from offboard.robot_client import policies
 from offboard.robot_client.policies.allowance import DUPLICATES_MAX
 from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.objectives import Mean, TimeAndEnergy
+from offboard.robot_client.policies.objectives import S_PER_QUALITY, Mean, TimeAndEnergy
 from offboard.robot_client.policies.probe import PROBE_EVERY
 
 MAP, TASK = {"map": Path("m.yaml")}, {"task": "m:f", "sizes": ("constant:1",)}
@@ -69,6 +69,15 @@ def config(settings: dict[str, Any]) -> RobotConfig:
             "--objective: p95 changes nothing with --policy paper",
         ),
         (MAP | {"objective": "p95", "policy": "hedge:cloud"}, "--objective: p95 changes nothing with"),
+        (
+            MAP | {"s_per_quality": 2.0, "policy": "paper"},
+            "--s-per-quality: 2 changes nothing with --policy paper",
+        ),
+        (
+            MAP | COSTS | {"s_per_quality": 0.0, "objective": "deadline", "deadline_s": 0.5},
+            "--s-per-quality: 0 changes nothing with --objective deadline",
+        ),
+        (MAP | COSTS | {"s_per_quality": -1.0}, "--s-per-quality: -1.0 is below 0"),
         (MAP | {"duplicates": 1.5}, "--duplicates: 1.5 is above 1"),
         (MAP | {"compute_watts": -1.0}, "--compute-watts: -1.0 is below 0"),
         (MAP | {"bytes_per_minute": -1.0}, "--bytes-per-minute: -1.0 is below 0"),
@@ -91,6 +100,7 @@ def test_flags_that_contradict_each_other_are_refused(settings: dict[str, Any], 
         MAP | TRACED | {"jump": True, "reference": 10, "measure": 5, "alone": 5},
         TASK | TRACED | {"reference": 1},
         MAP | {"policy": "hedge:greedy", "objective": "deadline", "deadline_s": 0.2},
+        MAP | {"policy": "greedy", "s_per_quality": 0.0},
         MAP | {"bytes_per_minute": 1e6, "joules_per_minute": 60.0, "duplicates": 0.0, "memory": Path("m")},
     ],
 )
@@ -105,8 +115,9 @@ def test_objective_energy_and_limits_are_made_from_the_flags() -> None:
     assert isinstance(plain.settings(1).objective, Mean)
     assert plain.settings(1).energy == Energy()
     assert not plain.settings(1).allowance().capped
+    assert plain.settings(1).s_per_quality == S_PER_QUALITY
     flags = "--objective energy --s-per-joule 2 --compute-watts 3 --idle-watts 0.5 --radio-joules-byte 1e-6"
-    caps = "--policy greedy --bytes-per-minute 6000 --joules-per-minute 60 --duplicates 0.5"
+    caps = "--s-per-quality 3 --policy greedy --bytes-per-minute 6000 --joules-per-minute 60 --duplicates 0.5"
     config = load(
         DriveConfig,
         ["--map", "m", *flags.split(), *caps.split()],
@@ -116,6 +127,7 @@ def test_objective_energy_and_limits_are_made_from_the_flags() -> None:
         prefix="R",
     )
     assert config.settings(1).objective == TimeAndEnergy(2.0)
+    assert config.settings(1).s_per_quality == 3.0
     assert config.settings(1).energy == Energy(3.0, 0.5, 1e-6)
     allowance = config.settings(1).allowance()
     allowance.begin(0.0)

@@ -120,6 +120,7 @@ WRONG_SETTINGS = [
     ({"predictor": 5}, "predictor 5: must be a string or None"),
     ({"heartbeats": "yes"}, "heartbeats 'yes': must be True or False or None"),
     ({"objective": "p95"}, "objective 'p95': must be Objective"),
+    ({"s_per_quality": "1"}, "s_per_quality '1': must be a number"),
     ({"energy": 5.0}, "energy 5.0: must be Energy"),
     ({"duplicates": "0.1"}, "duplicates '0.1': must be a number"),
     ({"bytes_a_minute": "1"}, "bytes_a_minute '1': must be a number or None"),

@@ -81,6 +81,7 @@ def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
                 "high_s": 0.15,
                 "age": 3,
                 "failures": 0,
+                "quality": None,
             },
             "cloud": {
                 "predicted_s": None,
@@ -89,6 +90,7 @@ def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
                 "high_s": None,
                 "age": 0,
                 "failures": 1,
+                "quality": None,
             },
         },
         "decision": {

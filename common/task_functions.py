@@ -1,0 +1,119 @@
+"""The functions that a task is made of: which ones are allowed, what a caller gives them, their source.
+
+`tasks` registers them.
+"""
+
+import inspect
+import textwrap
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from offboard.common.dataclass_types import field_names
+from offboard.common.errors import ConfigError
+
+OPTIONS = ("deadline_s", "function", "observe", "timeout_s", "where")  # of a call, in this version or others
+
+
+def check_ordinary(name: str, **functions: Callable[..., Any] | None) -> None:
+    """ConfigError if one of the functions does not simply return its result."""
+    for place, function in functions.items():
+        for lazy in (inspect.iscoroutinefunction, inspect.isgeneratorfunction, inspect.isasyncgenfunction):
+            if lazy(function):
+                raise ConfigError(
+                    f"task {name}: {place} {name_of(function)} is a coroutine or generator function; "
+                    "use an ordinary function that returns its result"
+                )
+
+
+def check_parameters(name: str, parameters: Iterable[inspect.Parameter]) -> None:
+    for parameter in parameters:
+        if parameter.kind in (parameter.KEYWORD_ONLY, parameter.VAR_KEYWORD):
+            raise ConfigError(
+                f"task {name}: parameter {parameter.name!r} is keyword-only; make it positional"
+            )
+        if parameter.name in OPTIONS:
+            raise ConfigError(
+                f"task {name}: a parameter cannot be named {parameter.name!r}, "
+                "an option of the call; rename it"
+            )
+
+
+def check_first_parameter(name: str, signature: inspect.Signature) -> None:
+    first = next(iter(signature.parameters.values()), None)
+    if first is None or first.kind not in (first.POSITIONAL_ONLY, first.POSITIONAL_OR_KEYWORD):
+        raise ConfigError(f"task {name}: setup= needs a function whose first parameter takes its result")
+
+
+def check_variant(
+    name: str, site: str, function: Callable[..., Any], *, setup: object, given: inspect.Signature
+) -> None:
+    """ConfigError unless a caller gives this variant of a task what the task itself is `given`."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError) as error:  # many functions of C libraries have none
+        raise ConfigError(f"task {name}: the variant of {site!r} has no signature: {error}") from error
+    if setup is not None:
+        check_first_parameter(name, signature)
+    wanted, found = _shown(given), _shown(without_state(signature, setup))
+    if wanted != found:
+        raise ConfigError(
+            f"task {name}: the variant of {site!r}, {name_of(function)}, takes {found}, "
+            f"but the task takes {wanted}"
+        )
+
+
+def _shown(signature: inspect.Signature) -> str:
+    """The parameters with their defaults, as in `(frame, scale=2)`; annotations do not count."""
+    bare = [one.replace(annotation=inspect.Parameter.empty) for one in signature.parameters.values()]
+    return str(signature.replace(parameters=bare, return_annotation=inspect.Signature.empty))
+
+
+def without_state(signature: inspect.Signature, setup: object) -> inspect.Signature:
+    """What a caller gives: all parameters, without the first one if there is a setup."""
+    if setup is None:
+        return signature
+    _, *given = signature.parameters.values()
+    return signature.replace(parameters=given)
+
+
+def name_of(function: object) -> str:
+    return getattr(function, "__qualname__", None) or repr(function)
+
+
+def source_hash(function: Callable[..., Any], setup: Callable[[], Any] | None, types: Iterable[type]) -> str:
+    """SHA-256 of the source of a function, its setup and its dataclasses, with the names of their fields.
+
+    An empty text, which matches nothing, if the function has no source.
+    """
+    if not _source(function):
+        return ""
+    return _hash([_source(function), _source(setup), *_sources(types)])
+
+
+def contract_hash(signature: inspect.Signature, types: Iterable[type]) -> str:
+    """SHA-256 of what all variants of a task have in common: what a caller gives, and the dataclasses.
+
+    Defaults do not count: the robot fills them in.
+    """
+    given = [f"{one.kind.name} {one.name}" for one in signature.parameters.values()]
+    return _hash(["variants", *given, *_sources(types)])
+
+
+def _sources(types: Iterable[type]) -> list[str]:
+    return [part for one in types for part in (_source(one), *sorted(field_names(one)))]
+
+
+def _hash(parts: Iterable[str]) -> str:
+    import hashlib  # it loads OpenSSL, which --help does not need
+
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+
+def _source(of: Any) -> str:
+    try:
+        # Code of exec and of `python -c` has this file name. Python 3.13 keeps the source of -c under it.
+        if inspect.getfile(inspect.unwrap(of)) == "<string>":
+            return ""
+        return textwrap.dedent(inspect.getsource(of))
+    except (OSError, TypeError):
+        return ""
