@@ -34,7 +34,8 @@ class Kind:
     same length (each finite, >= 0). `types` are the dataclasses that arguments and result may contain. `warm`
     is called once per process before the first task. A kind with `duplicate=False` never runs on two sites.
     `work` maps a result to the amount of work that it took, in any unit. `setup` is called once per worker;
-    its result is the first argument of the function, which callers do not give.
+    its result is the first argument of the function, which callers do not give. `pack` makes one value of the
+    arguments of a task that leaves the robot, and `unpack` makes the arguments of that value.
     """
 
     name: str
@@ -47,6 +48,8 @@ class Kind:
     work: Callable[[Any], float] | None = None
     positional: int | None = None  # a call with this many positional arguments needs no binding
     setup: Callable[[], Any] | None = None
+    pack: Callable[..., Any] | None = None
+    unpack: Callable[[Any], Any] | None = None
     _counts: list[int] = field(default_factory=list, compare=False, repr=False)  # the first one holds for all
 
     def bind(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:
@@ -56,6 +59,10 @@ class Kind:
         bound = self.signature().bind(*args, **kwargs)
         bound.apply_defaults()
         return bound.args
+
+    def arguments_in(self, item: Any) -> tuple[Any, ...]:
+        """The arguments in one item: a tuple holds all of them if the function takes several."""
+        return item if isinstance(item, tuple) and self.positional != 1 else (item,)
 
     def signature(self) -> inspect.Signature:
         """What a caller gives: the parameters of the function, without the first one if there is a setup."""
@@ -108,12 +115,18 @@ class Kind:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One call of a kind: its arguments and its input size."""
+    """One call of a kind: its arguments and its input size.
+
+    `compress`: the numbers of the arguments that are compressed on the way to the site.
+    `parcel`: keeps its packed arguments for further sites, if its kind packs them.
+    """
 
     kind: Kind
     args: tuple[Any, ...]
     size: Size
     id: int = field(default_factory=itertools.count(1).__next__)
+    compress: tuple[int, ...] = ()
+    parcel: Any = field(default=None, compare=False, repr=False)
 
 
 _kinds: dict[str, Kind] = {}
@@ -128,11 +141,13 @@ def task(
     warm: Callable[[], None] | None = None,
     work: Callable[[Any], float] | None = None,
     setup: Callable[[], Any] | None = None,
+    pack: Callable[..., Any] | None = None,
+    unpack: Callable[[Any], Any] | None = None,
 ) -> Callable[[F], F]:
     """Register a function as a kind of task. It can still be called as an ordinary function.
 
-    Robot and server load the same module. If the source of the function, of its setup or of its dataclasses
-    differs between them, the task stays onboard.
+    Robot and server load the same module. If the source of the function, of its setup, of its pack or unpack
+    or of its dataclasses differs between them, the task stays onboard.
     If `size` returns several numbers, the predictor `least-squares` uses all of them, and every other one
     uses the first; `parts` predicts from the work instead if the kind tells it (by the first number too).
     """
@@ -144,7 +159,10 @@ def task(
     check_types(name, types)
 
     def register(function: F) -> F:
-        _check_ordinary(name, function=function, size=size, setup=setup, work=work, warm=warm)
+        _check_ordinary(
+            name, function=function, size=size, setup=setup, work=work, warm=warm, pack=pack, unpack=unpack
+        )
+        _check_packing(name, pack, unpack)
         signature = inspect.signature(function)
         if setup is not None:
             _check_first_parameter(name, signature)
@@ -154,8 +172,8 @@ def task(
         count = len(parameters) if fixed else None
         kind = Kind(
             name, function, size, duplicate,
-            types=tuple(types), warm=warm, source_hash=_source_hash(function, setup, types), work=work,
-            positional=count, setup=setup,
+            types=tuple(types), warm=warm, source_hash=_source_hash(function, setup, types, pack, unpack),
+            work=work, positional=count, setup=setup, pack=pack, unpack=unpack,
         )  # fmt: skip
         known = _kinds.get(name)
         if known is not None:
@@ -244,6 +262,14 @@ def _check_ordinary(name: str, **functions: Callable[..., Any] | None) -> None:
                 )
 
 
+def _check_packing(name: str, *packing: Any) -> None:
+    if (packing[0] is None) != (packing[1] is None):
+        raise ConfigError(f"task {name}: pack= and unpack= need each other; give both or none")
+    for place, one in zip(("pack", "unpack"), packing, strict=True):
+        if one is not None and not callable(one):
+            raise ConfigError(f"task {name}: {place}= is {one!r:.80}; it must be a function")
+
+
 def _check_parameters(name: str, parameters: Iterable[inspect.Parameter]) -> None:
     for parameter in parameters:
         if parameter.kind in (parameter.KEYWORD_ONLY, parameter.VAR_KEYWORD):
@@ -291,8 +317,13 @@ def _without_state(signature: inspect.Signature, setup: object) -> inspect.Signa
     return signature.replace(parameters=given)
 
 
-def _source_hash(function: Callable[..., Any], setup: Callable[[], Any] | None, types: Iterable[type]) -> str:
-    """SHA-256 of the source of a function, its setup and its dataclasses, with the names of their fields.
+def _source_hash(
+    function: Callable[..., Any],
+    setup: Callable[[], Any] | None,
+    types: Iterable[type],
+    *packing: Callable[..., Any] | None,
+) -> str:
+    """SHA-256 of the source of a function, its setup, its dataclasses with their fields, and its packing.
 
     An empty text, which matches nothing, if the function has no source.
     """
@@ -301,6 +332,7 @@ def _source_hash(function: Callable[..., Any], setup: Callable[[], Any] | None, 
     parts = [_source(function), _source(setup)]
     for one in types:
         parts += [_source(one), *sorted(field_names(one))]
+    parts += [_source(one) for one in packing if one is not None]
     import hashlib  # it loads OpenSSL, which --help does not need
 
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()

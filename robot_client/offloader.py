@@ -37,9 +37,9 @@ from offboard.robot_client.predictors.window import WINDOW
 from offboard.robot_client.records.recording import Recording, tell
 from offboard.robot_client.records.trace import Late, Record
 from offboard.robot_client.settings import Settings, check_types
-from offboard.robot_client.sites import heartbeat
 from offboard.robot_client.sites.absence import Absent, absent_sites, wait_for_sites
 from offboard.robot_client.sites.clock import Clock, SystemClock
+from offboard.robot_client.sites.outgoing import new_task
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, TIMEOUT_S, Execution, Runner, checked_timeout
 
 LATE_MAX = 64  # executions that ended after their task was answered, kept for the next record
@@ -120,21 +120,14 @@ class Offloader:
         `observers`: called with the record of every task. `settings`: options that few robots need.
         `metrics`: HOST:PORT where Prometheus reads `/metrics`. `trace`: the file that gets every record.
         """
-        from offboard.robot_client.sites.make_runners import (
-            make_runners,  # zmq is loaded only for a connection
-        )
-
         check_types(cls.connect, locals())
         rare = settings or Settings()
         chosen, memories = rare.make_policy(policy), rare.make_memories(policy, window)
         servers = ({CLOUD: endpoint} if endpoint else {}) | dict(sites or {})
-        heartbeat_s = heartbeat.EVERY_S if rare.beats(policy) else 0.0
         with ExitStack() as opened:
             recording = Recording(trace=trace, metrics=metrics)
             opened.callback(recording.close)
-            runners = make_runners(
-                servers, keys=keys, heartbeat_s=heartbeat_s, seed=rare.seed, states=rare.states
-            )
+            runners = rare.make_runners(servers, keys, policy)
             for runner in runners:
                 opened.callback(runner.close)
             offload = cls(
@@ -168,7 +161,7 @@ class Offloader:
         budget_s = self._timeout_s if timeout_s is None else checked_timeout(timeout_s)
         kind = kind_of(function)
         args = kind.bind(args, kwargs)
-        answer, _ = self._answer(where, budget_s, Task(kind, args, kind.size_of(args)))
+        answer, _ = self._answer(where, budget_s, new_task(kind, args))
         if answer.failure is not None:
             raise answer.failure
         return cast("R", answer.value)
@@ -191,7 +184,7 @@ class Offloader:
             self._life.refuse()
         budget_s = self._timeout_s if timeout_s is None else checked_timeout(timeout_s)
         kind = kind_of(function)
-        tasks = [Task(kind, args, kind.size_of(args)) for args in arguments(kind, items)]
+        tasks = [new_task(kind, args) for args in arguments(kind, items)]
         sites = tuple(self._runners)
         if where is not None:
             check_where(where, kind, self._runners)
@@ -352,6 +345,7 @@ class Offloader:
             self._clock,
             timeout_s,
             begun=partial(self._begun, pending),
+            task_for=pending.task_for,
             allowed=self._take_duplicate,
             late=partial(self._ended_late, pending),
         )
@@ -368,8 +362,7 @@ class Offloader:
             raise
 
     def _begun(self, pending: PendingTask, site: str) -> None:
-        outlook = pending.forecast.sites.get(site)
-        predicted_s = (outlook.predicted_s if outlook else None) or 0.0
+        predicted_s = pending.predicted_s(site)
         with self._lock:
             self._flights.begin(site, pending.task.id, predicted_s=predicted_s, now_s=self._clock.now_s())
 

@@ -5,6 +5,8 @@
 
 import contextlib
 import hashlib
+import itertools
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -24,27 +26,34 @@ from offboard.common.wire.blobs import (
     byte_length,
     checked_dtype,
 )
+from offboard.common.wire.compression import decompress
 
 BLOB_BYTES_MIN = 64 * 1024  # a larger argument is a blob
 VALUE_BYTES_MAX = 16 * 1024 * 1024  # of the msgpack part of a value, without its arrays
 ARRAYS_MAX = 1000  # arrays of one value that are sent in frames
 BLOBS_MAX = 64  # blobs that one value may refer to
+DECOMPRESSED_BYTES_MAX = 16 * 1024 * 1024  # of the arrays of one value that are sent compressed in frames
 UNSCANNED_BYTES_MAX = 512  # of msgpack that is too short to announce a harmful number of items
 NESTING_MAX = 32
 DIMENSIONS_MAX = 8
 PLACE_LENGTH_MAX = 80  # of the text that says where a bad part is
 
-_IN_FRAME, _IN_BLOB, _DATACLASS = 1, 2, 3
+_IN_FRAME, _IN_BLOB, _DATACLASS, _COMPRESSED = 1, 2, 3, 4
 _SCALARS = {type(None), bool, int, float, str}
+_Along = Callable[[int, memoryview], Buffer | None]
 _UNPACK_ERRORS = (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException)
 
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """An encoded value: frame 0 is msgpack, the others are raw arrays. `blobs` holds its blobs by digest."""
+    """An encoded value: frame 0 is msgpack, the others are raw or compressed arrays.
+
+    `blobs` holds its blobs by digest, and `arguments` the numbers of the arguments that they belong to.
+    """
 
     frames: list[Buffer]
     blobs: dict[bytes, memoryview] = field(default_factory=dict)
+    arguments: dict[bytes, int] = field(default_factory=dict)
 
 
 def encode(
@@ -53,14 +62,15 @@ def encode(
     *,
     name: str = "",
     blobs: bool = False,
-    along: Callable[[memoryview], bool] = lambda _: False,
+    along: _Along = lambda *_: None,
 ) -> Body:
     """Encode None, bool, int, float, str, bytes, list, tuple, dict, arrays and dataclasses of `types`.
 
     With `blobs`, each array or bytes larger than BLOB_BYTES_MIN becomes a blob: the value holds only its
-    digest. If `along` returns True for the bytes of an array, the array is sent in a frame instead.
-    Arrays are not copied, so do not change them before the frames are sent. BadValue says what cannot be
-    sent and where it is, such as `result['poses'][3].x`; `name` is its first word.
+    digest. `along` is called with the number of the argument, which is its place in a list `value`, and the
+    bytes of an array. If it returns them, or other bytes, which are then the compressed ones, these are sent
+    in a frame instead. Arrays are not copied, so do not change them before the frames are sent. BadValue says
+    what cannot be sent and where it is, such as `result['poses'][3].x`; `name` is its first word.
     """
     encoder = _Encoder(types, use_blobs=blobs, along=along)
     try:
@@ -73,7 +83,7 @@ def encode(
             f"{name or 'the value'} takes {len(main)} bytes without its arrays; "
             f"at most {VALUE_BYTES_MAX} are allowed"
         )
-    return Body([main, *encoder.frames], encoder.blobs)
+    return Body([main, *encoder.frames], encoder.blobs, encoder.arguments)
 
 
 def decode(frames: Sequence[Buffer], types: Sequence[type], blobs: Mapping[bytes, StoredBlob]) -> Any:
@@ -102,14 +112,14 @@ def unpack_bounded(data: Buffer, bytes_max: int) -> Any:
 class _Encoder:
     """Turns a value into a tree for msgpack, and collects the frames of arrays and the blobs."""
 
-    def __init__(
-        self, types: Sequence[type], *, use_blobs: bool, along: Callable[[memoryview], bool]
-    ) -> None:
+    def __init__(self, types: Sequence[type], *, use_blobs: bool, along: _Along) -> None:
         self.types = types
         self.use_blobs = use_blobs
         self.along = along
         self.frames: list[Buffer] = []
         self.blobs: dict[bytes, memoryview] = {}
+        self.arguments: dict[bytes, int] = {}
+        self._argument = 0
 
     def pack(self, value: Any, depth: int) -> bytes:
         tree = self._tree(value, depth)
@@ -130,6 +140,8 @@ class _Encoder:
         if kind is list or kind is tuple:
             if set(map(type, value)) <= _SCALARS:
                 return value
+            if depth == 0:
+                return list(map(self._part, itertools.count(), value))
             return [one if type(one) in _SCALARS else self._tree(one, depth + 1) for one in value]
         if kind is dict:
             return {
@@ -137,6 +149,11 @@ class _Encoder:
                 for key, one in value.items()
             }
         return self._array(value) if kind is np.ndarray else self._object(value, depth)
+
+    def _part(self, number: int, value: Any) -> Any:
+        """An argument of a call, in the list of all of them."""
+        self._argument = number
+        return self._tree(value, 1)
 
     def _object(self, value: Any, depth: int) -> Any:
         kind = type(value)
@@ -168,16 +185,20 @@ class _Encoder:
                 f"allowed are {DIMENSIONS_MAX} dimensions of numbers"
             )
         raw = np.asarray(array, order="C").reshape(-1).view(np.uint8).data
-        if self.use_blobs and raw.nbytes > BLOB_BYTES_MIN and not self.along(raw):
-            return self._blob(array_digest(array, raw), raw, array.dtype.str, array.shape)
+        frame: Buffer = raw
+        if self.use_blobs and raw.nbytes > BLOB_BYTES_MIN:
+            along = self.along(self._argument, raw)
+            if along is None:
+                return self._blob(array_digest(array, raw), raw, array.dtype.str, array.shape)
+            frame = along
         if len(self.frames) == ARRAYS_MAX:
             raise BadValue(f"the value holds more than {ARRAYS_MAX} arrays")
-        self.frames.append(raw)
+        self.frames.append(frame)
         place = (len(self.frames), array.dtype.str, array.shape)
-        return msgpack.ExtType(_IN_FRAME, msgpack.packb(place))
+        return msgpack.ExtType(_IN_FRAME if frame is raw else _COMPRESSED, msgpack.packb(place))
 
     def _blob(self, digest: bytes, raw: memoryview, dtype: str | None, shape: tuple[int, ...]) -> Any:
-        self.blobs[digest] = raw
+        self.blobs[digest], self.arguments[digest] = raw, self._argument
         if len(self.blobs) > BLOBS_MAX:
             raise BadValue(f"the value holds more than {BLOBS_MAX} arrays over {BLOB_BYTES_MIN} bytes")
         return msgpack.ExtType(_IN_BLOB, msgpack.packb((digest, dtype, shape)))
@@ -187,7 +208,7 @@ def _place_of_bad(value: Any, types: Sequence[type], depth: int) -> str:
     """Where the part is that cannot be sent, such as `[0].pose['x']`. It is found by encoding each part."""
     for place, part, deeper in _parts(value, types, depth) if depth <= NESTING_MAX else ():
         try:
-            _Encoder(types, use_blobs=False, along=bool).pack(part, deeper)
+            _Encoder(types, use_blobs=False, along=lambda *_: None).pack(part, deeper)
         except BadValue:
             return place + _place_of_bad(part, types, deeper)
     return ""
@@ -218,6 +239,7 @@ class _Decoder:
         self.frames = frames
         self.types = {cls.__name__: cls for cls in types}
         self.blobs = blobs
+        self.bytes_left = DECOMPRESSED_BYTES_MAX
 
     def unpack(self, data: Buffer, depth: int) -> Any:
         return self._value(unpack_bounded(data, VALUE_BYTES_MAX), depth)
@@ -244,17 +266,26 @@ class _Decoder:
         if code == _DATACLASS:
             return self._dataclass(self.unpack(data, depth + 1))
         tree = unpack_bounded(data, VALUE_BYTES_MAX)
-        if code not in (_IN_FRAME, _IN_BLOB) or not isinstance(tree, list) or len(tree) != 3:
+        if code not in (_IN_FRAME, _IN_BLOB, _COMPRESSED) or not isinstance(tree, list) or len(tree) != 3:
             raise ProtocolError(f"unknown extension {code}")
         where, dtype, shape = tree[0], tree[1], _shape(tree[2])
-        if code == _IN_FRAME:
+        if code != _IN_BLOB:
             if type(where) is not int or not 1 <= where < len(self.frames):
                 raise ProtocolError(f"array in frame {where!r} of {len(self.frames)}")
-            return array_view(memoryview(self.frames[where]).toreadonly(), dtype, shape)
+            frame = self.frames[where]
+            if code == _COMPRESSED:
+                frame = self._decompressed(frame, math.prod(shape) * checked_dtype(dtype).itemsize)
+            return array_view(memoryview(frame).toreadonly(), dtype, shape)
         blob = self.blobs.get(where) if isinstance(where, bytes) else None
         if blob is None:
             raise ProtocolError("the value refers to a blob that the request does not list")
         return bytes(blob.data) if dtype is None else blob.array(checked_dtype(dtype).str, shape)
+
+    def _decompressed(self, frame: Buffer, size: int) -> bytes:
+        self.bytes_left -= size
+        if self.bytes_left < 0:
+            raise ProtocolError(f"compressed arrays of more than {DECOMPRESSED_BYTES_MAX} bytes")
+        return decompress(frame, size)
 
     def _dataclass(self, tree: Any) -> Any:
         if not (isinstance(tree, list) and len(tree) == 2 and isinstance(tree[1], dict)):

@@ -4,7 +4,7 @@ What is learned of one site is in `site`.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from offboard.common.errors import Overtaken
 from offboard.common.tasks import Size, Task
@@ -29,6 +29,18 @@ class PendingTask:
     amount: Size | None
     decision: Decision
     seconds: dict[str, float] = field(default_factory=dict)
+
+    def predicted_s(self, site: str) -> float:
+        """What the task should take there; 0 if that is unknown."""
+        outlook = self.forecast.sites.get(site)
+        return (outlook.predicted_s if outlook else None) or 0.0
+
+    def task_for(self, site: str) -> Task:
+        """The task as this site gets it."""
+        outlook = self.forecast.sites.get(site)
+        if outlook is None or outlook.packing is None or not outlook.packing.compress:
+            return self.task
+        return replace(self.task, compress=outlook.packing.compress)
 
 
 class Learner:
@@ -57,6 +69,8 @@ class Learner:
         self._spend(pending, execution)
         site, decision = execution.site, pending.decision
         memory = pending.memory.site(site)
+        if site != ONBOARD:
+            pending.memory.packing.learn(execution)
         second_here = decision.second is not None and decision.second.site == site
         memory.learn(
             pending.amount if work is None else work,

@@ -80,6 +80,20 @@ class PredictionErrors:
 NO_ERRORS = PredictionErrors()
 
 
+class Packing(NamedTuple):
+    """What should be made smaller on the way to a site.
+
+    `compress`: the numbers of the arguments to compress; empty if the kind packs all of them itself.
+    `raw_bytes`, `bytes`: what a task would send without it, and what it should send.
+    `seconds`: how long the robot should take for it.
+    """
+
+    compress: tuple[int, ...]
+    raw_bytes: int
+    bytes: float
+    seconds: float
+
+
 class Outlook(NamedTuple):
     """What is known of one site before a task runs. None means that nothing was learnt yet.
 
@@ -91,6 +105,7 @@ class Outlook(NamedTuple):
     `in_flight`: tasks of any kind that run there now.
     `bytes`, `joules`: what running the task there should take.
     `condition`: what was measured of the site. `errors`: how wrong its past predictions were.
+    `packing`: what should be made smaller on the way to the site; None: nothing.
 
     Build it with keywords. It is a named tuple because every task needs one for each site, and a frozen
     dataclass takes twice as long to build.
@@ -111,6 +126,7 @@ class Outlook(NamedTuple):
     joules: float = 0.0
     condition: Condition = UNMEASURED
     errors: PredictionErrors = NO_ERRORS
+    packing: Packing | None = None
 
     @property
     def given_up(self) -> bool:

@@ -166,9 +166,9 @@ def as_dict(record: Record) -> dict[str, Any]:
         "started_at": record.started_at.isoformat(timespec="milliseconds"),
         "size": record.size,
         "features": features(record),
-        "sites": {site: _values(outlook, _OUTLOOK_FIELDS) for site, outlook in record.sites.items()},
+        "sites": {site: _outlook(outlook) for site, outlook in record.sites.items()},
         "decision": _decision(record.decision),
-        "executions": [_values(one, _EXECUTION_FIELDS) for one in record.executions],
+        "executions": [_execution(one) for one in record.executions],
         "used": record.used,
         "waited_s": record.waited_s,
         "late": [_values(one, _LATE_FIELDS) for one in record.late],
@@ -188,6 +188,16 @@ def features(record: Record) -> dict[str, float]:
                 if value is not None:
                     found[f"{site}.{name}"] = value
     return found
+
+
+def _outlook(outlook: Outlook) -> dict[str, Any]:
+    packing = outlook.packing
+    return _values(outlook, _OUTLOOK_FIELDS) | {"packing": packing and packing._asdict()}
+
+
+def _execution(execution: Execution) -> dict[str, Any]:
+    packed = [one._asdict() for one in execution.packed]
+    return _values(execution, _EXECUTION_FIELDS) | {"packed": packed}
 
 
 def _decision(decision: Decision) -> dict[str, Any]:

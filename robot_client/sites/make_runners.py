@@ -21,12 +21,14 @@ def make_runners(
     heartbeat_s: float,
     seed: int,
     states: TaskStates | None = None,
+    compress: bool = True,
 ) -> list[Runner]:
     """Connected runners; `servers` holds the endpoint of each server by name.
 
     `keys`: the folder with the keys (None: no encryption).
     `heartbeat_s`: seconds between heartbeats (0: no heartbeats).
     `states`: those of the onboard worker (None: states of its own).
+    `compress`: whether arguments may be compressed.
     """
     runners: list[Runner] = []
     background = Background()
@@ -34,7 +36,13 @@ def make_runners(
         for site, endpoint in servers.items():
             own = None if keys is None else robot_keys(Path(keys), site)
             server = CloudRunner(
-                endpoint, site=site, heartbeat_s=heartbeat_s, seed=seed, keys=own, background=background
+                endpoint,
+                site=site,
+                heartbeat_s=heartbeat_s,
+                seed=seed,
+                keys=own,
+                background=background,
+                compress=compress,
             )
             runners.append(server)
         runners.append(OnboardRunner(states=states, background=background))
