@@ -14,8 +14,9 @@ from offboard.common.planning.maps import GridMap
 from offboard.common.planning.planner import Point, Pose, Scan, plan_path
 from offboard.common.tasks import kind_of
 from offboard.common.wire import messages as wire
+from offboard.common.wire.compression import compress
 
-EXT_BLOB, EXT_DATACLASS = 2, 3  # msgpack extensions of offboard.common.wire.values
+EXT_BLOB, EXT_DATACLASS, EXT_COMPRESSED = 2, 3, 4  # msgpack extensions of offboard.common.wire.values
 
 Frames = list[Any]
 
@@ -40,13 +41,16 @@ def valid_messages() -> list[Frames]:
     named = wire.encode(
         [GridMap(blob.reshape(1, -1).view(np.int8), 0.1), *arguments[1:]], kind.types, blobs=True
     )
-    digest = next(iter(named.blobs))
+    digest, raw = next(iter(named.blobs.items()))
+    packed = wire.encode([blob, blob], kind.types, blobs=True, along=lambda _, raw: compress(raw))
     messages: list[wire.Message] = [
-        wire.Hello({kind.name: kind.source_hash}, "0.1.0", 1 << 20),
+        wire.Hello({kind.name: kind.source_hash}, "0.1.0", 1 << 20, ("zstd",)),
         wire.Request(1, kind.name, 1.0, body=small.frames),
         wire.Request(2, kind.name, 1.0, blobs=tuple(large.blobs), body=large.frames),
         wire.Request(3, kind.name, 1.0, attempt=2, blobs=(digest,), body=named.frames),
-        wire.Blob(named.blobs[digest]),
+        wire.Request(5, kind.name, 1.0, body=packed.frames),
+        wire.Blob(raw),
+        wire.Blob(compress(raw), raw.nbytes),
         wire.Ping(4),
         wire.Cancel(1),
         wire.Reply(1, "ok", body=small.frames),
@@ -122,6 +126,13 @@ def _array_bombs() -> dict[str, Frames]:
         "a negative shape": _plan_with(_array((-1, 4), bytes(4))),
         "objects as dtype": _plan_with(_array((1,), bytes(8), "|O")),
         "nine dimensions": _plan_with(_array((1,) * 9, bytes(1))),
+        "a compressed map of 10^9 cells": _plan_with(
+            _array((31_623, 31_623), bytes(10), code=EXT_COMPRESSED)
+        ),
+        "a map that unpacks to more cells": _plan_with(
+            _array((10, 10), compress(bytes(2**26)), code=EXT_COMPRESSED)
+        ),
+        "16 MiB in a few bytes, a thousand times": _many_compressed(1000, 2**24),
         "a frame that is not there": [msgpack.packb([msgpack.ExtType(1, msgpack.packb((9, "|i1", (1,))))])],
     }
 
@@ -162,6 +173,8 @@ def _header_bombs() -> dict[str, Frames]:
         ),
         "a line break in a message type": [msgpack.packb([1, "ping\nINFO robots known: mallory\x1b[2J", {}])],
         "NaN as a budget": [header, b"\x90"],
+        "a compressed blob of 2 GB": list(wire.pack(wire.Blob(compress(bytes(1000)), 2**31 - 1))),
+        "a compressed blob that is longer": list(wire.pack(wire.Blob(compress(bytes(2**26)), 1000))),
         "a blob of another hash": request([b"\x90"], blobs=(bytes(32),)),
         "64 blobs that are not there": request([b"\x90"], blobs=tuple(bytes([n]) * 32 for n in range(64))),
         "a header of 65 KB": [msgpack.packb([1, "ping", {"id": 1, "x": bytes(65_536)}])],
@@ -172,9 +185,15 @@ def _header_bombs() -> dict[str, Frames]:
     }
 
 
-def _array(shape: tuple[int, ...], data: bytes, dtype: str = "|i1") -> Frames:
+def _array(shape: tuple[int, ...], data: bytes, dtype: str = "|i1", *, code: int = 1) -> Frames:
     """A value that is an array in its own frame; its shape may be wrong."""
-    return [msgpack.packb(msgpack.ExtType(1, msgpack.packb((1, dtype, shape)))), data]
+    return [msgpack.packb(msgpack.ExtType(code, msgpack.packb((1, dtype, shape)))), data]
+
+
+def _many_compressed(count: int, size: int) -> Frames:
+    """A list of arrays that all are in one compressed frame."""
+    one = msgpack.ExtType(EXT_COMPRESSED, msgpack.packb((1, "|i1", (size,))))
+    return [msgpack.packb([one] * count), compress(bytes(size))]
 
 
 def _plan_with(array: Frames) -> Frames:

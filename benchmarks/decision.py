@@ -13,7 +13,7 @@ from offboard.robot_client import policies, predictors
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Policy, Probe
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution, Sending
 
 CALLS = 2_000
 RUN = "a run that ends at once"
@@ -22,6 +22,7 @@ RANDOM = random.Random(1)
 SIZES = [RANDOM.uniform(1, 5) for _ in range(CALLS)]
 MEASURED = Condition(round_trip_s=0.03)
 NOISE = [RANDOM.lognormvariate(0.0, 0.1) for _ in range(CALLS)]
+SENT = Sending(1000)
 SECONDS = {ONBOARD: 0.02, CLOUD: 0.04}  # of a task of size 1
 
 
@@ -45,8 +46,8 @@ class InstantRunner:
         future.set_result(Execution(self.site, SECONDS[self.site] * task.size * next(self._noise), task.size))
         return future
 
-    def bytes_to_send(self, task: Task) -> int:  # noqa: ARG002
-        return 1000
+    def to_send(self, task: Task) -> Sending:  # noqa: ARG002
+        return SENT
 
     def cancel(self, task: Task) -> None:
         pass

@@ -28,8 +28,9 @@ from offboard.common.host.cgroup import SELF
 from offboard.common.host.load import SERVER_EVERY_S, Load
 from offboard.common.host.load_watch import LoadWatch
 from offboard.common.security.keys import KeyPair
-from offboard.common.wire.blobs import BlobStore, Buffer
+from offboard.common.wire.blobs import BlobStore, Buffer, byte_length
 from offboard.common.wire.channel import Channel, make_context
+from offboard.common.wire.compression import compressions, decompress
 from offboard.common.wire.messages import (
     Blob,
     Cancel,
@@ -237,8 +238,8 @@ class Server:
                 self.metrics.dropped.labels("quota").inc()
             case Request():
                 self._scheduler.request(peer, message)
-            case Blob(data):
-                self._blobs.add(data, self._access.robot_of(peer))
+            case Blob(data, size):
+                self._keep(data, size, self._access.robot_of(peer))
             case Ping(id):
                 self._sender.send(peer, Pong(id, self._scheduler.waiting, *self._load.latest()))
             case Hello():
@@ -249,6 +250,18 @@ class Server:
                 self._scheduler.cancel(peer, id)
             case _:
                 raise ProtocolError(f"a server does not accept a {type(message).__name__.lower()}")
+
+    def _keep(self, data: Buffer, size: int | None, robot: bytes) -> None:
+        """Keep a blob. A compressed one counts with all its bytes, because they are hashed and kept."""
+        if size is not None:
+            if size > self._limits.message_bytes_max:
+                raise ProtocolError(f"blob of {size} bytes once it is decompressed")
+            more = max(0, size - byte_length(data))
+            if self._rate_limit.judge(robot, more, self._last_turn) is not Verdict.TAKE:
+                self.metrics.dropped.labels("quota").inc()
+                return
+            data = decompress(data, size)
+        self._blobs.add(data, robot)
 
     def _answered(self, work: Work, outcome: Outcome) -> list[Work]:
         """Send the reply of a task; returns the work to start in its place."""
@@ -262,7 +275,7 @@ class Server:
         return chosen
 
     def _hello(self) -> Hello:
-        return Hello(tasks.hashes(), VERSION, self._limits.message_bytes_max)
+        return Hello(tasks.hashes(), VERSION, self._limits.message_bytes_max, compressions())
 
     def _drop(self, reason: str, error: ProtocolError) -> None:
         self.metrics.dropped.labels(reason).inc()

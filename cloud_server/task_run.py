@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from offboard.common import tasks
 from offboard.common.errors import ProtocolError, TaskFailed, Unwanted, describe
@@ -65,6 +66,8 @@ def run_task(call: Call, states: TaskStates) -> Outcome:
         args = decode(call.frames, kind.types, call.blobs)
         if not isinstance(args, list):
             raise ProtocolError("the body is not a list of arguments")
+        if kind.unpack is not None:
+            args = _unpacked(kind, args)
         with states.lend(kind) as state:
             in_task = True
             value = call_while(call.wanted, kind.function, (*state, *args))
@@ -73,11 +76,33 @@ def run_task(call: Call, states: TaskStates) -> Outcome:
     except BaseException as error:  # noqa: BLE001 - a task may raise anything
         status, failure = "failed", describe(error)
         server_fault = not in_task or isinstance(error, Unwanted)
-        traceback = "" if server_fault else traceback_of(error)
+        traceback = _of_unpack(error) if server_fault else traceback_of(error)
     run_s, cpu_s = time.perf_counter() - started, cpu_time.used_s() - cpu_before_s
     return Outcome(
         status, failure, run_s, cpu_s, frames=result, server_fault=server_fault, traceback=traceback
     )
+
+
+def _unpacked(kind: tasks.Kind, received: Sequence[Any]) -> Sequence[Any]:
+    """The arguments that `unpack` makes of the one value received; ProtocolError if it does not make them."""
+    assert kind.unpack is not None
+    if len(received) != 1:
+        raise ProtocolError(f"{len(received)} values for unpack of task {kind.name}, which takes one")
+    try:
+        made = kind.unpack(received[0])
+    except MemoryError:  # the worker may have to be replaced
+        raise
+    except BaseException as error:  # the function is the user's own
+        raise ProtocolError(f"unpack of task {kind.name}: {describe(error)}") from error
+    try:
+        return kind.bind(kind.arguments_in(made), {})
+    except TypeError as error:
+        raise ProtocolError(f"unpack of task {kind.name} returns other arguments: {error}") from error
+
+
+def _of_unpack(error: BaseException) -> str:
+    """The traceback of an `unpack` that raised; empty for other faults of the server."""
+    return "" if error.__cause__ is None else traceback_of(error.__cause__, _unpacked)
 
 
 def warm_kinds(states: TaskStates) -> None:

@@ -25,6 +25,16 @@ def check_ordinary(name: str, **functions: Callable[..., Any] | None) -> None:
                 )
 
 
+def check_packing(name: str, pack: Any, unpack: Any) -> None:
+    """ConfigError unless both are ordinary functions, or both None."""
+    if (pack is None) != (unpack is None):
+        raise ConfigError(f"task {name}: pack= and unpack= need each other; give both or none")
+    for place, one in (("pack", pack), ("unpack", unpack)):
+        if one is not None and not callable(one):
+            raise ConfigError(f"task {name}: {place}= is {one!r:.80}; it must be a function")
+    check_ordinary(name, pack=pack, unpack=unpack)
+
+
 def check_parameters(name: str, parameters: Iterable[inspect.Parameter]) -> None:
     for parameter in parameters:
         if parameter.kind in (parameter.KEYWORD_ONLY, parameter.VAR_KEYWORD):
@@ -80,27 +90,35 @@ def name_of(function: object) -> str:
     return getattr(function, "__qualname__", None) or repr(function)
 
 
-def source_hash(function: Callable[..., Any], setup: Callable[[], Any] | None, types: Iterable[type]) -> str:
-    """SHA-256 of the source of a function, its setup and its dataclasses, with the names of their fields.
+def source_hash(
+    function: Callable[..., Any],
+    setup: Callable[[], Any] | None,
+    types: Iterable[type],
+    *packing: Callable[..., Any] | None,
+) -> str:
+    """SHA-256 of the source of a function, its setup, its dataclasses with their fields, and its packing.
 
     An empty text, which matches nothing, if the function has no source.
     """
     if not _source(function):
         return ""
-    return _hash([_source(function), _source(setup), *_sources(types)])
+    return _hash([_source(function), _source(setup), *_sources(types, *packing)])
 
 
-def contract_hash(signature: inspect.Signature, types: Iterable[type]) -> str:
-    """SHA-256 of what all variants of a task have in common: what a caller gives, and the dataclasses.
+def contract_hash(
+    signature: inspect.Signature, types: Iterable[type], *packing: Callable[..., Any] | None
+) -> str:
+    """SHA-256 of what all variants of a task have in common: what a caller gives, dataclasses, and packing.
 
     Defaults do not count: the robot fills them in.
     """
     given = [f"{one.kind.name} {one.name}" for one in signature.parameters.values()]
-    return _hash(["variants", *given, *_sources(types)])
+    return _hash(["variants", *given, *_sources(types, *packing)])
 
 
-def _sources(types: Iterable[type]) -> list[str]:
-    return [part for one in types for part in (_source(one), *sorted(field_names(one)))]
+def _sources(types: Iterable[type], *packing: Callable[..., Any] | None) -> list[str]:
+    parts = [part for one in types for part in (_source(one), *sorted(field_names(one)))]
+    return parts + [_source(one) for one in packing if one is not None]
 
 
 def _hash(parts: Iterable[str]) -> str:

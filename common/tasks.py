@@ -17,6 +17,7 @@ from offboard.common.errors import BadValue, ConfigError, UnknownTask, describe,
 from offboard.common.task_functions import (
     check_first_parameter,
     check_ordinary,
+    check_packing,
     check_parameters,
     check_variant,
     contract_hash,
@@ -43,10 +44,11 @@ class Kind:
     same length (each finite, >= 0). `types` are the dataclasses that arguments and result may contain. `warm`
     is called once per process before the first task. A kind with `duplicate=False` never runs on two sites.
     `work` maps a result to the amount of work that it took, in any unit. `setup` is called once per worker;
-    its result is the first argument of the function, which callers do not give.
+    its result is the first argument of the function, which callers do not give. `pack` makes one value of the
+    arguments of a task that leaves the robot, and `unpack` makes the arguments of that value.
 
     `variants` holds a kind for each site, if sites run different functions, with the `quality` of its answers
-    from 0 to 1. `source_hash` then covers what they have in common: the parameters and the dataclasses.
+    from 0 to 1. `source_hash` then covers what they have in common: parameters, dataclasses, pack and unpack.
     """
 
     name: str
@@ -61,6 +63,8 @@ class Kind:
     setup: Callable[[], Any] | None = None
     variants: "Mapping[str, Kind]" = field(default_factory=dict, compare=False)
     quality: float = 1.0
+    pack: Callable[..., Any] | None = None
+    unpack: Callable[[Any], Any] | None = None
     _counts: list[int] = field(default_factory=list, compare=False, repr=False)  # the first one holds for all
 
     def bind(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:
@@ -70,6 +74,10 @@ class Kind:
         bound = self.signature().bind(*args, **kwargs)
         bound.apply_defaults()
         return bound.args
+
+    def arguments_in(self, item: Any) -> tuple[Any, ...]:
+        """The arguments in one item: a tuple holds all of them if the function takes several."""
+        return item if isinstance(item, tuple) and self.positional != 1 else (item,)
 
     def signature(self) -> inspect.Signature:
         """What a caller gives: the parameters of the function, without the first one if there is a setup."""
@@ -139,12 +147,18 @@ class Kind:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One call of a kind: its arguments and its input size."""
+    """One call of a kind: its arguments and its input size.
+
+    `compress`: the numbers of the arguments that are compressed on the way to the site.
+    `parcel`: keeps its packed arguments for further sites, if its kind packs them.
+    """
 
     kind: Kind
     args: tuple[Any, ...]
     size: Size
     id: int = field(default_factory=itertools.count(1).__next__)
+    compress: tuple[int, ...] = ()
+    parcel: Any = field(default=None, compare=False, repr=False)
 
 
 _kinds: dict[str, Kind] = {}
@@ -162,11 +176,13 @@ def task(
     setup: Callable[[], Any] | Mapping[str, Callable[[], Any]] | None = None,
     variants: Mapping[str, Callable[..., Any] | None] | None = None,
     quality: Mapping[str, float] | None = None,
+    pack: Callable[..., Any] | None = None,
+    unpack: Callable[[Any], Any] | None = None,
 ) -> Callable[[F], F]:
     """Register a function as a kind of task. It can still be called as an ordinary function.
 
-    Robot and server load the same module. If the source of the function, of its setup or of its dataclasses
-    differs between them, the task stays onboard.
+    Robot and server load the same module. If the source of the function, of its setup, of its pack or unpack
+    or of its dataclasses differs between them, the task stays onboard.
     If `size` returns several numbers, the predictor `least-squares` uses all of them, and every other one
     uses the first; `parts` predicts from the work instead if the kind tells it (by the first number too).
 
@@ -185,6 +201,7 @@ def task(
         found = variants_of(name, function, variants=variants, quality=quality, setup=setup)
         own: Any = found[CLOUD].setup if found else setup
         check_ordinary(name, function=function, size=size, setup=own, work=work, warm=warm)
+        check_packing(name, pack, unpack)
         signature = inspect.signature(function)
         if own is not None:
             check_first_parameter(name, signature)
@@ -194,8 +211,8 @@ def task(
         count = len(parameters) if fixed else None
         kind = Kind(
             name, function, size, duplicate,
-            types=tuple(types), warm=warm, source_hash=source_hash(function, own, types), work=work,
-            positional=count, setup=own,
+            types=tuple(types), warm=warm, source_hash=source_hash(function, own, types, pack, unpack),
+            work=work, positional=count, setup=own, pack=pack, unpack=unpack,
         )  # fmt: skip
         if found:
             kind = _with_variants(kind, found)
@@ -277,14 +294,14 @@ def _with_variants(kind: Kind, found: Mapping[str, Variant]) -> Kind:
             function = one.function
             check_ordinary(name, variant=function, setup=one.setup)
             check_variant(name, site, function, setup=one.setup, given=given)
-            own_hash = source_hash(function, one.setup, kind.types)
+            own_hash = source_hash(function, one.setup, kind.types, kind.pack, kind.unpack)
         made[site] = replace(
             kind, name=f"{name}{AT}{site}", function=function, setup=one.setup, source_hash=own_hash,
             quality=one.quality,
         )  # fmt: skip
         if len(made[site].name) > NAME_LENGTH_MAX:
             raise ConfigError(f"task {name}: {made[site].name!r} has over {NAME_LENGTH_MAX} characters")
-    return replace(kind, source_hash=contract_hash(given, kind.types), variants=made)
+    return replace(kind, source_hash=contract_hash(given, kind.types, kind.pack, kind.unpack), variants=made)
 
 
 def _meant(name: str) -> str:

@@ -38,9 +38,9 @@ from offboard.robot_client.policies.observe import Observe
 from offboard.robot_client.records.recording import Recording, record_of, tell
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.settings import Settings, check_types
-from offboard.robot_client.sites import heartbeat
 from offboard.robot_client.sites.absence import Absent, absent_sites, wait_for_sites
 from offboard.robot_client.sites.clock import Clock, SystemClock
+from offboard.robot_client.sites.outgoing import new_task
 from offboard.robot_client.sites.runner import ONBOARD, TIMEOUT_S, Execution, Runner, checked_timeout
 from offboard.robot_client.task_runs import TaskRuns
 
@@ -127,20 +127,13 @@ class Offloader:
         `metrics`: HOST:PORT where Prometheus reads `/metrics`. `trace`: the file that gets every record.
         `observe`: answer every task onboard, and estimate what the policy would save (`savings`).
         """
-        from offboard.robot_client.sites.make_runners import (
-            make_runners,  # zmq is loaded only for a connection
-        )
-
         check_types(cls.connect, locals())
         rare = settings or Settings()
         chosen, memories = rare.make_policy(policy), rare.make_memories(policy)
-        beat_s = heartbeat.EVERY_S if rare.beats(policy) else 0.0
         with ExitStack() as opened:
             recording = Recording(trace=trace, metrics=metrics)
             opened.callback(recording.close)
-            runners = make_runners(
-                endpoint, sites or {}, keys=keys, heartbeat_s=beat_s, seed=rare.seed, states=rare.states
-            )
+            runners = rare.make_runners(endpoint, sites or {}, keys, policy)
             for runner in runners:
                 opened.callback(runner.close)
             offload = cls(
@@ -176,7 +169,7 @@ class Offloader:
         budget_s = self._timeout_s if timeout_s is None else checked_timeout(timeout_s)
         kind = kind_of(function)
         args = kind.bind(args, kwargs)
-        task = Task(kind, args, kind.size_of(args))
+        task = new_task(kind, args)
         if deadline_s is None:
             answer, _ = self._answer(where, budget_s, task)
         else:
@@ -203,7 +196,7 @@ class Offloader:
             self._life.refuse()
         budget_s = self._timeout_s if timeout_s is None else checked_timeout(timeout_s)
         kind = kind_of(function)
-        tasks = [Task(kind, args, kind.size_of(args)) for args in arguments(kind, items)]
+        tasks = [new_task(kind, args) for args in arguments(kind, items)]
         sites = tuple(self._runners)
         if self._observes:
             where = where or ONBOARD
@@ -247,7 +240,7 @@ class Offloader:
             checked_timeout(deadline_s, "deadline_s")
         kind = kind_of(function)
         args = kind.bind(args, kwargs)
-        task, absent = Task(kind, args, kind.size_of(args)), absent_sites(self._runners, kind)
+        task, absent = new_task(kind, args), absent_sites(self._runners, kind)
         with self._lock:
             _, forecast = self._forecast(task, absent, self._timeout_s)
         return expectations(forecast, absent, deadline_s)

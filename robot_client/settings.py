@@ -22,8 +22,9 @@ from offboard.robot_client.policies import Policy
 from offboard.robot_client.policies.allowance import DUPLICATES, Allowance
 from offboard.robot_client.policies.decision import Named
 from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.predictors.window import WINDOW, checked_length
 from offboard.robot_client.policies.objectives import S_PER_QUALITY, Mean, Objective
+from offboard.robot_client.predictors.window import WINDOW, checked_length
+from offboard.robot_client.sites.runner import Runner
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,6 +41,7 @@ class Settings:
     `bytes_a_minute`: the most bytes that tasks may send and receive in a minute (None: no cap).
     `joules_a_minute`: the most joules that tasks may take in a minute (None: no cap).
     `memory`: the file in which what was learnt outlives the process (None: a new process knows nothing).
+    `compress`: whether large arguments are compressed where that should save time.
     `states`: what setups make; offloaders of one process that share it load each model once (None: its own).
     `seed`: for policies and predictors that draw; the same seed draws the same numbers.
     """
@@ -54,6 +56,7 @@ class Settings:
     bytes_a_minute: float | None = None
     joules_a_minute: float | None = None
     memory: Path | str | None = None
+    compress: bool = True
     states: TaskStates | None = None
     seed: int = 0
 
@@ -78,6 +81,23 @@ class Settings:
     def beats(self, policy: str) -> bool:
         """Whether the servers are sent heartbeats."""
         return policies.heartbeats(policy) if self.heartbeats is None else self.heartbeats
+
+    def make_runners(
+        self, endpoint: str | None, sites: Mapping[str, str], keys: Path | str | None, policy: str
+    ) -> list[Runner]:
+        """Connected runners: of the server at `endpoint`, of each further one in `sites`, and of onboard."""
+        from offboard.robot_client.sites.heartbeat import EVERY_S
+        from offboard.robot_client.sites.make_runners import make_runners  # loads zmq
+
+        return make_runners(
+            endpoint,
+            sites,
+            keys=keys,
+            heartbeat_s=EVERY_S if self.beats(policy) else 0.0,
+            seed=self.seed,
+            states=self.states,
+            compress=self.compress,
+        )
 
     def make_memories(self, policy: str) -> Memories:
         """What is known of each kind: nothing yet, or what the file `memory` holds.

@@ -59,6 +59,7 @@ class TaskRuns:
             self._clock,
             pending.timeout_s,
             begun=partial(self._begun, pending),
+            task_for=pending.task_for,
             allowed=self._take_duplicate,
             late=partial(self._ended_late, pending),
         )
@@ -79,7 +80,7 @@ class TaskRuns:
         before = self._begun_onboard
         busy = self._flights.count(ONBOARD) > 0
         self._begun(pending, site)
-        run = self._runners[site].submit(pending.task, pending.timeout_s)
+        run = self._runners[site].submit(pending.task_for(site), pending.timeout_s)
         self._clock.wait([run])
         beside = busy or self._begun_onboard != before
         self._ended_late(pending, site, result_of(site, run), beside=beside)
@@ -99,8 +100,7 @@ class TaskRuns:
         return late
 
     def _begun(self, pending: PendingTask, site: str) -> None:
-        outlook = pending.forecast.sites.get(site)
-        predicted_s = (outlook.predicted_s if outlook else None) or 0.0
+        predicted_s = pending.predicted_s(site)
         with self._lock:
             self._flights.begin(site, pending.task.id, predicted_s=predicted_s, now_s=self._clock.now_s())
             self._begun_onboard += site == ONBOARD

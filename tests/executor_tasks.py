@@ -61,6 +61,27 @@ class Pose:
 def exec_pose(pose):
     return pose.x
 
+def to_one(a, b):
+    return {"a": a, "b": b}
+
+def to_both(one):
+    return one["a"], one["b"]
+
+@task("exec_packed", size=lambda a, b: 0, pack=to_one, unpack=to_both)
+def exec_packed(a, b):
+    return [a, b]
+
+def raise_value_error(value):
+    raise ValueError(f"no picture: {value}")
+
+@task("exec_bad_unpack", size=lambda value: 0, pack=str, unpack=raise_value_error)
+def exec_bad_unpack(value):
+    return value
+
+@task("exec_few_unpacked", size=lambda a, b: 0, pack=lambda a, b: a, unpack=str)
+def exec_few_unpacked(a, b):
+    return [a, b]
+
 @task("exec_echo", size=lambda value: 0)
 def exec_echo(value):
     return value

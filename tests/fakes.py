@@ -4,7 +4,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 
 from offboard.common.tasks import Kind, Task
-from offboard.robot_client.sites.runner import UNMEASURED, Condition, Execution
+from offboard.robot_client.sites.runner import UNMEASURED, Condition, Execution, Sending
 
 
 class ScriptedRunner:
@@ -32,8 +32,8 @@ class ScriptedRunner:
         future.set_result(self.script(task))
         return future
 
-    def bytes_to_send(self, task: Task) -> int:  # noqa: ARG002 - the same for every task
-        return self.bytes_out
+    def to_send(self, task: Task) -> Sending:  # noqa: ARG002 - the same for every task
+        return Sending(self.bytes_out)
 
     def cancel(self, task: Task) -> None:
         self.cancelled.append(task)

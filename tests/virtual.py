@@ -9,7 +9,7 @@ from typing import Any
 
 from offboard.common.errors import CloudBroken, CloudTimeout, OffloadError, Overtaken
 from offboard.common.tasks import Kind, Task
-from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Execution
+from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Execution, Sending
 
 
 class VirtualClock:
@@ -86,8 +86,8 @@ class VirtualRunner:
             self._clock.after(budget_s, lambda: self._end(task, CloudTimeout("late"), censored=True))
         return future
 
-    def bytes_to_send(self, task: Task) -> int:  # noqa: ARG002 - the same for every task
-        return int(self.fields.get("bytes_out", 0))
+    def to_send(self, task: Task) -> Sending:  # noqa: ARG002 - the same for every task
+        return Sending(int(self.fields.get("bytes_out", 0)))
 
     def cancel(self, task: Task) -> None:
         self.cancelled.append(task)

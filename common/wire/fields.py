@@ -11,6 +11,7 @@ from offboard.common.tasks import KINDS_MAX, NAME_LENGTH_MAX
 from offboard.common.wire.values import BLOBS_MAX
 
 TEXT_LENGTH_MAX = 128  # of a software version or a source hash
+WORDS_MAX = 16
 SECONDS_MAX = 1e6
 DIGEST_BYTES = 32
 IDLE = {"load": 0.0, "capacity": 1.0}  # values of an idle server; they are not sent
@@ -59,6 +60,14 @@ class Fields:
             raise self.wrong(name, f"a list of at most {BLOBS_MAX} digests")
         if not all(isinstance(item, bytes) and len(item) == DIGEST_BYTES for item in value):
             raise self.wrong(name, f"a list of digests of {DIGEST_BYTES} bytes")
+        return tuple(value)
+
+    def words(self, name: str) -> tuple[str, ...]:
+        value = self.values.get(name, [])
+        if not isinstance(value, list) or len(value) > WORDS_MAX:
+            raise self.wrong(name, f"a list of at most {WORDS_MAX} texts")
+        if not all(isinstance(item, str) and len(item) <= TEXT_LENGTH_MAX for item in value):
+            raise self.wrong(name, f"a list of texts of at most {TEXT_LENGTH_MAX} characters")
         return tuple(value)
 
     def tasks(self, name: str) -> dict[str, str]:

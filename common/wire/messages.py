@@ -66,12 +66,13 @@ class Hello:
     """The first message in each direction.
 
     `tasks` maps each known task to the hash of its source. The sender accepts messages of up to
-    `message_bytes_max`.
+    `message_bytes_max`, and arguments that one of `compressions` has compressed.
     """
 
     tasks: dict[str, str]
     software: str
     message_bytes_max: int
+    compressions: tuple[str, ...] = ()
 
 
 @dataclass(slots=True)
@@ -143,9 +144,13 @@ class Cancel:
 
 @dataclass(frozen=True, slots=True)
 class Blob:
-    """The bytes of one blob. The receiver computes the digest itself."""
+    """The bytes of one blob. The receiver computes the digest itself.
+
+    `size`: how many bytes there are once `data` is decompressed; None if it is not compressed.
+    """
 
     data: Buffer
+    size: int | None = None
 
 
 Message = Hello | Request | Reply | Ping | Pong | Cancel | Blob
@@ -153,21 +158,15 @@ Message = Hello | Request | Reply | Ping | Pong | Cancel | Blob
 
 def pack(message: Message) -> list[Buffer]:
     """The frames of a message; its buffers are not copied. BadValue if the message is too large."""
-    kind, names = _FIELDS[type(message)]
+    kind, names, optional = _FIELDS[type(message)]
     fields = {field: getattr(message, field) for field in names}
-    if isinstance(message, Reply):
-        if message.error:
-            fields["error"] = _sendable(message.error[:ERROR_LENGTH_MAX])
-        if message.traceback:
-            fields["traceback"] = _sendable(bounded(message.traceback))
-        else:
-            del fields["traceback"]
-        if message.cpu_s is None:
-            del fields["cpu_s"]
-    if isinstance(message, Reply | Pong):
-        for name, idle in IDLE.items():
-            if fields[name] == idle:
-                del fields[name]
+    if isinstance(message, Reply) and message.error:
+        fields["error"] = _sendable(message.error[:ERROR_LENGTH_MAX])
+    if isinstance(message, Reply) and message.traceback:
+        fields["traceback"] = _sendable(bounded(message.traceback))
+    for name, absent in optional:
+        if fields[name] == absent:
+            del fields[name]
     header: bytes = msgpack.packb([VERSION, kind, fields])
     frames: list[Buffer] = [header]
     if isinstance(message, Request | Reply):
@@ -214,6 +213,7 @@ def _hello(fields: Fields, rest: list[Buffer]) -> Hello:
         fields.tasks("tasks"),
         fields.text("software", TEXT_LENGTH_MAX),
         fields.whole("message_bytes_max", 1, COUNT_MAX),
+        fields.words("compressions"),
     )
 
 
@@ -267,9 +267,9 @@ def _cancel(fields: Fields, rest: list[Buffer]) -> Cancel:
     return Cancel(fields.whole("id", 0, ID_MAX))
 
 
-def _blob(_: Fields, rest: list[Buffer]) -> Blob:
+def _blob(fields: Fields, rest: list[Buffer]) -> Blob:
     _frame_count("blob", rest, 1)
-    return Blob(rest[0])
+    return Blob(rest[0], fields.whole("size", 1, COUNT_MAX) if "size" in fields.values else None)
 
 
 def _frame_count(name: str, rest: list[Buffer], wanted: int) -> None:
@@ -278,9 +278,16 @@ def _frame_count(name: str, rest: list[Buffer], wanted: int) -> None:
 
 
 _RAW = ("body", "data")  # fields that follow the header as frames
-_FIELDS: dict[type, tuple[str, list[str]]] = {
-    kind: (kind.__name__.lower(), [one.name for one in dataclasses.fields(kind) if one.name not in _RAW])
-    for kind in get_args(Message)
+# Fields that are not sent while they have this value.
+_OPTIONAL: dict[str, object] = {**IDLE, "cpu_s": None, "traceback": "", "compressions": (), "size": None}
+_NAMES = {kind: [one.name for one in dataclasses.fields(kind)] for kind in get_args(Message)}
+_FIELDS: dict[type, tuple[str, list[str], list[tuple[str, object]]]] = {
+    kind: (
+        kind.__name__.lower(),
+        [name for name in names if name not in _RAW],
+        [(name, _OPTIONAL[name]) for name in names if name in _OPTIONAL],
+    )
+    for kind, names in _NAMES.items()
 }
 _READERS: dict[str, Callable[[Fields, list[Buffer]], Message]] = {
     "hello": _hello,

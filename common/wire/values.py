@@ -5,6 +5,8 @@
 
 import contextlib
 import hashlib
+import itertools
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -24,11 +26,13 @@ from offboard.common.wire.blobs import (
     byte_length,
     checked_dtype,
 )
+from offboard.common.wire.compression import decompress
 
 BLOB_BYTES_MIN = 64 * 1024  # a larger argument is a blob
 VALUE_BYTES_MAX = 16 * 1024 * 1024  # of the msgpack part of a value, without its arrays
 ARRAYS_MAX = 1000  # arrays of one value that are sent in frames
 BLOBS_MAX = 64  # blobs that one value may refer to
+DECOMPRESSED_BYTES_MAX = 16 * 1024 * 1024  # of the arrays of one value that are sent compressed in frames
 UNSCANNED_BYTES_MAX = 512  # of msgpack that is too short to announce a harmful number of items
 NESTING_MAX = 32
 DATACLASS_LEVELS = 3  # that a dataclass counts as: its message is a list with a map in it
@@ -36,17 +40,22 @@ DIMENSIONS_MAX = 8
 ARRAY_BYTES_MAX = 2**31 - 1  # of one array: no message is larger
 PLACE_LENGTH_MAX = 80  # of the text that says where a bad part is
 
-_IN_FRAME, _IN_BLOB, _DATACLASS = 1, 2, 3
+_IN_FRAME, _IN_BLOB, _DATACLASS, _COMPRESSED = 1, 2, 3, 4
 _SCALARS = {type(None), bool, int, float, str}
+_Along = Callable[[int, memoryview], Buffer | None]
 _UNPACK_ERRORS = (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException)
 
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """An encoded value: frame 0 is msgpack, the others are raw arrays. `blobs` holds its blobs by digest."""
+    """An encoded value: frame 0 is msgpack, the others are raw or compressed arrays.
+
+    `blobs` holds its blobs by digest, and `arguments` the numbers of the arguments that they belong to.
+    """
 
     frames: list[Buffer]
     blobs: dict[bytes, memoryview] = field(default_factory=dict)
+    arguments: dict[bytes, int] = field(default_factory=dict)
 
 
 def encode(
@@ -55,16 +64,17 @@ def encode(
     *,
     name: str = "",
     blobs: bool = False,
-    along: Callable[[memoryview], bool] = lambda _: False,
+    along: _Along = lambda *_: None,
     array_bytes_max: int = ARRAY_BYTES_MAX,
 ) -> Body:
     """Encode None, bool, int, float, str, bytes, list, tuple, dict, arrays and dataclasses of `types`.
 
     With `blobs`, each array or bytes larger than BLOB_BYTES_MIN becomes a blob: the value holds only its
-    digest. If `along` returns True for the bytes of an array, the array is sent in a frame instead.
-    Arrays are not copied, so do not change them before the frames are sent. One that is not contiguous is
-    copied, unless it has more than `array_bytes_max`. BadValue says what cannot be sent and where it is, such
-    as `result['poses'][3].x`; `name` is its first word.
+    digest. `along` is called with the number of the argument, which is its place in a list `value`, and the
+    bytes of an array. If it returns them, or other bytes, which are then the compressed ones, these are sent
+    in a frame instead. Arrays are not copied, so do not change them before the frames are sent. One that is
+    not contiguous is copied, unless it has more than `array_bytes_max`. BadValue says what cannot be sent and
+    where it is, such as `result['poses'][3].x`; `name` is its first word.
     """
     encoder = _Encoder(types, use_blobs=blobs, along=along, array_bytes_max=array_bytes_max)
     try:
@@ -77,7 +87,7 @@ def encode(
             f"{name or 'the value'} takes {len(main)} bytes without its arrays; "
             f"at most {VALUE_BYTES_MAX} are allowed"
         )
-    return Body([main, *encoder.frames], encoder.blobs)
+    return Body([main, *encoder.frames], encoder.blobs, encoder.arguments)
 
 
 def decode(frames: Sequence[Buffer], types: Sequence[type], blobs: Mapping[bytes, StoredBlob]) -> Any:
@@ -111,7 +121,7 @@ class _Encoder:
         types: Sequence[type],
         *,
         use_blobs: bool,
-        along: Callable[[memoryview], bool],
+        along: _Along,
         array_bytes_max: int,
     ) -> None:
         self.types = types
@@ -120,6 +130,8 @@ class _Encoder:
         self.array_bytes_max = array_bytes_max
         self.frames: list[Buffer] = []
         self.blobs: dict[bytes, memoryview] = {}
+        self.arguments: dict[bytes, int] = {}
+        self._argument = 0
 
     def pack(self, value: Any, depth: int) -> bytes:
         tree = self._tree(value, depth)
@@ -140,6 +152,8 @@ class _Encoder:
         if kind is list or kind is tuple:
             if set(map(type, value)) <= _SCALARS:
                 return value
+            if depth == 0:
+                return list(map(self._part, itertools.count(), value))
             return [one if type(one) in _SCALARS else self._tree(one, depth + 1) for one in value]
         if kind is dict:
             return {
@@ -147,6 +161,11 @@ class _Encoder:
                 for key, one in value.items()
             }
         return self._array(value) if kind is np.ndarray else self._object(value, depth)
+
+    def _part(self, number: int, value: Any) -> Any:
+        """An argument of a call, in the list of all of them."""
+        self._argument = number
+        return self._tree(value, 1)
 
     def _object(self, value: Any, depth: int) -> Any:
         kind = type(value)
@@ -181,16 +200,20 @@ class _Encoder:
         if not array.flags.c_contiguous and array.nbytes > self.array_bytes_max:
             raise BadValue(f"an array of {array.nbytes} bytes; at most {self.array_bytes_max} are allowed")
         raw = np.asarray(array, order="C").reshape(-1).view(np.uint8).data
-        if self.use_blobs and raw.nbytes > BLOB_BYTES_MIN and not self.along(raw):
-            return self._blob(array_digest(array, raw), raw, array.dtype.str, array.shape)
+        frame: Buffer = raw
+        if self.use_blobs and raw.nbytes > BLOB_BYTES_MIN:
+            along = self.along(self._argument, raw)
+            if along is None:
+                return self._blob(array_digest(array, raw), raw, array.dtype.str, array.shape)
+            frame = along
         if len(self.frames) == ARRAYS_MAX:
             raise BadValue(f"the value holds more than {ARRAYS_MAX} arrays")
-        self.frames.append(raw)
+        self.frames.append(frame)
         place = (len(self.frames), array.dtype.str, array.shape)
-        return msgpack.ExtType(_IN_FRAME, msgpack.packb(place))
+        return msgpack.ExtType(_IN_FRAME if frame is raw else _COMPRESSED, msgpack.packb(place))
 
     def _blob(self, digest: bytes, raw: memoryview, dtype: str | None, shape: tuple[int, ...]) -> Any:
-        self.blobs[digest] = raw
+        self.blobs[digest], self.arguments[digest] = raw, self._argument
         if len(self.blobs) > BLOBS_MAX:
             raise BadValue(f"the value holds more than {BLOBS_MAX} arrays over {BLOB_BYTES_MIN} bytes")
         return msgpack.ExtType(_IN_BLOB, msgpack.packb((digest, dtype, shape)))
@@ -199,7 +222,9 @@ class _Encoder:
 def _place_of_bad(value: Any, like: _Encoder, depth: int) -> str:
     """Where the part is that cannot be sent, such as `[0].pose['x']`. It is found by encoding each part."""
     for place, part, deeper in _parts(value, like.types, depth) if depth <= NESTING_MAX else ():
-        encoder = _Encoder(like.types, use_blobs=False, along=bool, array_bytes_max=like.array_bytes_max)
+        encoder = _Encoder(
+            like.types, use_blobs=False, along=lambda *_: None, array_bytes_max=like.array_bytes_max
+        )
         try:
             encoder.pack(part, deeper)
         except BadValue:
@@ -232,6 +257,7 @@ class _Decoder:
         self.frames = frames
         self.types = {cls.__name__: cls for cls in types}
         self.blobs = blobs
+        self.bytes_left = DECOMPRESSED_BYTES_MAX
 
     def unpack(self, data: Buffer, depth: int) -> Any:
         return self._value(unpack_bounded(data, VALUE_BYTES_MAX), depth)
@@ -258,17 +284,26 @@ class _Decoder:
         if code == _DATACLASS:
             return self._dataclass(self.unpack(data, depth + 1))
         tree = unpack_bounded(data, VALUE_BYTES_MAX)
-        if code not in (_IN_FRAME, _IN_BLOB) or not isinstance(tree, list) or len(tree) != 3:
+        if code not in (_IN_FRAME, _IN_BLOB, _COMPRESSED) or not isinstance(tree, list) or len(tree) != 3:
             raise ProtocolError(f"unknown extension {code}")
         where, dtype, shape = tree[0], tree[1], _shape(tree[2])
-        if code == _IN_FRAME:
+        if code != _IN_BLOB:
             if type(where) is not int or not 1 <= where < len(self.frames):
                 raise ProtocolError(f"array in frame {where!r} of {len(self.frames)}")
-            return array_view(memoryview(self.frames[where]).toreadonly(), dtype, shape)
+            frame = self.frames[where]
+            if code == _COMPRESSED:
+                frame = self._decompressed(frame, math.prod(shape) * checked_dtype(dtype).itemsize)
+            return array_view(memoryview(frame).toreadonly(), dtype, shape)
         blob = self.blobs.get(where) if isinstance(where, bytes) else None
         if blob is None:
             raise ProtocolError("the value refers to a blob that the request does not list")
         return bytes(blob.data) if dtype is None else blob.array(checked_dtype(dtype).str, shape)
+
+    def _decompressed(self, frame: Buffer, size: int) -> bytes:
+        self.bytes_left -= size
+        if self.bytes_left < 0:
+            raise ProtocolError(f"compressed arrays of more than {DECOMPRESSED_BYTES_MAX} bytes")
+        return decompress(frame, size)
 
     def _dataclass(self, tree: Any) -> Any:
         if not (isinstance(tree, list) and len(tree) == 2 and isinstance(tree[1], dict)):

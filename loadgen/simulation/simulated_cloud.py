@@ -22,7 +22,7 @@ from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client.sites.cloud import PENDING_MAX
 from offboard.robot_client.sites.heartbeat import EARLY_S, Heartbeat, ServerReport
-from offboard.robot_client.sites.runner import CLOUD, Condition, Execution
+from offboard.robot_client.sites.runner import CLOUD, Condition, Execution, Sending
 
 TASK, BEAT, CANCEL, BLOB = "task", "beat", "cancel", "blob"  # sorts of messages
 
@@ -92,8 +92,8 @@ class SimulatedCloud:
             self._clock.at(pending.deadline_s, partial(self._expire, pending))
         return pending.future
 
-    def bytes_to_send(self, task: Task) -> int:
-        return self._costs.task(number_of(task)).bytes_out
+    def to_send(self, task: Task) -> Sending:
+        return Sending(self._costs.task(number_of(task)).bytes_out)
 
     def cancel(self, task: Task) -> None:
         pending = self._pending.get(task.id)

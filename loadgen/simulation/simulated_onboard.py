@@ -12,7 +12,7 @@ from offboard.loadgen.simulation.model.simulated_load import SimulatedLoad
 from offboard.loadgen.simulation.model.true_costs import TrueCosts
 from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
 from offboard.loadgen.testbed.testbed import ROBOT
-from offboard.robot_client.sites.runner import ONBOARD, Condition, Execution
+from offboard.robot_client.sites.runner import NOTHING, ONBOARD, Condition, Execution, Sending
 
 
 class SimulatedOnboard:
@@ -37,8 +37,8 @@ class SimulatedOnboard:
         self._runs[task.id] = run, future
         return future
 
-    def bytes_to_send(self, task: Task) -> int:  # noqa: ARG002 - nothing is sent
-        return 0
+    def to_send(self, task: Task) -> Sending:  # noqa: ARG002 - nothing is sent
+        return NOTHING
 
     def cancel(self, task: Task) -> None:
         """End the run, even if it has begun: the tasks of scenarios check often if they are cancelled."""

@@ -28,7 +28,15 @@ from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Decision, Forecast, Policy, Probe
 from offboard.robot_client.predictors import Predictor
 from offboard.robot_client.predictors.window import WINDOW, WINDOW_MAX
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
+from offboard.robot_client.sites.runner import (
+    CLOUD,
+    NOTHING,
+    ONBOARD,
+    UNMEASURED,
+    Condition,
+    Execution,
+    Sending,
+)
 
 ORACLE = "oracle"
 RECORDED = "as recorded"
@@ -197,8 +205,8 @@ class _Replaying:
         future.set_result(Execution(self.site, self._seconds[row]))
         return future
 
-    def bytes_to_send(self, task: Task) -> int:  # noqa: ARG002 - nothing is sent
-        return 0
+    def to_send(self, task: Task) -> Sending:  # noqa: ARG002 - nothing is sent
+        return NOTHING
 
     def cancel(self, task: Task) -> None:
         pass

@@ -51,7 +51,7 @@ def compare(tasks: Sequence[Kind], there: Mapping[str, str], *, chosen: bool) ->
     if not tasks:
         return "none to compare; name modules with --tasks"
     names = ", ".join(kind.name for kind in tasks)
-    return f"functions, setups and dataclasses are the same on both sides: {names}"
+    return f"functions, setups, packing and dataclasses are the same on both sides: {names}"
 
 
 def _registered_by(modules: Sequence[str]) -> tuple[Kind, ...]:

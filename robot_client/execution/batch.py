@@ -181,10 +181,8 @@ class Batch:
 
 
 def arguments(kind: Kind, items: Iterable[Any]) -> list[tuple[Any, ...]]:
-    """The arguments of each item: a tuple holds all of them if the function takes several."""
-    parameters = kind.signature().parameters.values()
-    several = len(parameters) > 1 or any(one.kind is one.VAR_POSITIONAL for one in parameters)
-    return [kind.bind(item if several and isinstance(item, tuple) else (item,), {}) for item in items]
+    """The arguments of each item."""
+    return [kind.bind(kind.arguments_in(item), {}) for item in items]
 
 
 def _usable(forecast: Forecast) -> Mapping[str, Outlook]:

@@ -39,6 +39,7 @@ class Race:
     `begun`: called with every site that starts.
     `allowed`: asked before a second run starts. A fallback, which replaces failed runs, is always allowed.
     `late`: called in any thread when a run ends after the task was answered.
+    `task_for`: returns the task as a site gets it (None: each site gets the same).
     """
 
     def __init__(
@@ -51,6 +52,7 @@ class Race:
         begun: Callable[[str], None],
         allowed: Callable[[], bool],
         late: Callable[[str, Execution], None],
+        task_for: Callable[[str], Task] | None = None,
     ) -> None:
         self._task = task
         self._runners = runners
@@ -59,6 +61,7 @@ class Race:
         self._begun = begun
         self._allowed = allowed
         self._late = late
+        self._task_for = task_for
         self._runs: dict[str, tuple[Future[Execution], float]] = {}  # with its start time
 
     def run(self, plan: Plan) -> tuple[Execution, ...]:
@@ -88,8 +91,9 @@ class Race:
 
     def _start(self, site: str) -> None:
         self._begun(site)
+        task = self._task if self._task_for is None else self._task_for(site)
         began_s = self._clock.now_s()
-        self._runs[site] = self._runners[site].submit(self._task, self._timeout_s), began_s
+        self._runs[site] = self._runners[site].submit(task, self._timeout_s), began_s
 
     def _start_second(self, second: Probe | Hedge) -> None:
         late: list[str] = []

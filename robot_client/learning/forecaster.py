@@ -8,9 +8,11 @@ from collections.abc import Collection, Mapping
 from offboard.common.tasks import Size, Task
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.runs_in_flight import Flights
+from offboard.robot_client.learning.site import SiteMemory
 from offboard.robot_client.policies import Forecast, Outlook
 from offboard.robot_client.policies.allowance import Allowance
-from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Runner
+from offboard.robot_client.policies.forecast import Packing
+from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Runner, Sending
 
 
 class Forecaster:
@@ -29,12 +31,14 @@ class Forecaster:
         for site in sites:
             known, in_flight = memory.site(site), self._flights.count(site)
             condition = self._behind(site, in_flight, now_s) if known.measured else UNMEASURED
+            sending = self._runners[site].to_send(task)
             outlooks[site] = known.outlook(
                 amount,
                 condition,
                 in_flight=in_flight,
                 timeout_s=timeout_s,
-                bytes_out=self._runners[site].bytes_to_send(task),
+                bytes_out=sending.bytes,
+                packing=_packing(memory, known, sending),
             )
         return self._with_allowance(memory, task.size, outlooks)
 
@@ -49,12 +53,14 @@ class Forecaster:
         for site, count in own.items():
             known = memory.site(site)
             condition = self._apart_from(site, count) if known.measured else UNMEASURED
+            sending = self._runners[site].to_send(task)
             outlooks[site] = known.outlook(
                 amount,
                 condition,
                 in_flight=count,
                 timeout_s=timeout_s,
-                bytes_out=self._runners[site].bytes_to_send(task),
+                bytes_out=sending.bytes,
+                packing=_packing(memory, known, sending),
             )
         return self._with_allowance(memory, task.size, outlooks)
 
@@ -84,3 +90,10 @@ class Forecaster:
     def _apart_from(self, site: str, own: int) -> Condition:
         condition = self._runners[site].condition()
         return condition._replace(queue=max(0, condition.queue - own))
+
+
+def _packing(memory: KindMemory, known: SiteMemory, sending: Sending) -> Packing | None:
+    """What to make smaller on the way to the site. Most tasks have nothing, so that is asked first."""
+    if not sending.large and memory.kind.pack is None:
+        return None
+    return memory.packing.plan(sending, known.link_s)

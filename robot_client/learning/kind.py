@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 
 from offboard.common.errors import is_interrupt
 from offboard.common.tasks import Kind, Size, first_number
+from offboard.robot_client.learning.packing import PackingMemory
 from offboard.robot_client.learning.shared_work import SharedWork
 from offboard.robot_client.learning.site import SiteMemory
 from offboard.robot_client.policies.energy import Energy
@@ -44,6 +45,7 @@ class KindMemory:
         self.last_site: str | None = None  # where the last task was sent
         self.worked: deque[tuple[float, float]] = deque(maxlen=REMEMBERED)  # sizes and their work
         self.kind = kind
+        self.packing = PackingMemory(packs=kind.pack is not None)
         self._make = make
         self._objective = objective
         self._energy = energy

@@ -5,7 +5,7 @@ What is learned of one site is in `site`.
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 
 from offboard.common.errors import Overtaken
@@ -41,6 +41,18 @@ class PendingTask:
     call: "Future[str] | None" = None
     deadline_s: float | None = None
     ended: dict[str, Execution] = field(default_factory=dict)
+
+    def predicted_s(self, site: str) -> float:
+        """What the task should take there; 0 if that is unknown."""
+        outlook = self.forecast.sites.get(site)
+        return (outlook.predicted_s if outlook else None) or 0.0
+
+    def task_for(self, site: str) -> Task:
+        """The task as this site gets it."""
+        outlook = self.forecast.sites.get(site)
+        if outlook is None or outlook.packing is None or not outlook.packing.compress:
+            return self.task
+        return replace(self.task, compress=outlook.packing.compress)
 
 
 class Learner:
@@ -78,6 +90,8 @@ class Learner:
         if beside is None:
             second_here = decision.second is not None and decision.second.site == site
             beside = site != ONBOARD and decision.site == ONBOARD and (decision.both or second_here)
+        if site != ONBOARD:
+            pending.memory.packing.learn(execution)
         memory.learn(
             pending.amount if work is None else work,
             execution,

@@ -11,7 +11,7 @@ from offboard.common.errors import CannotCross, Overtaken, TaskError
 from offboard.common.tasks import Size, first_number
 from offboard.robot_client.learning.conformal import Conformal
 from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.forecast import Outlook, Quality
+from offboard.robot_client.policies.forecast import Outlook, Packing, Quality
 from offboard.robot_client.policies.objectives import Expected, Objective
 from offboard.robot_client.predictors import Prediction, Predictor
 from offboard.robot_client.predictors.base import REMEMBERED
@@ -27,7 +27,7 @@ class Observation:
 
     `amount`: what the predictor learned `seconds` for: the size or the work.
     `work`: the work that the result said.
-    `seconds`: the time without `waited_s`, the wait for other tasks of this robot.
+    `seconds`: the time without `waited_s`, the wait for other tasks of this robot, or for the packing.
     `predicted_s`: the prediction, if the interval learned its error.
     `run_s`, `queue_s`: what the site measured of them; None: nothing.
     `bound`: the robot ran the same task itself and may have received the answer of this site late.
@@ -92,10 +92,14 @@ class SiteMemory:
         in_flight: int,
         timeout_s: float,
         bytes_out: float,
+        packing: Packing | None = None,
     ) -> Outlook:
-        """The outlook for a task of this amount that sends this many bytes; None: the amount is unknown."""
+        """The outlook for a task of this amount that sends this many bytes, unless `packing` says fewer.
+
+        An amount of None is unknown.
+        """
         predictor = self.predictor
-        moved = bytes_out + self._bytes_in.value
+        moved = (bytes_out if packing is None else packing.bytes) + self._bytes_in.value
         found = None if amount is None else self._predict(amount, moved, condition)
         if found is None:
             return Outlook(
@@ -105,8 +109,11 @@ class SiteMemory:
                 in_flight=in_flight,
                 condition=condition,
                 quality=self._quality,
+                packing=packing,
             )
         seconds = found.seconds + condition.wait_s
+        if packing is not None and self._parts is not None:  # all others learn it with the rest of the time
+            seconds += packing.seconds
         if condition.silent:
             seconds = max(seconds, timeout_s)
         low_s, high_s = self._conformal.interval(seconds, found.spread_s) or (None, None)
@@ -128,7 +135,13 @@ class SiteMemory:
             condition=condition,
             errors=errors,
             quality=self._quality,
+            packing=packing,
         )
+
+    @property
+    def link_s(self) -> float | None:
+        """The seconds that each byte takes on the way to this site; None if nothing says so."""
+        return None if self._parts is None or self._site == ONBOARD else self._parts.byte_s
 
     def learn(
         self,
@@ -209,7 +222,12 @@ class SiteMemory:
         return execution.censored and expected_s is not None and execution.seconds >= expected_s
 
     def _waited_s(self, execution: Execution, outlook: Outlook | None) -> float:
-        """How long an onboard run waited for other tasks of the robot, which its outlook included."""
+        """How long the run waited before the site had it, for something that its outlook included.
+
+        Onboard, it waited for other tasks of the robot; on the way to a server, for the packing.
+        """
+        if execution.packed:
+            return 0.0 if self._parts is None else execution.pack_s
         behind = self.measured and self._site == ONBOARD and outlook is not None and outlook.in_flight > 0
         return (execution.queue_s or 0.0) if behind else 0.0
 

@@ -101,6 +101,18 @@ class Quality(NamedTuple):
 
 
 WHOLE = Quality()  # of every site, for a task without variants
+class Packing(NamedTuple):
+    """What should be made smaller on the way to a site.
+
+    `compress`: the numbers of the arguments to compress; empty if the kind packs all of them itself.
+    `raw_bytes`, `bytes`: what a task would send without it, and what it should send.
+    `seconds`: how long the robot should take for it.
+    """
+
+    compress: tuple[int, ...]
+    raw_bytes: int
+    bytes: float
+    seconds: float
 
 
 class Outlook(NamedTuple):
@@ -115,6 +127,7 @@ class Outlook(NamedTuple):
     `bytes`, `joules`: what running the task there should take.
     `condition`: what was measured of the site. `errors`: how wrong its past predictions were.
     `quality`: of the variant that the site runs; WHOLE for a task without variants.
+    `packing`: what should be made smaller on the way to the site; None: nothing.
 
     Build it with keywords. It is a named tuple because every task needs one for each site, and a frozen
     dataclass takes twice as long to build.
@@ -136,6 +149,7 @@ class Outlook(NamedTuple):
     condition: Condition = UNMEASURED
     errors: PredictionErrors = NO_ERRORS
     quality: Quality = WHOLE
+    packing: Packing | None = None
 
     @property
     def given_up(self) -> bool:

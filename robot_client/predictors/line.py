@@ -47,6 +47,11 @@ class Line:
         """The standard deviation of the times, as a share of them."""
         return math.sqrt(self._noise)
 
+    @property
+    def steepest(self) -> float:
+        """The slope plus its standard deviation."""
+        return self.b + math.sqrt(max(0.0, self._pbb))
+
     def at(self, x: float) -> float:
         """The seconds for this amount."""
         seconds = self.a + self.b * x

@@ -41,6 +41,16 @@ class Parts:
     def __len__(self) -> int:
         return self._run.count
 
+    @property
+    def byte_s(self) -> float:
+        """The most seconds, by what is known, that each byte takes on the link.
+
+        The upper end makes the robot try to send less: equal tasks do not tell what their bytes take.
+        """
+        if not (self._bytes and self._network.count):
+            return 1.0 / FIRST_BYTES_S
+        return self._network.steepest / self._bytes
+
     def predict(
         self,
         size: float,

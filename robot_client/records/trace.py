@@ -177,7 +177,7 @@ def as_dict(record: Record) -> dict[str, Any]:
         "features": features(record),
         "sites": {site: _outlook(outlook) for site, outlook in record.sites.items()},
         "decision": _decision(record.decision),
-        "executions": [_values(one, _EXECUTION_FIELDS) for one in record.executions],
+        "executions": [_execution(one) for one in record.executions],
         "used": record.used,
         "waited_s": record.waited_s,
         "deadline_s": record.deadline_s,
@@ -204,7 +204,13 @@ def features(record: Record) -> dict[str, float]:
 def _outlook(outlook: Outlook) -> dict[str, Any]:
     """Only a task with variants has a quality."""
     quality = None if outlook.quality is WHOLE else outlook.quality.value
-    return _values(outlook, _OUTLOOK_FIELDS) | {"quality": quality}
+    packing = None if outlook.packing is None else outlook.packing._asdict()
+    return _values(outlook, _OUTLOOK_FIELDS) | {"quality": quality, "packing": packing}
+
+
+def _execution(execution: Execution) -> dict[str, Any]:
+    packed = [one._asdict() for one in execution.packed]
+    return _values(execution, _EXECUTION_FIELDS) | {"packed": packed}
 
 
 def _decision(decision: Decision) -> dict[str, Any]:

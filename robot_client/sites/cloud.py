@@ -28,6 +28,7 @@ from offboard.common.errors import (
 from offboard.common.security.keys import RobotKeys
 from offboard.common.tasks import Kind, Task, hashes
 from offboard.common.wire import messages as wire
+from offboard.common.wire.compression import compressions
 from offboard.common.wire.payload import payload_bytes
 from offboard.robot_client.sites.absence import CrossingPauses, difference
 from offboard.robot_client.sites.background import Background
@@ -35,8 +36,9 @@ from offboard.robot_client.sites.blob_uploads import BlobUploads
 from offboard.robot_client.sites.cloud_socket import MESSAGE_BYTES_MAX, CloudSocket, SocketEvent
 from offboard.robot_client.sites.connection import LOG_PAUSE_S, Action, Connection, HandshakeFailure
 from offboard.robot_client.sites.heartbeat import EARLY_S, Heartbeat, ServerReport
+from offboard.robot_client.sites.outgoing import Outgoing
 from offboard.robot_client.sites.pending_request import PendingRequest
-from offboard.robot_client.sites.runner import CLOUD, Condition, Execution, Lasting, check_endpoint
+from offboard.robot_client.sites.runner import CLOUD, Condition, Execution, Lasting, Sending, check_endpoint
 from offboard.robot_client.sites.shared_reader import Answer, SharedReader
 
 PENDING_MAX = 1024
@@ -56,6 +58,7 @@ class CloudRunner:
 
     heartbeat_s: seconds between heartbeats; 0: none are sent, and only tasks are measured.
     keys: encrypt the connection, and connect only to the server of this key.
+    compress: whether arguments may be compressed for this server.
     """
 
     def __init__(
@@ -67,6 +70,7 @@ class CloudRunner:
         seed: int = 0,
         keys: RobotKeys | None = None,
         background: Background | None = None,
+        compress: bool = True,
     ) -> None:
         check_endpoint(site, endpoint)
         self.site = site
@@ -76,6 +80,8 @@ class CloudRunner:
         self._heartbeat_wanted = False  # by `hurry`
         self._remote: dict[str, str] = {}  # source hashes at the server, by kind and variant
         self._message_bytes_max = MESSAGE_BYTES_MAX  # what the server takes, once it has said so
+        self._compressions = set(compressions() if compress else ())
+        self._compresses = False  # whether the server takes what one of them makes
         self._warned: set[str] = set()  # kinds
         self._pending: dict[int, PendingRequest] = {}
         self._cancelled: deque[int] = deque()
@@ -112,12 +118,14 @@ class CloudRunner:
         published_s = time.perf_counter()
         try:
             inline = self._uploads.inline_rule(task.kind.name, self._message_bytes_max)
+            outgoing = Outgoing(task, inline, compresses=self._compresses)
+            values = outgoing.values(task, self._uploads.probably_carried)
             body = wire.encode(
-                list(task.args),
+                values,
                 task.kind.types,
                 name="arguments",
                 blobs=True,
-                along=inline,
+                along=outgoing,
                 array_bytes_max=self._message_bytes_max,
             )
         except Exception as error:  # noqa: BLE001 - whatever cannot be sent, onboard can answer
@@ -136,7 +144,7 @@ class CloudRunner:
             published_s,
             deadline_s=published_s + budget_s,
             future=Answer(self._reader),
-            inline=inline.used,
+            outgoing=outgoing,
         )
         with self._socket.lock:
             if self._reader.closed:
@@ -150,8 +158,15 @@ class CloudRunner:
                 self._socket.wake()
         return pending.future
 
-    def bytes_to_send(self, task: Task) -> int:
-        return payload_bytes(task.args, self._uploads.probably_carried)
+    def to_send(self, task: Task) -> Sending:
+        if task.kind.pack is not None:
+            return Sending(payload_bytes(task.args))
+        known = self._uploads.probably_carried
+        count = payload_bytes(task.args, known)
+        if count <= wire.BLOB_BYTES_MIN or not self._compresses:
+            return Sending(count)
+        sizes = [(number, payload_bytes(one, known)) for number, one in enumerate(task.args)]
+        return Sending(count, tuple(one for one in sizes if one[1] > wire.BLOB_BYTES_MIN))
 
     def cancel(self, task: Task) -> None:
         self._cancelled.append(task.id)
@@ -265,7 +280,7 @@ class CloudRunner:
             self._upload(pending, unknown)
         elif unknown:
             pending.doubtful = True
-        elif body.blobs and not pending.inline:
+        elif body.blobs and not pending.outgoing.inline.used:
             self._uploads.found(kind, new=False)
         self._send_request(pending)
 
@@ -304,6 +319,7 @@ class CloudRunner:
     def _take(self, message: wire.Message, received_s: float, bytes_in: int) -> None:
         if isinstance(message, wire.Hello):
             self._remote, self._message_bytes_max = message.tasks, message.message_bytes_max
+            self._compresses = not self._compressions.isdisjoint(message.compressions)
             if self._connection.hello_answered(received_s):
                 self._heartbeat.start(received_s)
             return
@@ -345,7 +361,9 @@ class CloudRunner:
 
     def _upload(self, pending: PendingRequest, digests: Iterable[bytes]) -> None:
         for digest in digests:
-            pending.bytes_out += self._send(wire.Blob(pending.body.blobs[digest]))
+            raw = pending.body.blobs[digest]
+            data = pending.outgoing.smaller(pending.body.arguments[digest], raw)
+            pending.bytes_out += self._send(wire.Blob(data, None if data is raw else raw.nbytes))
             self._uploads.sent(digest, self._messages)
 
     def _give_up(

@@ -23,12 +23,14 @@ def make_runners(
     heartbeat_s: float,
     seed: int,
     states: TaskStates | None = None,
+    compress: bool = True,
 ) -> list[Runner]:
     """Connected runners: of the server at `endpoint`, of each further one in `sites`, and of onboard.
 
     `keys`: the folder with the keys (None: no encryption).
     `heartbeat_s`: seconds between heartbeats (0: no heartbeats).
     `states`: those of the onboard worker (None: states of its own).
+    `compress`: whether arguments may be compressed.
     """
     if endpoint is not None and CLOUD in sites:
         raise ConfigError(f"sites: {CLOUD!r} is the name of the server at {endpoint}; choose another one")
@@ -41,7 +43,13 @@ def make_runners(
         for site, endpoint in servers.items():
             own = None if keys is None else robot_keys(Path(keys), site)
             server = CloudRunner(
-                endpoint, site=site, heartbeat_s=heartbeat_s, seed=seed, keys=own, background=background
+                endpoint,
+                site=site,
+                heartbeat_s=heartbeat_s,
+                seed=seed,
+                keys=own,
+                background=background,
+                compress=compress,
             )
             runners.append(server)
         runners.append(OnboardRunner(states=states, background=background))

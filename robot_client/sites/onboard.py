@@ -32,7 +32,7 @@ from offboard.common.threads import join_all
 from offboard.common.tracebacks import traceback_of
 from offboard.common.wanted import call_while
 from offboard.robot_client.sites.background import Background
-from offboard.robot_client.sites.runner import ONBOARD, Condition, Execution
+from offboard.robot_client.sites.runner import NOTHING, ONBOARD, Condition, Execution, Sending
 
 ABANDONED_MAX = 4  # cancelled runs that go on at the same time
 ABANDONED_NICE = 10  # their niceness: a tenth of the CPU time of a task with niceness 0 (sched(7))
@@ -138,8 +138,8 @@ class OnboardRunner:
             self._run_here(run)
         return run.future
 
-    def bytes_to_send(self, task: Task) -> int:  # noqa: ARG002 - nothing is sent
-        return 0
+    def to_send(self, task: Task) -> Sending:  # noqa: ARG002 - nothing is sent
+        return NOTHING
 
     def cancel(self, task: Task) -> None:
         """Remove the task from the queue, or let its run stop early.

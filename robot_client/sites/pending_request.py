@@ -19,6 +19,7 @@ from offboard.common.errors import (
 )
 from offboard.common.tasks import Task
 from offboard.common.wire import messages as wire
+from offboard.robot_client.sites.outgoing import Outgoing
 from offboard.robot_client.sites.runner import Execution
 
 
@@ -26,7 +27,7 @@ from offboard.robot_client.sites.runner import Execution
 class PendingRequest:
     """One request to the server of `site`. Times are readings of `time.perf_counter`.
 
-    inline: whether large arguments are inside the body.
+    outgoing: what of the arguments is inside the body, and what was packed.
     attempt: how often it was sent, counted from 1.
     last_message: the number of the message that carried it last.
     doubtful: whether its large arguments were only named, and the server may lack one of them.
@@ -38,7 +39,7 @@ class PendingRequest:
     published_s: float
     deadline_s: float
     future: "Future[Execution]"
-    inline: bool
+    outgoing: Outgoing
     attempt: int = 1
     bytes_out: int = 0
     last_message: int = 0
@@ -61,7 +62,8 @@ class PendingRequest:
                 value = wire.decode(reply.body, self.task.kind.types, {})
             except ProtocolError as error:
                 failure = CannotCross(f"result: {error}")
-        seconds = received_s - self.published_s
+        seconds, packed = received_s - self.published_s, self.outgoing.packed
+        pack_s = sum([one.seconds for one in packed])
         return Execution(
             self.site,
             seconds,
@@ -69,11 +71,12 @@ class PendingRequest:
             failure,
             queue_s=reply.queue_s,
             run_s=reply.run_s,
-            network_s=max(0.0, seconds - reply.queue_s - reply.run_s),
+            network_s=max(0.0, seconds - reply.queue_s - reply.run_s - pack_s),
             cpu_s=reply.cpu_s,
             bytes_out=self.bytes_out,
             bytes_in=bytes_in,
-            started=reply.status in ("ok", "failed"),
+            started=reply.status in ("ok", "failed") and not _unread(reply),
+            packed=packed,
         )
 
     def given_up(
@@ -86,6 +89,7 @@ class PendingRequest:
             censored=censored,
             bytes_out=self.bytes_out,
             started=started,
+            packed=self.outgoing.packed,
         )
 
 
@@ -94,6 +98,11 @@ _FAILURES: dict[str, Callable[[str], OffloadError]] = {
     "expired": CloudBusy,
     "unknown_task": CloudBroken,
 }
+
+
+def _unread(reply: wire.Reply) -> bool:
+    """Whether the server could not read or unpack the arguments, so that the task did not begin."""
+    return reply.server_fault and reply.error.startswith("ProtocolError: ")
 
 
 def _failure(kind: str, reply: wire.Reply) -> OffloadError | None:

@@ -23,6 +23,33 @@ PORT_MAX = 65_535
 _ENDPOINT = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5})")
 
 
+class Packed(NamedTuple):
+    """What was made smaller for one run: an argument by its number, or all of them (None) by `pack`.
+
+    how: `pack`, or the library that compressed the argument.
+    raw_bytes, bytes: before and after. seconds: what it took; 0 if it was done for another site before.
+    """
+
+    argument: int | None
+    how: str
+    raw_bytes: int
+    bytes: int
+    seconds: float
+
+
+class Sending(NamedTuple):
+    """About how many bytes a run would send now.
+
+    large: the arguments among them that can be compressed, as pairs of their number and their bytes.
+    """
+
+    bytes: int
+    large: tuple[tuple[int, int], ...] = ()
+
+
+NOTHING = Sending(0)
+
+
 @dataclass(slots=True)
 class Execution:
     """One run of a task on one site, measured with the robot's own clock.
@@ -34,6 +61,7 @@ class Execution:
     cpu_s: CPU time of the server (onboard: of the robot) during the run, including other tasks that ran.
     bytes_out, bytes_in: bytes of the messages, without transport headers.
     started: false if the task certainly never ran there.
+    packed: what was made smaller before it was sent; `network_s` leaves out the time for it.
     """
 
     site: str
@@ -48,10 +76,16 @@ class Execution:
     bytes_out: int = 0
     bytes_in: int = 0
     started: bool = True
+    packed: tuple[Packed, ...] = ()
 
     def without_value(self) -> "Execution":
         """A copy for the record, without the result, which may be large."""
         return replace(self, value=None)
+
+    @property
+    def pack_s(self) -> float:
+        """How much of `seconds` the robot took to pack the arguments."""
+        return sum([one.seconds for one in self.packed])
 
     @property
     def ok(self) -> bool:
@@ -109,8 +143,8 @@ class Runner(Protocol):
         A remote runner gives the task up after `budget_s` seconds.
         """
 
-    def bytes_to_send(self, task: "Task") -> int:
-        """About how many bytes a run of this task would send now. Must not block."""
+    def to_send(self, task: "Task") -> Sending:
+        """What a run of this task would send now, before it is packed. Must not block."""
 
     def cancel(self, task: "Task") -> None:
         """The answer is no longer wanted. If the run can be stopped, its future ends now, censored."""

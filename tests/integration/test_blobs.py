@@ -64,16 +64,17 @@ def served() -> Iterator[Served]:
 
 
 @contextmanager
-def joined(served: Served) -> Iterator[CloudRunner]:
-    with closing(CloudRunner(served.server.endpoint)) as runner:
+def joined(served: Served, *, compress: bool = True) -> Iterator[CloudRunner]:
+    with closing(CloudRunner(served.server.endpoint, compress=compress)) as runner:
         until = time.monotonic() + WAIT_S
         while runner.unavailable(kind_of(both_sums)) and time.monotonic() < until:
             time.sleep(0.01)
         yield runner
 
 
-def run(runner: CloudRunner, *arrays: np.ndarray[Any, Any]) -> Execution:
-    execution = runner.submit(Task(kind_of(both_sums), arrays, 0.0), WAIT_S).result()
+def run(runner: CloudRunner, *arrays: np.ndarray[Any, Any], compress: tuple[int, ...] = ()) -> Execution:
+    one = Task(kind_of(both_sums), arrays, 0.0, compress=compress)
+    execution = runner.submit(one, WAIT_S).result()
     assert execution.value == [array.sum() for array in arrays]
     return execution
 
@@ -128,6 +129,38 @@ def test_a_blob_from_another_robot_is_not_sent_again(served: Served) -> None:
         for n in range(NEW_AFTER):
             assert run(other, new(n)).bytes_out < NUMBERS
     assert served.asked == NEW_AFTER
+
+
+def test_a_compressed_argument_is_stored_whole_and_known_again(served: Served) -> None:
+    """It crosses in few bytes, once; its digest is that of the array itself."""
+    with joined(served) as runner:
+        first, again = run(runner, new(1), compress=(0,)), run(runner, new(1))
+        assert first.bytes_out < 5000
+        assert [(one.argument, one.how, one.raw_bytes) for one in first.packed] == [
+            (0, "zstd", new(1).nbytes)
+        ]
+        assert again.bytes_out < 1000
+        assert again.packed == ()
+        assert served.kept_bytes == new(1).nbytes
+        for n in range(2, 2 + NEW_AFTER):
+            run(runner, new(n))
+        inside = run(runner, new(0), new(-1), compress=(1,))
+    assert new(0).nbytes < inside.bytes_out < new(0).nbytes + 5000
+    assert [one.argument for one in inside.packed] == [1]
+    assert inside.network_s is not None
+    assert inside.network_s < inside.seconds - inside.pack_s
+
+
+def test_a_robot_may_be_told_not_to_compress(served: Served) -> None:
+    """It then knows of nothing to compress, and compresses nothing."""
+    task = Task(kind_of(both_sums), (new(1), 5, new(2)), 0.0)
+    with joined(served) as runner:
+        assert runner.to_send(task).large == ((0, new(1).nbytes), (2, new(2).nbytes))
+    with joined(served, compress=False) as runner:
+        assert runner.to_send(task).large == ()
+        plain = run(runner, new(1), compress=(0,))
+    assert plain.bytes_out > new(1).nbytes
+    assert plain.packed == ()
 
 
 def test_of_two_blobs_the_known_one_is_not_sent_again(served: Served) -> None:

@@ -92,6 +92,7 @@ OWNERS = {
         "cloud_server/robot_socket.py",
         "cloud_server/server.py",
     },
+    "backports": {"common/wire/compression.py"},
     "fastapi": {
         "cloud_server/http_api.py",
         "loadgen/relay/control_api.py",

@@ -48,6 +48,12 @@ GOLDEN: list[tuple[wire.Message, str]] = [
     ),
     (Cancel(2**63 - 1), "9301a663616e63656c81a26964cf7fffffffffffffff"),
     (Blob(b"map"), "9301a4626c6f6280|6d6170"),
+    (Blob(b"map", 1000), "9301a4626c6f6281a473697a65cd03e8|6d6170"),
+    (
+        Hello({}, "1", 4096, ("zstd",)),
+        "9301a568656c6c6f84a57461736b7380a8736f667477617265a131b16d6573736167655f62797465735f6d6178cd1000"
+        "ac636f6d7072657373696f6e7391a47a737464",
+    ),
 ]
 
 
@@ -161,6 +167,24 @@ def test_the_tasks_of_a_hello_are_limited(tasks: dict[Any, str]) -> None:
     """The lengths of names and hashes and their number are limited."""
     with pytest.raises(ProtocolError):
         wire.unpack([msgpack.packb([1, "hello", {"tasks": tasks, "software": "1"}])])
+
+
+@pytest.mark.parametrize("words", ["zstd", None, ["z" * 129], [b"zstd"], ["zstd"] * 17])
+def test_the_compressions_of_a_hello_are_limited(words: Any) -> None:
+    """They are a short list of short texts; a hello without them is one of an older version."""
+    fields: dict[str, Any] = {"tasks": {}, "software": "1", "message_bytes_max": 1}
+    hello = wire.unpack([msgpack.packb([1, "hello", fields])])
+    assert hello == Hello({}, "1", 1)
+    with pytest.raises(ProtocolError, match=r"hello\.compressions"):
+        wire.unpack([msgpack.packb([1, "hello", fields | {"compressions": words}])])
+
+
+@pytest.mark.parametrize("size", [0, -1, 2**31, 1.0, "1", None])
+def test_the_size_of_a_blob_is_limited(size: Any) -> None:
+    """It is a whole number from 1, or left out."""
+    assert wire.unpack([msgpack.packb([1, "blob", {}]), b"x"]) == Blob(b"x")
+    with pytest.raises(ProtocolError, match=r"blob\.size"):
+        wire.unpack([msgpack.packb([1, "blob", {"size": size}]), b"x"])
 
 
 @pytest.mark.parametrize(

@@ -321,3 +321,16 @@ def test_no_task_breaks_the_model(
             assert math.isfinite(found.seconds)
             assert found.seconds >= 0
             assert math.isfinite(found.spread_s or 0.0)
+
+
+def test_what_a_byte_takes_is_learned_from_tasks_of_different_bytes() -> None:
+    """Before the first answer it is that of a usual link; equal tasks allow more than the truth."""
+    model = Parts(remote=True)
+    assert model.byte_s == 1 / FIRST_BYTES_S
+    for _ in range(20):
+        answer(model, moved=1e6, rest_s=1e6 / BYTES_S)
+    assert model.byte_s > 0.8 / BYTES_S
+    for n in range(40):
+        moved = 1e6 if n % 2 else 3e5
+        answer(model, moved=moved, rest_s=moved / BYTES_S)
+    assert model.byte_s == pytest.approx(1 / BYTES_S, rel=0.1)

@@ -12,7 +12,9 @@ from offboard import Offloader, Settings
 from offboard.common.errors import BadValue, TaskError, TaskFailed, describe
 from offboard.common.tasks import task
 from offboard.common.wire import messages as wire
+from offboard.robot_client.sites.blob_uploads import BlobUploads
 from offboard.robot_client.sites.onboard import OnboardRunner
+from offboard.robot_client.sites.outgoing import Outgoing
 from offboard.robot_client.sites.pending_request import PendingRequest
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.fakes import ScriptedRunner
@@ -217,7 +219,8 @@ def test_an_error_of_the_cloud_names_the_task_once() -> None:
     from offboard.common.tasks import Task, kind_of
 
     one = Task(kind_of(sound), (1,), 1.0)
-    pending = PendingRequest(CLOUD, one, wire.encode([1], ()), 0.0, 1.0, Future(), inline=False)
+    outgoing = Outgoing(one, BlobUploads().inline_rule("sound", 1000), compresses=False)
+    pending = PendingRequest(CLOUD, one, wire.encode([1], ()), 0.0, 1.0, Future(), outgoing=outgoing)
     for text in ("ValueError: no", "setup of task sound: ValueError: no"):
         reply = wire.Reply(one.id, "failed", queue_s=0.0, run_s=0.0, error=text)
         failure = str(pending.answered(reply, 0.5, 10).failure)

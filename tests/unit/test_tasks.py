@@ -14,6 +14,8 @@ import pytest
 from offboard.common.errors import BadValue, ConfigError, UnknownTask
 from offboard.common.tasks import kind_named, kind_of, load_modules, task
 
+ROOT = Path(__file__).parents[2]
+
 
 @task("double", size=lambda number, scale=1: number * scale)
 def double(number: float, scale: int = 1) -> float:
@@ -100,10 +102,9 @@ def test_a_module_that_is_also_the_script_registers_its_tasks_twice(tmp_path: Pa
     """It is the same file, so each name means the same function."""
     main = "\nif __name__ == '__main__':\n    import script\n    print(script.twin(4), twin(5))\n"
     (tmp_path / "script.py").write_text(TWIN.format(factor=2) + main)
-    root = Path(__file__).parents[2]
     done = subprocess.run(
         [sys.executable, "script.py"],
-        capture_output=True, text=True, cwd=tmp_path, env={"PYTHONPATH": str(root)},
+        capture_output=True, text=True, cwd=tmp_path, env={"PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     assert (done.stdout, done.stderr) == ("8 10\n", "")
 
@@ -127,6 +128,73 @@ def test_the_source_hash_covers_the_setup() -> None:
         task(name, size=float, setup=setup)(run_engine)
         hashes.append(kind_named(name).source_hash)
     assert hashes[0] == hashes[2] != hashes[1]
+
+
+PACKED = """from offboard.common.tasks import task
+
+
+def to_link(number):
+    return {to}
+
+
+def from_link(value):
+    return {back}
+
+
+@task("{name}", size=float, pack=to_link, unpack=from_link)
+def twice(number):
+    return 2 * number
+"""
+
+
+def test_the_source_hash_covers_pack_and_unpack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A server that unpacks in another way than the robot packs is noticed when they connect."""
+    monkeypatch.syspath_prepend(tmp_path)
+    sources = {"same_a": ("number", "value"), "same_b": ("number", "value")}
+    sources |= {"other_pack": ("number + 1", "value"), "other_unpack": ("number", "value - 1")}
+    hashes = {}
+    for module, (to, back) in sources.items():
+        text = PACKED.format(name="packed_twice", to=to, back=back)
+        (tmp_path / f"{module}.py").write_text(text)
+        code = "import sys; from offboard.common import tasks; tasks.load_modules(sys.argv[1:]); "
+        code += "print(tasks.kind_named('packed_twice').source_hash)"
+        done = subprocess.run(
+            [sys.executable, "-c", code, module],
+            capture_output=True, text=True, check=True, env={"PYTHONPATH": f"{ROOT}:{tmp_path}"},
+        )  # fmt: skip
+        hashes[module] = done.stdout
+    assert hashes["same_a"] == hashes["same_b"]
+    assert len(set(hashes.values())) == 3
+
+
+@pytest.mark.parametrize(
+    ("packing", "said"),
+    [
+        ({"pack": bytes}, "pack= and unpack= need each other; give both or none"),
+        ({"unpack": bytes}, "pack= and unpack= need each other; give both or none"),
+        ({"pack": "jpeg", "unpack": bytes}, "pack= is 'jpeg'; it must be a function"),
+        ({"pack": bytes, "unpack": 90}, "unpack= is 90; it must be a function"),
+    ],
+)
+def test_wrong_packing_is_refused(packing: dict[str, Any], said: str) -> None:
+    """One line names the task, the keyword and what is allowed."""
+    with pytest.raises(ConfigError) as caught:
+        task("half_packed", size=float, **packing)(double)
+    assert str(caught.value) == f"task half_packed: {said}"
+
+
+def test_a_tuple_holds_all_arguments_of_a_function_that_takes_several() -> None:
+    """For a function of one argument, a tuple is that argument."""
+
+    def one(first: Any) -> None: ...
+    def many(*all_of_them: Any) -> None: ...
+
+    task("arguments_one", size=lambda _: 0)(one)
+    task("arguments_many", size=lambda *_: 0)(many)
+    assert kind_named("arguments_one").arguments_in((1, 2)) == ((1, 2),)
+    assert kind_named("arguments_many").arguments_in((1, 2)) == (1, 2)
+    assert kind_of(double).arguments_in((1, 2)) == (1, 2)
+    assert kind_of(double).arguments_in([1, 2]) == ([1, 2],)
 
 
 @pytest.mark.parametrize("name", ["timeout_s", "where", "observe", "deadline_s", "function"])
@@ -155,7 +223,7 @@ async def later_one_by_one(number: float) -> AsyncIterator[float]:
 
 
 @pytest.mark.parametrize("function", [later, one_by_one, later_one_by_one, partial(later, 1.0)])
-@pytest.mark.parametrize("place", ["function", "size", "setup", "work", "warm"])
+@pytest.mark.parametrize("place", ["function", "size", "setup", "work", "warm", "pack", "unpack"])
 def test_coroutine_and_generator_functions_are_refused(place: str, function: Callable[..., Any]) -> None:
     """Calling one computes nothing, so every function of a task must be an ordinary one."""
     given: dict[str, Any] = {"function": double, "size": float, place: function}

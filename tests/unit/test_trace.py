@@ -18,8 +18,9 @@ from offboard.loadgen.robot_files import read_trace
 from offboard.robot_client.learning.regret import Regret
 from offboard.robot_client.learning.savings import Savings
 from offboard.robot_client.policies import Decision, Hedge, Outlook
+from offboard.robot_client.policies.forecast import Packing
 from offboard.robot_client.records.trace import WAITING_MAX, Late, Record, Trace
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution, Packed
 
 ROOT = Path(__file__).parents[2]
 
@@ -32,11 +33,22 @@ def record(i: int = 0) -> Record:
         size=1.5,
         sites={
             ONBOARD: Outlook(predicted_s=0.1, spread_s=0.01, full=True, age=3, low_s=0.08, high_s=0.15),
-            CLOUD: Outlook(failures=1, condition=Condition(round_trip_s=0.03, queue=2)),
+            CLOUD: Outlook(
+                failures=1,
+                condition=Condition(round_trip_s=0.03, queue=2),
+                packing=Packing((1,), 2000, 500.0, 0.25),
+            ),
         },
         decision=Decision(CLOUD, "cloud 1 ms against onboard 2 ms", "paper", second=Hedge(ONBOARD, 0.5)),
         executions=(
-            Execution(CLOUD, 2.0, failure=CloudTimeout("late"), censored=True, bytes_out=10),
+            Execution(
+                CLOUD,
+                2.0,
+                failure=CloudTimeout("late"),
+                censored=True,
+                bytes_out=10,
+                packed=(Packed(1, "zstd", 2000, bytes=400, seconds=0.2),),
+            ),
             Execution(ONBOARD, 0.1, queue_s=0.0, run_s=0.1, network_s=0.0, cpu_s=0.02),
         ),
         used=ONBOARD,
@@ -82,6 +94,7 @@ def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
                 "age": 3,
                 "failures": 0,
                 "quality": None,
+                "packing": None,
             },
             "cloud": {
                 "predicted_s": None,
@@ -91,6 +104,7 @@ def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
                 "age": 0,
                 "failures": 1,
                 "quality": None,
+                "packing": {"compress": [1], "raw_bytes": 2000, "bytes": 500.0, "seconds": 0.25},
             },
         },
         "decision": {
@@ -116,6 +130,7 @@ def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
                 "cpu_s": None,
                 "bytes_out": 10,
                 "bytes_in": 0,
+                "packed": [{"argument": 1, "how": "zstd", "raw_bytes": 2000, "bytes": 400, "seconds": 0.2}],
             },
             {
                 "site": "onboard",
@@ -129,6 +144,7 @@ def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
                 "cpu_s": 0.02,
                 "bytes_out": 0,
                 "bytes_in": 0,
+                "packed": [],
             },
         ],
         "used": "onboard",

@@ -15,6 +15,7 @@ from hypothesis.extra import numpy as arrays
 from offboard.common.errors import BadValue, ProtocolError
 from offboard.common.wire import messages as wire
 from offboard.common.wire import values
+from offboard.common.wire.compression import compress
 from tests.wire_values import Pose
 
 DIGEST = bytes(range(32))
@@ -86,6 +87,61 @@ def assert_same(got: Any, wanted: Any) -> None:
     else:
         assert type(got) is type(wanted)
         assert got == wanted
+
+
+def compressed(*arrays: np.ndarray[Any, Any]) -> wire.Body:
+    """The body of a call whose arrays are all sent compressed."""
+    return wire.encode(list(arrays), blobs=True, along=lambda _, raw: compress(raw))
+
+
+def test_a_compressed_array_has_the_extension_code_4() -> None:
+    """It names its frame, dtype and shape as an array that is not compressed, and comes back equal."""
+    array = np.arange(20_000).reshape(100, 200)
+    body = compressed(array)
+    assert bytes(body.frames[0]).hex() == "91" + "c70a04" + "9301a33c693892" + "64ccc8"
+    assert len(body.frames[1]) < array.nbytes / 2
+    assert_same(wire.decode([bytes(frame) for frame in body.frames], [], {}), [array])
+
+
+def test_the_place_of_an_array_among_the_arguments_is_told() -> None:
+    """Also if it is deep inside an argument, or becomes a blob."""
+    seen = []
+
+    def along(argument: int, raw: memoryview) -> memoryview | None:
+        seen.append((argument, raw.nbytes))
+        return raw if argument == 1 else None
+
+    first, second, third = (np.full(10_000 + n, 0.5) for n in range(3))
+    body = wire.encode([1, {"a": [second]}, "x", Pose(third, 0, [first])], [Pose], blobs=True, along=along)
+    assert seen == [(1, second.nbytes), (3, third.nbytes), (3, first.nbytes)]
+    assert list(body.arguments.values()) == [3, 3]
+    assert body.arguments.keys() == body.blobs.keys()
+
+
+def test_compressed_arrays_are_limited_together() -> None:
+    """A few bytes cannot make the reader take more than DECOMPRESSED_BYTES_MAX of memory."""
+    most = values.DECOMPRESSED_BYTES_MAX
+    wire.decode(compressed(np.zeros(most // 2, np.uint8), np.ones(most // 2, np.uint8)).frames, [], {})
+    bombs = [
+        compressed(np.zeros(most + 1, np.uint8)),
+        compressed(*(np.zeros(most // 4 + n, np.uint8) for n in range(4))),
+    ]
+    tracemalloc.start()
+    for body in bombs:
+        with pytest.raises(ProtocolError, match=f"compressed arrays of more than {most} bytes"):
+            wire.decode(body.frames, [], {})
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1.5 * most
+
+
+@pytest.mark.parametrize("shape", [[19_999], [20_001], [2**62], [2**40, 2**40], [0]])
+def test_a_compressed_array_of_another_shape_is_refused(shape: list[int]) -> None:
+    """The shape says how many bytes there must be."""
+    body = compressed(np.arange(20_000))
+    place = msgpack.ExtType(4, msgpack.packb((1, "<i8", shape)))
+    with pytest.raises(ProtocolError):
+        wire.decode([msgpack.packb([place]), body.frames[1]], [], {})
 
 
 def test_tuples_and_numpy_scalars_become_lists_and_numbers() -> None:

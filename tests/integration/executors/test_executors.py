@@ -63,6 +63,31 @@ def test_what_a_task_raises_is_its_outcome(
     assert value(run(executor, "exec_echo", 1)) == 1
 
 
+def test_a_kind_that_packs_gets_its_arguments_unpacked(executor: Executor) -> None:
+    """The one value that was sent becomes all arguments."""
+    assert value(run(executor, "exec_packed", {"a": 1, "b": [2]})) == [1, [2]]
+
+
+@pytest.mark.parametrize(
+    ("kind", "args", "error"),
+    [
+        ("exec_bad_unpack", ["x"], "unpack of task exec_bad_unpack: ValueError: no picture: x"),
+        ("exec_packed", [3], "unpack of task exec_packed: TypeError: 'int' object is not subscriptable"),
+        ("exec_packed", [1, 2], "2 values for unpack of task exec_packed, which takes one"),
+        ("exec_few_unpacked", [3], "unpack of task exec_few_unpacked returns other arguments: missing a"),
+    ],
+)
+def test_a_failing_unpack_is_a_fault_of_the_server(
+    executor: Executor, kind: str, args: list[Any], error: str
+) -> None:
+    """Onboard then answers. If the code of the user raised, its traceback is kept for the log."""
+    outcome = run(executor, kind, *args)
+    assert (outcome.status, outcome.server_fault) == ("failed", True)
+    assert outcome.error.startswith(f"ProtocolError: {error}")
+    assert ("in raise_value_error" in outcome.traceback) == (kind == "exec_bad_unpack")
+    assert value(run(executor, "exec_echo", 1)) == 1
+
+
 OTHER_FIELDS = bytes(encode([Pose(1, 2, [])], [Pose]).frames[0])  # here, Pose has x only
 
 

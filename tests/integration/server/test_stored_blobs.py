@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from offboard.cloud_server.executors import EXECUTORS
+from offboard.common.wire.compression import compress
 from offboard.common.wire.messages import Blob
-from tests.integration.server.peers import Join, Serve
+from tests.integration.server.peers import Join, Serve, until
 
 pytestmark = pytest.mark.integration
 
@@ -41,6 +42,38 @@ def test_stored_blobs_are_bounded(serve: Serve, join: Join) -> None:
     assert peer.value(20, "served_sum", arrays[3]) == arrays[3].sum()
     peer.request(21, "served_sum", arrays[0])
     assert peer.reply().status == "need_blob"
+
+
+def test_a_compressed_blob_is_kept_whole(serve: Serve, join: Join) -> None:
+    """Its digest is that of the decompressed bytes, and these count as kept."""
+    running = serve()
+    peer, array = join(running.server.endpoint), np.arange(50_000.0)
+    peer.send(Blob(compress(array.data.cast("B")), array.nbytes))
+    assert peer.value(1, "served_sum", array) == array.sum()
+    assert running.counted("blob_bytes") == array.nbytes
+
+
+@pytest.mark.parametrize("size", [1, 399_999, 400_001, 2**20 + 1, 2**31 - 1])
+def test_a_compressed_blob_of_another_size_is_dropped(serve: Serve, join: Join, size: int) -> None:
+    """It may neither be more nor less than announced, nor more than a message may have."""
+    running = serve()
+    peer, array = join(running.server.endpoint), np.arange(50_000.0)
+    peer.send(Blob(compress(array.data.cast("B")), size))
+    peer.request(1, "served_sum", array)
+    assert peer.reply().status == "need_blob"
+    assert running.counted("dropped_total", reason="malformed") == 1
+    assert running.counted("blob_bytes") == 0
+
+
+def test_a_compressed_blob_counts_with_all_its_bytes(serve: Serve, join: Join) -> None:
+    """Otherwise a robot could make the server hash far more than it may send."""
+    running = serve(robot_bytes_per_s=2**20)
+    peer = join(running.server.endpoint)
+    for n in range(3):
+        array = np.full(100_000, float(n))
+        peer.send(Blob(compress(array.data.cast("B")), array.nbytes))
+    until(lambda: running.counted("dropped_total", reason="quota") == 2)
+    assert running.counted("blob_bytes") == 800_000
 
 
 def test_a_waiting_request_keeps_its_blobs(serve: Serve, join: Join, pipe: Path) -> None:
