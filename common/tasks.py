@@ -34,7 +34,8 @@ class Kind:
     same length (each finite, >= 0). `types` are the dataclasses that arguments and result may contain. `warm`
     is called once per process before the first task. A kind with `duplicate=False` never runs on two sites.
     `work` maps a result to the amount of work that it took, in any unit. `setup` is called once per worker;
-    its result is the first argument of the function, which callers do not give.
+    its result is the first argument of the function, which callers do not give. `policy_server`: a policy
+    server may answer too.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Kind:
     work: Callable[[Any], float] | None = None
     positional: int | None = None  # a call with this many positional arguments needs no binding
     setup: Callable[[], Any] | None = None
+    policy_server: bool = False
     _counts: list[int] = field(default_factory=list, compare=False, repr=False)  # the first one holds for all
 
     def bind(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:
@@ -128,6 +130,7 @@ def task(
     warm: Callable[[], None] | None = None,
     work: Callable[[Any], float] | None = None,
     setup: Callable[[], Any] | None = None,
+    policy_server: bool = False,
 ) -> Callable[[F], F]:
     """Register a function as a kind of task. It can still be called as an ordinary function.
 
@@ -135,6 +138,8 @@ def task(
     differs between them, the task stays onboard.
     If `size` returns several numbers, the predictor `least-squares` uses all of them, and every other one
     uses the first; `parts` predicts from the work instead if the kind tells it (by the first number too).
+    With `policy_server`, policy servers may answer too: the function takes one observation and returns an
+    action, and no source is compared.
     """
     if not name or len(name) > NAME_LENGTH_MAX or not name.isidentifier():
         raise ConfigError(f"task name {name!r} is not an identifier of at most {NAME_LENGTH_MAX} characters")
@@ -152,10 +157,14 @@ def task(
         _check_parameters(name, parameters)
         fixed = all(parameter.kind != parameter.VAR_POSITIONAL for parameter in parameters)
         count = len(parameters) if fixed else None
+        if policy_server and count != 1:
+            raise ConfigError(
+                f"task {name}: policy_server=True needs a function of one argument, the observation"
+            )
         kind = Kind(
             name, function, size, duplicate,
             types=tuple(types), warm=warm, source_hash=_source_hash(function, setup, types), work=work,
-            positional=count, setup=setup,
+            positional=count, setup=setup, policy_server=policy_server,
         )  # fmt: skip
         known = _kinds.get(name)
         if known is not None:

@@ -111,7 +111,8 @@ class Offloader:
     ) -> Self:
         """An offloader for onboard, a server `cloud` at `endpoint` (tcp://HOST:PORT), and further servers.
 
-        `sites`: the endpoint of each further server, by name.
+        `sites`: the endpoint of each further server, by name; that of a policy server is ws://HOST:PORT or
+        wss://HOST:PORT.
         `policy`: the name of a policy; caps in the settings add the wrapper `budget` to it.
         `window`: observations of each kind on each site that predictions rest on.
         `timeout_s`: how long a server has for a task before the task runs onboard, in seconds.
@@ -120,9 +121,7 @@ class Offloader:
         `observers`: called with the record of every task. `settings`: options that few robots need.
         `metrics`: HOST:PORT where Prometheus reads `/metrics`. `trace`: the file that gets every record.
         """
-        from offboard.robot_client.sites.make_runners import (
-            make_runners,  # zmq is loaded only for a connection
-        )
+        from offboard.robot_client.make_runners import make_runners  # zmq is loaded only for a connection
 
         check_types(cls.connect, locals())
         rare = settings or Settings()
@@ -132,9 +131,7 @@ class Offloader:
         with ExitStack() as opened:
             recording = Recording(trace=trace, metrics=metrics)
             opened.callback(recording.close)
-            runners = make_runners(
-                servers, keys=keys, heartbeat_s=heartbeat_s, seed=rare.seed, states=rare.states
-            )
+            runners = make_runners(servers, keys=keys, heartbeat_s=heartbeat_s, settings=rare)
             for runner in runners:
                 opened.callback(runner.close)
             offload = cls(

@@ -37,6 +37,7 @@ class Settings:
     `joules_a_minute`: the most joules that tasks may take in a minute (None: no cap).
     `memory`: the file in which what was learnt outlives the process (None: a new process knows nothing).
     `states`: what setups make; offloaders of one process that share it load each model once (None: its own).
+    `insecure`: whether a policy server beyond this computer may be used by ws://, which is not encrypted.
     `seed`: for policies and predictors that draw; the same seed draws the same numbers.
     """
 
@@ -49,6 +50,7 @@ class Settings:
     joules_a_minute: float | None = None
     memory: Path | str | None = None
     states: TaskStates | None = None
+    insecure: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -13,7 +13,7 @@ FOLDER_FILES_MAX = {"cloud_server": 18}
 FILES_MAX = 14
 MODULE_LINES_MAX = 400
 TEST_LINES_MAX = 400
-ROBOT_LINES_MAX = 7_000
+ROBOT_LINES_MAX = 7_700
 GLOSSARY_MAX = 60
 FLAGS_MAX = 16
 
@@ -48,7 +48,7 @@ def test_files_are_short() -> None:
 
 
 def test_what_a_robot_installs_is_small() -> None:
-    """`robot_client` has at most 6,500 lines."""
+    """`robot_client` has at most ROBOT_LINES_MAX lines."""
     assert sum(one.lines for one in MODULES if one.path.parts[0] == "robot_client") <= ROBOT_LINES_MAX
 
 
