@@ -105,7 +105,9 @@ class PolicyServerRunner:
             failure = CannotCross(f"observation: {why}")
             self._pauses.note(task.kind.name, failure, published_s)
             return self._refused(failure)
-        observation = Observation(self.site, task, data, published_s, published_s + budget_s)
+        observation = Observation(
+            self.site, task, data, published_s=published_s, deadline_s=published_s + budget_s
+        )
         with self._lock:
             if self._closed:
                 observation.future.cancel()
