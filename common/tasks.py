@@ -49,6 +49,7 @@ class Kind:
 
     `variants` holds a kind for each site, if sites run different functions, with the `quality` of its answers
     from 0 to 1. `source_hash` then covers what they have in common: parameters, dataclasses, pack and unpack.
+    `policy_server`: a policy server may answer too.
     """
 
     name: str
@@ -65,6 +66,7 @@ class Kind:
     quality: float = 1.0
     pack: Callable[..., Any] | None = None
     unpack: Callable[[Any], Any] | None = None
+    policy_server: bool = False
     _counts: list[int] = field(default_factory=list, compare=False, repr=False)  # the first one holds for all
 
     def bind(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:
@@ -178,6 +180,7 @@ def task(
     quality: Mapping[str, float] | None = None,
     pack: Callable[..., Any] | None = None,
     unpack: Callable[[Any], Any] | None = None,
+    policy_server: bool = False,
 ) -> Callable[[F], F]:
     """Register a function as a kind of task. It can still be called as an ordinary function.
 
@@ -189,6 +192,9 @@ def task(
     `variants`: the function of each site that does not run the decorated one; None: this computer does not
     have it. `quality`: how good the answers of each site are, from 0 to 1. With variants, `setup` may be a
     dictionary by site too.
+
+    With `policy_server`, policy servers may answer too: the function takes one observation and returns an
+    action, and no source is compared.
     """
     if not isinstance(name, str) or len(name) > NAME_LENGTH_MAX or not name.isidentifier():
         raise ConfigError(f"task name {name!r} is not an identifier of at most {NAME_LENGTH_MAX} characters")
@@ -209,10 +215,13 @@ def task(
         check_parameters(name, parameters)
         fixed = all(parameter.kind != parameter.VAR_POSITIONAL for parameter in parameters)
         count = len(parameters) if fixed else None
+        if policy_server and (count != 1 or pack is not None):
+            needs = "a function of one argument, the observation, and no pack="
+            raise ConfigError(f"task {name}: policy_server=True needs {needs}")
         kind = Kind(
             name, function, size, duplicate,
             types=tuple(types), warm=warm, source_hash=source_hash(function, own, types, pack, unpack),
-            work=work, positional=count, setup=own, pack=pack, unpack=unpack,
+            work=work, positional=count, setup=own, pack=pack, unpack=unpack, policy_server=policy_server,
         )  # fmt: skip
         if found:
             kind = _with_variants(kind, found)

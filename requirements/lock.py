@@ -13,6 +13,9 @@ EXTRAS = {
     "examples": ["examples", "bench"],
 }
 
+# Environments of tests only.
+PEERS = ("openpi",)
+
 OPTIONS = (
     *("--quiet", "--universal", "--python-version", "3.11", "--generate-hashes", "--upgrade"),
     *("--no-emit-index-url", "--no-emit-find-links", "--no-header", "--no-annotate"),
@@ -22,3 +25,6 @@ for name, extras in EXTRAS.items():
     chosen = [part for extra in extras for part in ("--extra", extra)]
     out = ("--output-file", str(HERE / f"{name}.txt"), str(HERE.parent / "pyproject.toml"))
     subprocess.run(["uv", "pip", "compile", *OPTIONS, *chosen, *out], check=True)
+for name in PEERS:
+    files = ("--output-file", str(HERE / f"{name}.txt"), str(HERE / f"{name}.in"))
+    subprocess.run(["uv", "pip", "compile", *OPTIONS, *files], check=True)

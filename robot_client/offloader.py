@@ -118,7 +118,8 @@ class Offloader:
     ) -> Self:
         """An offloader for onboard, a server `cloud` at `endpoint` (tcp://HOST:PORT), and further servers.
 
-        `sites`: the endpoint of each further server, by name.
+        `sites`: the endpoint of each further server, by name; that of a policy server is ws://HOST:PORT or
+        wss://HOST:PORT.
         `policy`: the name of a policy; caps in the settings add the wrapper `budget` to it.
         `timeout_s`: how long a server has for a task before the task runs onboard, in seconds.
         `keys`: the folder of `robot-client keys`, with the public key of each server in NAME.key or
@@ -127,13 +128,15 @@ class Offloader:
         `metrics`: HOST:PORT where Prometheus reads `/metrics`. `trace`: the file that gets every record.
         `observe`: answer every task onboard, and estimate what the policy would save (`savings`).
         """
+        from offboard.robot_client.make_runners import make_runners  # zmq is loaded only for a connection
+
         check_types(cls.connect, locals())
         rare = settings or Settings()
         chosen, memories = rare.make_policy(policy), rare.make_memories(policy)
         with ExitStack() as opened:
             recording = Recording(trace=trace, metrics=metrics)
             opened.callback(recording.close)
-            runners = rare.make_runners(endpoint, sites or {}, keys, policy)
+            runners = make_runners(endpoint, sites or {}, keys=keys, policy=policy, settings=rare)
             for runner in runners:
                 opened.callback(runner.close)
             offload = cls(

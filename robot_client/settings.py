@@ -24,7 +24,6 @@ from offboard.robot_client.policies.decision import Named
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.objectives import S_PER_QUALITY, Mean, Objective
 from offboard.robot_client.predictors.window import WINDOW, checked_length
-from offboard.robot_client.sites.runner import Runner
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,6 +42,7 @@ class Settings:
     `memory`: the file in which what was learnt outlives the process (None: a new process knows nothing).
     `compress`: whether large arguments are compressed where that should save time.
     `states`: what setups make; offloaders of one process that share it load each model once (None: its own).
+    `insecure`: whether a policy server beyond this computer may be used by ws://, which is not encrypted.
     `seed`: for policies and predictors that draw; the same seed draws the same numbers.
     """
 
@@ -58,6 +58,7 @@ class Settings:
     memory: Path | str | None = None
     compress: bool = True
     states: TaskStates | None = None
+    insecure: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -81,23 +82,6 @@ class Settings:
     def beats(self, policy: str) -> bool:
         """Whether the servers are sent heartbeats."""
         return policies.heartbeats(policy) if self.heartbeats is None else self.heartbeats
-
-    def make_runners(
-        self, endpoint: str | None, sites: Mapping[str, str], keys: Path | str | None, policy: str
-    ) -> list[Runner]:
-        """Connected runners: of the server at `endpoint`, of each further one in `sites`, and of onboard."""
-        from offboard.robot_client.sites.heartbeat import EVERY_S
-        from offboard.robot_client.sites.make_runners import make_runners  # loads zmq
-
-        return make_runners(
-            endpoint,
-            sites,
-            keys=keys,
-            heartbeat_s=EVERY_S if self.beats(policy) else 0.0,
-            seed=self.seed,
-            states=self.states,
-            compress=self.compress,
-        )
 
     def make_memories(self, policy: str) -> Memories:
         """What is known of each kind: nothing yet, or what the file `memory` holds.

@@ -102,12 +102,13 @@ def make_context(where: str) -> "zmq.Context[zmq.Socket[bytes]]":
 
     libzmq ends the process if it lacks one while a context is made.
     """
-    _check_room(where)
+    check_room(where)
     zmq.Frame(bytes(zmq.COPY_THRESHOLD))  # pyzmq makes a context for large messages: now, as there is room
     return zmq.Context()
 
 
-def _check_room(where: str) -> None:
+def check_room(where: str) -> None:
+    """OffloadError if this process lacks files or threads for a connection."""
     pipes: list[int] = []
     over = threading.Event()
     threads = [threading.Thread(target=over.wait, daemon=True) for _ in range(THREADS)]

@@ -118,7 +118,7 @@ def _run_tasks(
 def _connect(
     config: RobotConfig, states: TaskStates, settings: Settings | None = None, **options: Any
 ) -> Offloader:
-    own = replace(settings or Settings(), states=states)
+    own = replace(settings or Settings(), states=states, insecure=config.insecure)
     return Offloader.connect(
         config.cloud, timeout_s=config.timeout_s, keys=config.keys, settings=own, **options
     )

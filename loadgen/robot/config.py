@@ -9,7 +9,8 @@ from offboard.common.planning.planner_names import DIJKSTRA, PLANNERS
 from offboard.loadgen.robot.decision_settings import DecisionSettings
 from offboard.loadgen.robot.run_settings import RunSettings
 from offboard.loadgen.robot.workload import CLOSED, SIZES_ALLOWED, parse_sizes
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, TIMEOUT_S, check_endpoint
+from offboard.robot_client.openpi.endpoint import check_site
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, TIMEOUT_S
 
 SERVERS, PLANS, CALLS = "servers", "map and robot", "task"
 
@@ -26,7 +27,7 @@ class ServerSettings:
     )
     site: tuple[str, ...] = setting(
         (),
-        "a further server, with a name; repeat the flag for more",
+        "a further server, with a name; ws:// or wss:// is a policy server; repeat the flag for more",
         group=SERVERS,
         rare=True,
         metavar="NAME=ENDPOINT",
@@ -37,6 +38,13 @@ class ServerSettings:
         "NAME.key for the server of --site NAME); without it, nothing is encrypted",
         group=SERVERS,
         metavar="DIR",
+    )
+    insecure: bool = setting(
+        False,
+        "allow ws:// to a policy server beyond this computer: anyone on the way can read and change what is "
+        "sent",
+        group=SERVERS,
+        rare=True,
     )
     timeout_s: float = setting(
         TIMEOUT_S,
@@ -58,7 +66,7 @@ class ServerSettings:
 
     def check_servers(self) -> None:
         if self.cloud is not None:
-            check_endpoint("--cloud", self.cloud)
+            check_site("--cloud", self.cloud, insecure=self.insecure)
         if self.keys is not None and self.cloud is None and not self.site:
             raise ConfigError(f"--keys: {self.keys} needs --cloud, the server to use")
         self.sites()
@@ -69,10 +77,10 @@ class ServerSettings:
         for entry in self.site:
             name, equals, endpoint = entry.partition("=")
             if not (equals and name.isidentifier()):
-                raise ConfigError(f"--site: {entry!r} is not NAME=tcp://HOST:PORT")
+                raise ConfigError(f"--site: {entry!r} is not NAME=tcp://HOST:PORT or NAME=ws://HOST:PORT")
             if name in (ONBOARD, CLOUD, *found):
                 raise ConfigError(f"--site: {entry!r}: the name {name!r} is already taken")
-            check_endpoint(f"--site {name}", endpoint)
+            check_site(f"--site {name}", endpoint, insecure=self.insecure)
             found[name] = endpoint
         return found
 

@@ -50,7 +50,8 @@ class CrossingPauses:
         left_s = until_s - time.perf_counter()
         if left_s <= 0:
             return None
-        return f"the values of the last {calls} calls of {kind} could not be sent; next try in {left_s:.0f} s"
+        why = f"the last {calls} calls of {kind} could not be sent, or their answers not be read"
+        return f"{why}; next try in {left_s:.0f} s"
 
 
 def difference(kind: Kind, site: str, there: Mapping[str, str]) -> str | None:

@@ -23,6 +23,7 @@ FOLDERS: dict[str, set[str]] = {
     "common/security": {"common"},
     "common/host": set(),
     "robot_client/sites": set(),
+    "robot_client/openpi": {"robot_client/sites"},
     "robot_client/predictors": {"robot_client/sites"},
     "robot_client/policies": {"robot_client/predictors", "robot_client/sites"},
     "robot_client/learning": {"robot_client/policies", "robot_client/predictors", "robot_client/sites"},
@@ -36,6 +37,7 @@ FOLDERS: dict[str, set[str]] = {
     "robot_client": {  # the offloader
         "robot_client/execution",
         "robot_client/learning",
+        "robot_client/openpi",
         "robot_client/policies",
         "robot_client/predictors",
         "robot_client/records",
@@ -104,6 +106,7 @@ OWNERS = {
         "loadgen/relay/control_api.py",
     },
     "docker": {"loadgen/testbed/docker_engine.py"},
+    "websockets": {"robot_client/openpi/web_socket.py"},
     "numba": {"common/planning/compiled.py"},
     "PIL": {"common/planning/map_files.py"},
     "yaml": {"common/planning/map_files.py"},
@@ -216,7 +219,7 @@ def test_the_robot_library_needs_no_extra() -> None:
     block = (
         "import sys\n"
         "for name in ('fastapi', 'uvicorn', 'docker', 'numba', 'PIL', 'yaml', 'httpx', 'rich',\n"
-        "             'sklearn', 'statsmodels', 'river', 'torch', 'scipy', 'pandas'):\n"
+        "             'sklearn', 'statsmodels', 'river', 'torch', 'scipy', 'pandas', 'websockets'):\n"
         "    sys.modules[name] = None\n"
         "import offboard, offboard.robot_client.sites.cloud, offboard.robot_client.records.metrics\n"
         "print(offboard.Offloader.__name__)\n"
@@ -238,7 +241,18 @@ def test_the_robot_library_needs_no_extra() -> None:
 )
 def test_help_loads_no_heavy_library(command: str) -> None:
     """--help answers with exit code 0 without importing numpy, zmq, numba, fastapi or what learns."""
-    heavy = ("numpy", "zmq", "numba", "fastapi", "sklearn", "statsmodels", "river", "torch", "scipy")
+    heavy = (
+        "numpy",
+        "zmq",
+        "numba",
+        "fastapi",
+        "sklearn",
+        "statsmodels",
+        "river",
+        "torch",
+        "scipy",
+        "websockets",
+    )
     package, *words = command.split()
     probe = (
         "import runpy, sys\n"

@@ -106,7 +106,7 @@ at_most = 1
         ),
         (
             ["loadgen", "drive", "--map", "m.yaml", "--site", "edge"],
-            "--site: 'edge' is not NAME=tcp://HOST:PORT",
+            "--site: 'edge' is not NAME=tcp://HOST:PORT or NAME=ws://HOST:PORT",
         ),
         (
             ["loadgen", "drive", "--map", "m.yaml", "--trace", "t", "--alone", "3"],

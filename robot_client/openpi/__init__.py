@@ -1,0 +1,1 @@
+"""Policy servers that speak the openpi protocol: they answer an observation with an action."""

@@ -1,0 +1,1 @@
+"""Robots and policy servers that speak the openpi protocol."""
