@@ -20,7 +20,7 @@ from offboard.common.errors import ConfigError
 from offboard.common.tasks import Task, kind_of
 from offboard.robot_client import policies
 from offboard.robot_client.execution.batch import Batch, Placed, arguments
-from offboard.robot_client.execution.choice import check_where, decided, pinned, plan_of
+from offboard.robot_client.execution.choice import check_where, decided, pinned
 from offboard.robot_client.execution.crossing_check import CrossingCheck
 from offboard.robot_client.execution.race import answer_of
 from offboard.robot_client.learning.forecaster import Forecaster

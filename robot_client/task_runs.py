@@ -64,7 +64,9 @@ class TaskRuns:
             late=partial(self._ended_late, pending),
         )
         plan = plan_of(decision, pending.forecast, pending.call)
-        if plan.all and decision.policy != PINNED:  # a measurement is the choice of the caller, not of the policy
+        if (
+            plan.all and decision.policy != PINNED
+        ):  # a measurement is the choice of the caller, not of the policy
             self._take_duplicates(len(plan.first) - 1)
         try:
             return race.run(plan)

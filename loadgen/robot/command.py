@@ -79,7 +79,6 @@ def _run_tasks(
                 states=states,
                 sites=sites,
                 policy=config.policy,
-                window=config.window,
                 settings=config.settings(config.seed),
                 observers=[own, *observers],
             )

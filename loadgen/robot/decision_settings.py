@@ -152,6 +152,7 @@ class DecisionSettings:
         """The rare options of the offloader."""
         return Settings(
             predictor=self.predictor,
+            window=self.window,
             heartbeats=self.heartbeats,
             objective=objectives.make(self.objective, deadline_s=self.deadline_s, s_a_joule=self.s_per_joule),
             s_per_quality=self.s_per_quality,

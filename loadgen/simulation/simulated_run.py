@@ -84,14 +84,16 @@ class _Run:
         self._queue: deque[tuple[int, float]] = deque()  # tasks that are due, while too many are in flight
         robot = scenario.robot
         policy, predictor = robot.names()
-        settings = Settings(predictor=predictor, heartbeats=robot.heartbeats, seed=scenario.seed)
+        settings = Settings(
+            predictor=predictor, window=robot.window, heartbeats=robot.heartbeats, seed=scenario.seed
+        )
         heartbeat_s = heartbeat.EVERY_S if settings.beats(policy) else 0.0
         self._testbed = SimulatedTestbed(scenario, tasks, self._clock, heartbeat_s=heartbeat_s, noise=noise)
         self._own = OwnRecord()
         self.offload = Offloader(
             [self._testbed.cloud, self._testbed.onboard],
             policy=settings.make_policy(policy),
-            memories=settings.make_memories(policy, robot.window),
+            memories=settings.make_memories(policy),
             timeout_s=robot.timeout_s,
             observers=[self._own],
             clock=self._clock,

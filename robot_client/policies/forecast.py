@@ -101,6 +101,8 @@ class Quality(NamedTuple):
 
 
 WHOLE = Quality()  # of every site, for a task without variants
+
+
 class Packing(NamedTuple):
     """What should be made smaller on the way to a site.
 

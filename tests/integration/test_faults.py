@@ -17,6 +17,7 @@ from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.loadgen.testbed.testbed import Setup
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.records.trace import Record
+from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.probes import echo, mark_once, nap, process_id, total, zeros
 
@@ -125,7 +126,7 @@ def test_an_outage_costs_no_task_and_the_cloud_is_used_after_it(testbed: Beds, c
 def test_the_published_rule_stays_onboard_after_an_outage(testbed: Beds, connect: Connect) -> None:
     """Algorithm 1 learns the lost times and never tries the cloud again; later policies do."""
     bed = testbed()
-    offload = connect(bed, policy="paper", window=5, timeout_s=TIMEOUT_S)
+    offload = connect(bed, policy="paper", settings=Settings(window=5), timeout_s=TIMEOUT_S)
     for _ in range(10):
         offload(nap, ONBOARD_S)
     bed.set_link(outage=True)

@@ -32,10 +32,10 @@ def where_am_i() -> int:
 
 PROGRAM = """
 import asyncio, os, sys
-from offboard import Offloader
+from offboard import Offloader, Settings
 from mytasks import count_primes, where_am_i
 
-with Offloader.connect(sys.argv[1], window=5) as offload:
+with Offloader.connect(sys.argv[1], settings=Settings(window=5)) as offload:
     assert offload.wait_for_sites(count_primes, 20.0) == {}
     print([offload(count_primes, 1000) for _ in range(8)][-1], offload.last.decision.reason)
     print(*[offload(where_am_i, where=site) == os.getpid() for site in ("onboard", "cloud")])

@@ -331,7 +331,7 @@ def test_a_batch_leaves_out_a_silent_site() -> None:
     offload = Offloader(
         [cloud, ScriptedRunner(ONBOARD, answers(ONBOARD, 1.0))],
         policy=policies.make(policies.DEFAULT),
-        memories=Settings().make_memories(policies.DEFAULT, 20),
+        memories=Settings(window=20).make_memories(policies.DEFAULT),
     )
     with offload:
         warm(offload)

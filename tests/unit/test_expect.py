@@ -38,7 +38,7 @@ class Robot:
         self.offload = Offloader(
             list(self.sites.values()),
             policy=policies.make(policies.DEFAULT),
-            memories=Settings().make_memories(policies.DEFAULT, 50),
+            memories=Settings().make_memories(policies.DEFAULT),
             allowance=self.allowance,
             clock=self.clock,
         )
@@ -98,7 +98,7 @@ def test_a_site_that_cannot_take_the_task_says_why() -> None:
     """Its expectation has the reason, and prints as it."""
     cloud = ScriptedRunner(CLOUD, lambda _: Execution(CLOUD, 0.1), unavailable="not connected")
     onboard = ScriptedRunner(ONBOARD, lambda _: Execution(ONBOARD, 0.1, 1.0))
-    memories = Settings().make_memories(policies.DEFAULT, 50)
+    memories = Settings().make_memories(policies.DEFAULT)
     with Offloader([cloud, onboard], policy=policies.make("greedy"), memories=memories) as offload:
         for _ in range(3):
             offload(expected_echo, 1.0)

@@ -73,7 +73,7 @@ def test_a_rule_of_a_user_is_named_like_any_other() -> None:
 def test_settings_and_scenarios_take_the_path() -> None:
     """A robot is made with it, and `loadgen` hands it to a robot as it is."""
     settings = Settings(predictor=CONSTANT)
-    assert settings.make_memories(BY_SIZE, 20)
+    assert settings.make_memories(BY_SIZE)
     assert settings.make_policy(BY_SIZE)
     assert (rivals.policy(f"probe:{BY_SIZE}"), rivals.predictor(CONSTANT)) == (f"probe:{BY_SIZE}", CONSTANT)
 

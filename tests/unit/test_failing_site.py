@@ -59,7 +59,7 @@ def make() -> Iterator[Callable[[str], Offloader]]:
             Offloader(
                 [ScriptedRunner(CLOUD, answer), OnboardRunner()],
                 policy=settings.make_policy(policy),
-                memories=settings.make_memories(policy, 50),
+                memories=settings.make_memories(policy),
                 observers=[bench.records.append],
             )
         )

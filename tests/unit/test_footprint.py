@@ -43,7 +43,7 @@ def offloader(policy: str) -> Offloader:
     return Offloader(
         [Forgetful(ONBOARD), Forgetful(CLOUD)],
         policy=policies.make(policy),
-        memories=Settings().make_memories(policy, 50),
+        memories=Settings().make_memories(policy),
     )
 
 

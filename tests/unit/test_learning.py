@@ -44,7 +44,7 @@ class Scene:
         self.sites = {site: VirtualRunner(site, self.clock) for site in (ONBOARD, CLOUD)}
         self.sites[CLOUD].fields = {"queue_s": 0.0, "run_s": RUN_S, "bytes_out": 1000}
         self.policy = Scripted()
-        self.memories = Settings().make_memories(policy, 50)
+        self.memories = Settings().make_memories(policy)
         self.offload = Offloader(
             list(self.sites.values()),
             policy=self.policy,

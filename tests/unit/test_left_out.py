@@ -98,5 +98,5 @@ def test_each_strategy_is_one_that_loadgen_knows() -> None:
 @pytest.mark.parametrize(("name", "per_work"), [("Tail", True), ("Work", False)])
 def test_a_subclass_of_the_model_learns_per_work_as_the_model_does(name: str, per_work: bool) -> None:
     """Its attribute `per_work` decides, so that only the mechanism in question differs."""
-    memories = Settings(predictor=f"benchmarks.left_out.{name}").make_memories("greedy", 20)
+    memories = Settings(predictor=f"benchmarks.left_out.{name}", window=20).make_memories("greedy")
     assert memories._shared_work is per_work

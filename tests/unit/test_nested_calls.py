@@ -96,12 +96,12 @@ def test_a_call_of_a_task_ends_with_a_cloud_too(policy: str, function: Callable[
     """Whichever site the nested calls are sent to, the answers are right."""
     bench.__init__()  # type: ignore[misc]
     bench.way = WAYS["call"]
-    settings = Settings()
+    settings = Settings(window=5)
     cloud = ScriptedRunner(CLOUD, lambda one: Execution(CLOUD, 0.01, one.args[0]))
     with Offloader(
         [cloud, OnboardRunner()],
         policy=settings.make_policy(policy),
-        memories=settings.make_memories(policy, 5),
+        memories=settings.make_memories(policy),
     ) as bench.offload:
         for number in range(20):
             assert bench.offload(function, number % 4) == number % 4

@@ -301,7 +301,7 @@ def test_no_answer_is_lost_among_random_faults(policy: str, seed: int) -> None:
     offload = Offloader(
         list(sites.values()),
         policy=policies.make(policy, seed),
-        memories=Settings().make_memories(policy, 20),
+        memories=Settings(window=20).make_memories(policy),
         timeout_s=TIMEOUT_S,
         observers=[records.append],
         clock=clock,

@@ -163,7 +163,7 @@ def test_what_an_observer_or_work_raises_costs_no_answer(
 @pytest.mark.usefixtures("fresh")
 def test_a_late_run_whose_work_cannot_be_read_ends_no_thread() -> None:
     """The worker whose answer came second still runs the next task."""
-    settings = Settings()
+    settings = Settings(window=5)
     gate, begun = threading.Event(), threading.Event()
 
     @task("late_work", size=float, work=fail)
@@ -179,7 +179,7 @@ def test_a_late_run_whose_work_cannot_be_read_ends_no_thread() -> None:
     with Offloader(
         [ScriptedRunner(CLOUD, script), onboard],
         policy=settings.make_policy("probe:cloud"),
-        memories=settings.make_memories("probe:cloud", 5),
+        memories=settings.make_memories("probe:cloud"),
     ) as offload:
         for _ in range(30):
             assert offload(late_work, 1) == 1

@@ -87,7 +87,7 @@ def test_table_replay_and_robot_predict_the_same(predictor: str, feedback: str) 
     played = Foretold(every=feedback == "full")
     replay_policy(rows, played, predictor=make, window=window, feedback=feedback)
     robot = Foretold(every=feedback == "full")
-    live(rows, robot, Settings(predictor=predictor).make_memories("paper", window), window)
+    live(rows, robot, Settings(predictor=predictor, window=window).make_memories("paper"), window)
     for one in (played, robot):
         assert [found[ONBOARD] for found in one.predicted_s] == pytest.approx(table[0].tolist(), rel=1e-9)
         assert [found[CLOUD] for found in one.predicted_s] == pytest.approx(table[1].tolist(), rel=1e-9)

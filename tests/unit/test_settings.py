@@ -65,7 +65,7 @@ def test_a_record_has_the_policy_as_the_user_named_it(name: str) -> None:
         with Offloader(
             [*sites, OnboardRunner()],
             policy=settings.make_policy(name),
-            memories=settings.make_memories(name, 5),
+            memories=settings.make_memories(name),
             observers=[lambda record: policies.append(record.decision.policy)],
         ) as offload:
             offload(echo, 1)
@@ -102,8 +102,6 @@ WRONG = [
     ({"sites": ["tcp://h:1"]}, "sites ['tcp://h:1']: must be a dictionary of strings or None"),
     ({"sites": {"edge": 5}}, "sites {'edge': 5}: must be a dictionary of strings or None"),
     ({"policy": None}, "policy None: must be a string"),
-    ({"window": "5"}, "window '5': must be a whole number"),
-    ({"window": 5.0}, "window 5.0: must be a whole number"),
     ({"timeout_s": "3"}, "timeout_s '3': must be a number"),
     ({"timeout_s": True}, "timeout_s True: must be a number"),
     ({"timeout_s": None}, "timeout_s None: must be a number"),
@@ -118,6 +116,8 @@ WRONG = [
 ]
 WRONG_SETTINGS = [
     ({"predictor": 5}, "predictor 5: must be a string or None"),
+    ({"window": "5"}, "window '5': must be a whole number"),
+    ({"window": 5.0}, "window 5.0: must be a whole number"),
     ({"heartbeats": "yes"}, "heartbeats 'yes': must be True or False or None"),
     ({"objective": "p95"}, "objective 'p95': must be Objective"),
     ({"s_per_quality": "1"}, "s_per_quality '1': must be a number"),
@@ -127,6 +127,8 @@ WRONG_SETTINGS = [
     ({"joules_a_minute": []}, "joules_a_minute []: must be a number or None"),
     ({"memory": 5}, "memory 5: must be a path or a string or None"),
     ({"states": 5}, "states 5: must be TaskStates or None"),
+    ({"compress": "no"}, "compress 'no': must be True or False"),
+    ({"insecure": 1}, "insecure 1: must be True or False"),
     ({"seed": "1"}, "seed '1': must be a whole number"),
 ]
 
@@ -160,7 +162,7 @@ def test_a_missing_or_ambiguous_server_is_one_error_of_connect(given: dict[str, 
 def test_a_wrong_window_is_an_error_of_connect(policy: str) -> None:
     """Also with a predictor that has no window."""
     with pytest.raises(ConfigError, match=r"^window 1: must be from 2 to 1000000$"):
-        Offloader.connect(policy=policy, window=1)
+        Offloader.connect(policy=policy, settings=Settings(window=1))
 
 
 @pytest.mark.parametrize(("given", "says"), WRONG_SETTINGS)
@@ -182,10 +184,9 @@ def test_every_parameter_is_checked() -> None:
 def test_right_types_are_taken(tmp_path: Path) -> None:
     """Paths may be strings, and numbers may be those of numpy."""
     memory, trace = tmp_path / "memory.json", tmp_path / "trace.jsonl"
-    settings = Settings(memory=str(memory), duplicates=np.float32(0.1), seed=np.int64(3))  # type: ignore[arg-type]
+    settings = Settings(memory=str(memory), window=np.int16(5), duplicates=np.float32(0.1), seed=np.int64(3))  # type: ignore[arg-type]
     observers: Any = (record for record in [print])
     with Offloader.connect(
-        window=np.int16(5),
         timeout_s=3,
         trace=str(trace),
         settings=settings,

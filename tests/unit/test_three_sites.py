@@ -55,7 +55,7 @@ def test_the_best_living_site_is_used_soon_after_each_change(
     with Offloader(
         [*servers, runner(ONBOARD)],
         policy=policies.make(policies.DEFAULT),
-        memories=Settings().make_memories(policies.DEFAULT, 50),
+        memories=Settings().make_memories(policies.DEFAULT),
         observers=[records.append],
     ) as offload:
         for fail, _ in PHASES:
