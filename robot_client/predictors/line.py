@@ -102,9 +102,10 @@ class Line:
         self._usual = unit = y + known or 1.0
         half = uncertain = 0.5 * y if x > 0 else 0.0
         if self.slope is not None:
+            half = max(half, NOISE * unit)  # of a short time, noise may hide as much
             half, uncertain = min(half, self.slope), min(half, SLOPES * self.slope)
         self.b = half
-        self.a = y - self.b * x
+        self.a = max(0.0, y - self.b * x)
         square = uncertain * uncertain
         self._paa, self._pab, self._pbb = square * x * x + self._noise * unit * unit, -square * x, square
 

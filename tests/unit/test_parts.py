@@ -69,6 +69,20 @@ def test_nothing_is_known_before_the_first_run() -> None:
         assert (model.full, len(model)) == (n >= WARM_UP, n)
 
 
+def test_a_first_answer_without_payload_says_nothing_of_the_rate() -> None:
+    """It takes one round trip. The link counts as one of 100 Mbit/s until a payload tells its true rate."""
+    model, payload = Parts(remote=True), 1e6
+    answer(model, moved=BYTES, rest_s=0.0)
+    assert predicted_s(model, moved=payload) == pytest.approx(
+        RTT_S + payload / FIRST_BYTES_S + run_of(1.0), rel=0.02
+    )
+    for _ in range(2):
+        answer(model, moved=payload, rest_s=payload / BYTES_S)
+    assert predicted_s(model, moved=payload / 2) == pytest.approx(
+        RTT_S + payload / 2 / BYTES_S + run_of(1.0), rel=0.1
+    )
+
+
 @pytest.mark.parametrize("size", [0.5, 1.0, 2.0])
 def test_a_server_takes_its_round_trip_the_rest_of_the_network_and_its_run(size: float) -> None:
     """The prediction of each size is the sum of the three, to 3 %."""
