@@ -11,7 +11,7 @@ from collections import deque
 from offboard.robot_client.predictors.base import REMEMBERED, ROUNDING
 
 OUTLIER = 3.0  # times the median work nearby: more work than this counts as this much
-NEIGHBOURS = 20  # pairs that are nearest in size: the line goes through these
+NEIGHBOURS = 20  # pairs that are nearest in size, the newest of equal ones: the line goes through these
 
 
 class SharedWork:
@@ -24,16 +24,16 @@ class SharedWork:
     """
 
     def __init__(self) -> None:
-        self._order: deque[tuple[float, float]] = deque()
-        self._sizes, self._works = array("d"), array("d")  # sorted by size, then by work
+        self._order: deque[float] = deque()  # the sizes as they came
+        self._sizes, self._works = array("d"), array("d")  # sorted by size; those of one size as they came
 
     def learn(self, size: float, work: float) -> None:
         """A result said that a task of this size was this much work."""
         if len(self._order) == REMEMBERED:
-            at = self._place(*self._order.popleft())
+            at = bisect_left(self._sizes, self._order.popleft())
             del self._sizes[at], self._works[at]
-        self._order.append((size, work))
-        at = self._place(size, work)
+        self._order.append(size)
+        at = bisect_right(self._sizes, size)
         self._sizes.insert(at, size)
         self._works.insert(at, work)
 
@@ -42,7 +42,9 @@ class SharedWork:
         count = len(self._sizes)
         if not count:
             return None
-        first = max(0, min(bisect_left(self._sizes, size) - NEIGHBOURS // 2, count - NEIGHBOURS))
+        below, end = bisect_left(self._sizes, size), bisect_right(self._sizes, size)
+        first = max((below + end - NEIGHBOURS) // 2, end - NEIGHBOURS)
+        first = max(0, min(first, count - NEIGHBOURS))
         sizes, works = self._sizes[first : first + NEIGHBOURS], self._works[first : first + NEIGHBOURS]
         count = len(sizes)
         most = OUTLIER * sorted(works)[count // 2]
@@ -59,8 +61,3 @@ class SharedWork:
         if spread <= ROUNDING * count * sxx:
             return sw / count
         return max(0.0, (sw * sxx - sx * sxw) / spread)  # the line at x = 0
-
-    def _place(self, size: float, work: float) -> int:
-        """The index of the first pair that is not below this one."""
-        first = bisect_left(self._sizes, size)
-        return bisect_left(self._works, work, first, bisect_right(self._sizes, size, first))

@@ -5,7 +5,7 @@ from random import Random
 
 import pytest
 
-from offboard.robot_client.learning.shared_work import SharedWork
+from offboard.robot_client.learning.shared_work import NEIGHBOURS, SharedWork
 from offboard.robot_client.predictors.base import REMEMBERED
 
 
@@ -39,6 +39,20 @@ def test_only_the_last_results_count() -> None:
         size = rng.uniform(1, 5)
         work.learn(size, 20 * size * (2.0 if n >= REMEMBERED else 1.0))
     assert work.predict(3.0) == pytest.approx(120.0)
+
+
+@pytest.mark.parametrize("sizes", [1, 3])
+def test_equal_sizes_have_the_mean_of_their_newest_work(sizes: int) -> None:
+    """Not that of the smallest work; camera frames of one size may take any work."""
+    rng, work = Random(4), SharedWork()
+    done = []
+    for n in range(30 * sizes):
+        size = float(n % sizes)
+        done.append((size, 10.0**size * rng.uniform(1.0, 2.0)))
+        work.learn(*done[-1])
+    for size in range(sizes):
+        newest = [one for at, one in done if at == size][-NEIGHBOURS:]
+        assert work.predict(float(size)) == pytest.approx(sum(newest) / NEIGHBOURS)
 
 
 def test_an_outlier_has_little_influence() -> None:
