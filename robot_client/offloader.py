@@ -33,7 +33,7 @@ from offboard.robot_client.lifetime import Lifetime
 from offboard.robot_client.policies import BOTH, Decision, Forecast, Policy
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.policies.expectation import Expectation, expectations, missed
-from offboard.robot_client.policies.objectives import Deadline, weighed
+from offboard.robot_client.policies.objectives import by_deadline
 from offboard.robot_client.policies.observe import Observe
 from offboard.robot_client.records.recording import Recording, record_of, tell
 from offboard.robot_client.records.trace import Record
@@ -54,7 +54,8 @@ class Offloader:
     `memories`: what is known of each kind of task, and the predictors that it is learnt with.
     `allowance`: second runs, bytes and joules that tasks may spend.
     `timeout_s`: how long a remote site has for a task before the task runs onboard.
-    `observers`: called with the record of every task, in the thread that asked for it.
+    `observers`: called with the record of every task, in the thread that asked for it; with a deadline, in
+    another one.
 
     Use it as a context manager, from any number of threads. A call that the code of an onboard task makes
     runs in the thread of that task if it runs onboard.
@@ -336,7 +337,7 @@ class Offloader:
         sites = [site for site in self._runners if site not in absent] if absent else self._runners
         now_s = self._clock.now_s()
         forecast = self._forecaster.forecast(memory, task, sites, timeout_s=timeout_s, now_s=now_s)
-        return memory, forecast if deadline_s is None else weighed(forecast, Deadline(deadline_s))
+        return memory, forecast if deadline_s is None else by_deadline(forecast, deadline_s)
 
     def _decide(
         self,
