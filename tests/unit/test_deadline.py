@@ -205,7 +205,7 @@ def test_a_task_that_never_ends_does_not_keep_the_process() -> None:
 
 
 def test_a_task_may_call_with_a_deadline(offload: Offloader) -> None:
-    """The inner call runs onboard in a thread of its own, beside the task that waits for it."""
+    """The inner call runs onboard in a thread of its own, while the task waits for it."""
     assert offload(deadline_nested, 4) == 4
     assert offload(deadline_nested, 5, deadline_s=WAIT_S) == 5
 
