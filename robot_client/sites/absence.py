@@ -57,8 +57,7 @@ class CrossingPauses:
 def difference(kind: Kind, site: str, there: Mapping[str, str]) -> str | None:
     """Why the server of this site cannot take a kind; `there` has the hashes of its `hello`. None if it can.
 
-    If one side does not have the function of a variant, only parameters, dataclasses and packing
-    are compared.
+    If one side does not have the function of a variant, only what all variants have in common is compared.
     """
     name = kind.name
     if there.get(name) == kind.source_hash != "":
