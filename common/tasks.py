@@ -286,7 +286,7 @@ def _checked(kind: Kind) -> Kind:
     if kind.policy_server and (count != 1 or kind.pack is not None):
         needs = "a function of one argument, the observation, and no pack="
         raise ConfigError(f"task {name}: policy_server=True needs {needs}")
-    own_hash = source_hash(function, setup, kind.types, kind.pack, kind.unpack)
+    own_hash = source_hash(function, setup, kind.types, (kind.pack, kind.unpack))
     return replace(kind, positional=count, source_hash=own_hash)
 
 
@@ -316,14 +316,14 @@ def _with_variants(kind: Kind, found: Mapping[str, Variant]) -> Kind:
             function = one.function
             check_ordinary(name, variant=function, setup=one.setup)
             check_variant(name, site, function, setup=one.setup, given=given)
-            own_hash = source_hash(function, one.setup, kind.types, kind.pack, kind.unpack)
+            own_hash = source_hash(function, one.setup, kind.types, (kind.pack, kind.unpack))
         made[site] = replace(
             kind, name=f"{name}{AT}{site}", function=function, setup=one.setup, source_hash=own_hash,
             quality=one.quality,
         )  # fmt: skip
         if len(made[site].name) > NAME_LENGTH_MAX:
             raise ConfigError(f"task {name}: {made[site].name!r} has over {NAME_LENGTH_MAX} characters")
-    return replace(kind, source_hash=contract_hash(given, kind.types, kind.pack, kind.unpack), variants=made)
+    return replace(kind, source_hash=contract_hash(given, kind.types, (kind.pack, kind.unpack)), variants=made)
 
 
 def _meant(name: str) -> str:

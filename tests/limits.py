@@ -191,6 +191,5 @@ CONSTANTS = ROBOT | SERVER | BENCH
 WITHOUT = {
     "tasks that run onboard at a time": "the runner of the robot has one worker thread",
     "`trace` and `memory`": "it is a kind of file, not a number",
-    "a policy server": "its own page has the limits",
     "connections of robots": "the kernel sets this limit",
 }
