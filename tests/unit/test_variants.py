@@ -142,7 +142,7 @@ CHANGED = "f" * 64
             sort_out,
             CLOUD,
             {"sort_out": CHANGED},
-            "the parameters or dataclasses of task sort_out differ on the server",
+            "the parameters, dataclasses or packing of task sort_out differ on the server",
         ),
         (
             sort_out,
