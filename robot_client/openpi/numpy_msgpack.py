@@ -21,7 +21,14 @@ _ARRAY, _SCALAR, _DATA, _DTYPE, _SHAPE = b"__ndarray__", b"__npgeneric__", b"dat
 _UNSENDABLE = "VOc"  # kinds of dtypes: structured, objects, complex
 _DTYPES = re.compile(r"[<>|=]?[biufSU][1-9]\d{0,8}")
 # What a number or text holds, by the kind of its dtype. NumPy would make `n` zero bytes of the number `n`.
-_HOLDS = {"b": {bool}, "i": {int}, "u": {int}, "f": {float, int}, "S": {bytes}, "U": {str}}
+_HOLDS: dict[str, set[type]] = {
+    "b": {bool},
+    "i": {int},
+    "u": {int},
+    "f": {float, int},
+    "S": {bytes},
+    "U": {str},
+}
 
 
 def pack(observation: Any) -> bytes:
