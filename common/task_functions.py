@@ -29,12 +29,12 @@ def check_ordinary(name: str, **functions: Callable[..., Any] | None) -> None:
 
 def check_packing(name: str, pack: Any, unpack: Any) -> None:
     """ConfigError unless both are ordinary functions, or both None."""
+    check_ordinary(name, pack=pack, unpack=unpack)
     if (pack is None) != (unpack is None):
         raise ConfigError(f"task {name}: pack= and unpack= need each other; give both or none")
     for place, one in (("pack", pack), ("unpack", unpack)):
         if one is not None and not callable(one):
             raise ConfigError(f"task {name}: {place}= is {one!r:.80}; it must be a function")
-    check_ordinary(name, pack=pack, unpack=unpack)
 
 
 def check_parameters(name: str, parameters: Iterable[inspect.Parameter]) -> None:
