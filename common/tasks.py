@@ -323,7 +323,9 @@ def _with_variants(kind: Kind, found: Mapping[str, Variant]) -> Kind:
         )  # fmt: skip
         if len(made[site].name) > NAME_LENGTH_MAX:
             raise ConfigError(f"task {name}: {made[site].name!r} has over {NAME_LENGTH_MAX} characters")
-    return replace(kind, source_hash=contract_hash(given, kind.types, (kind.pack, kind.unpack)), variants=made)
+    return replace(
+        kind, source_hash=contract_hash(given, kind.types, (kind.pack, kind.unpack)), variants=made
+    )
 
 
 def _meant(name: str) -> str:
