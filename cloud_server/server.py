@@ -211,7 +211,7 @@ class Server:
             most = self._limits.message_bytes_max
             if size > most:
                 raise ProtocolError(f"message of {size} bytes, at most {most} are allowed")
-            self._take(peer.bytes, unpack(frames), verdict)
+            self._take(peer.bytes, file, unpack(frames), verdict)
         except VersionMismatch as error:
             self._drop("version", error)
             self._sender.send(peer.bytes, self._hello())
@@ -228,7 +228,7 @@ class Server:
         )
         end(file, address)
 
-    def _take(self, peer: bytes, message: Message, verdict: Verdict) -> None:
+    def _take(self, peer: bytes, file: int, message: Message, verdict: Verdict) -> None:
         """Do what a message asks for."""
         match message:
             case Request() if verdict is Verdict.REFUSE:
@@ -238,8 +238,10 @@ class Server:
                 self.metrics.dropped.labels("quota").inc()
             case Request():
                 self._scheduler.request(peer, message)
-            case Blob(data, size):
-                self._keep(data, size, self._access.robot_of(peer))
+            case Blob(data, None):
+                self._blobs.add(data, self._access.robot_of(peer))
+            case Blob(data, int(size)):
+                self._decompress(peer, file, data, size)
             case Ping(id):
                 self._sender.send(peer, Pong(id, self._scheduler.waiting, *self._load.latest()))
             case Hello():
@@ -251,17 +253,18 @@ class Server:
             case _:
                 raise ProtocolError(f"a server does not accept a {type(message).__name__.lower()}")
 
-    def _keep(self, data: Buffer, size: int | None, robot: bytes) -> None:
-        """Keep a blob. A compressed one counts with all its bytes, because they are hashed and kept."""
-        if size is not None:
-            if size > self._limits.message_bytes_max:
-                raise ProtocolError(f"blob of {size} bytes once it is decompressed")
-            more = max(0, size - byte_length(data))
-            if self._rate_limit.judge(robot, more, self._last_turn) is not Verdict.TAKE:
-                self.metrics.dropped.labels("quota").inc()
-                return
-            data = decompress(data, size)
-        self._blobs.add(data, robot)
+    def _decompress(self, peer: bytes, file: int, data: Buffer, size: int) -> None:
+        """Keep a compressed blob. It counts with all its bytes, because they are hashed and kept."""
+        if size > self._limits.message_bytes_max:
+            raise ProtocolError(f"blob of {size} bytes once it is decompressed")
+        robot, more = self._access.robot_of(peer), max(0, size - byte_length(data))
+        verdict = self._rate_limit.judge(robot, more, self._last_turn)
+        if verdict is Verdict.TAKE:
+            self._blobs.add(decompress(data, size), robot)
+            return
+        self.metrics.dropped.labels("quota").inc()
+        if verdict is Verdict.CUT_OFF:
+            self._cut_off(peer, file)
 
     def _answered(self, work: Work, outcome: Outcome) -> list[Work]:
         """Send the reply of a task; returns the work to start in its place."""

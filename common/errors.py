@@ -70,7 +70,7 @@ class BadValue(TaskError):
 
 
 class DeadlineMissed(OffloadError):
-    """A call with `deadline_s` had no answer in time. Its task runs to its end, and its time is learnt.
+    """A call with `deadline_s` had no answer in time. A task that has begun runs to its end and is learnt.
 
     `expected` is what was expected of each site when the call began: an `Expectation` by site.
     """

@@ -11,6 +11,8 @@ from typing import Any
 from offboard.common.dataclass_types import field_names
 from offboard.common.errors import ConfigError
 
+Packing = tuple[Callable[..., Any] | None, Callable[..., Any] | None]  # pack and unpack
+
 OPTIONS = ("deadline_s", "function", "observe", "timeout_s", "where")  # of a call, in this version or others
 
 
@@ -27,12 +29,12 @@ def check_ordinary(name: str, **functions: Callable[..., Any] | None) -> None:
 
 def check_packing(name: str, pack: Any, unpack: Any) -> None:
     """ConfigError unless both are ordinary functions, or both None."""
+    check_ordinary(name, pack=pack, unpack=unpack)
     if (pack is None) != (unpack is None):
         raise ConfigError(f"task {name}: pack= and unpack= need each other; give both or none")
     for place, one in (("pack", pack), ("unpack", unpack)):
         if one is not None and not callable(one):
             raise ConfigError(f"task {name}: {place}= is {one!r:.80}; it must be a function")
-    check_ordinary(name, pack=pack, unpack=unpack)
 
 
 def check_parameters(name: str, parameters: Iterable[inspect.Parameter]) -> None:
@@ -94,7 +96,7 @@ def source_hash(
     function: Callable[..., Any],
     setup: Callable[[], Any] | None,
     types: Iterable[type],
-    *packing: Callable[..., Any] | None,
+    packing: Packing,
 ) -> str:
     """SHA-256 of the source of a function, its setup, its dataclasses with their fields, and its packing.
 
@@ -102,21 +104,19 @@ def source_hash(
     """
     if not _source(function):
         return ""
-    return _hash([_source(function), _source(setup), *_sources(types, *packing)])
+    return _hash([_source(function), _source(setup), *_sources(types, packing)])
 
 
-def contract_hash(
-    signature: inspect.Signature, types: Iterable[type], *packing: Callable[..., Any] | None
-) -> str:
+def contract_hash(signature: inspect.Signature, types: Iterable[type], packing: Packing) -> str:
     """SHA-256 of what all variants of a task have in common: what a caller gives, dataclasses, and packing.
 
     Defaults do not count: the robot fills them in.
     """
     given = [f"{one.kind.name} {one.name}" for one in signature.parameters.values()]
-    return _hash(["variants", *given, *_sources(types, *packing)])
+    return _hash(["variants", *given, *_sources(types, packing)])
 
 
-def _sources(types: Iterable[type], *packing: Callable[..., Any] | None) -> list[str]:
+def _sources(types: Iterable[type], packing: Packing) -> list[str]:
     parts = [part for one in types for part in (_source(one), *sorted(field_names(one)))]
     return parts + [_source(one) for one in packing if one is not None]
 

@@ -198,38 +198,19 @@ def task(
     """
     if not isinstance(name, str) or len(name) > NAME_LENGTH_MAX or not name.isidentifier():
         raise ConfigError(f"task name {name!r} is not an identifier of at most {NAME_LENGTH_MAX} characters")
-    if sum(1 + len(kind.variants) for kind in _kinds.values()) + len(quality or ()) >= KINDS_MAX:
-        raise ConfigError(f"task {name}: {KINDS_MAX} tasks are registered already, the most allowed")
-
     check_types(name, types)
 
     def register(function: F) -> F:
         found = variants_of(name, function, variants=variants, quality=quality, setup=setup)
         own: Any = found[CLOUD].setup if found else setup
-        check_ordinary(name, function=function, size=size, setup=own, work=work, warm=warm)
-        check_packing(name, pack, unpack)
-        signature = inspect.signature(function)
-        if own is not None:
-            check_first_parameter(name, signature)
-        parameters = without_state(signature, own).parameters.values()
-        check_parameters(name, parameters)
-        fixed = all(parameter.kind != parameter.VAR_POSITIONAL for parameter in parameters)
-        count = len(parameters) if fixed else None
-        if policy_server and (count != 1 or pack is not None):
-            needs = "a function of one argument, the observation, and no pack="
-            raise ConfigError(f"task {name}: policy_server=True needs {needs}")
-        kind = Kind(
-            name, function, size, duplicate,
-            types=tuple(types), warm=warm, source_hash=source_hash(function, own, types, pack, unpack),
-            work=work, positional=count, setup=own, pack=pack, unpack=unpack, policy_server=policy_server,
+        kind = _checked(
+            Kind(
+                name, function, size, duplicate,
+                types=tuple(types), warm=warm, work=work, setup=own,
+                pack=pack, unpack=unpack, policy_server=policy_server,
+            )
         )  # fmt: skip
-        if found:
-            kind = _with_variants(kind, found)
-        known = _kinds.get(name)
-        if known is not None:
-            _check_same(known, kind)
-        _kinds[name] = kind
-        _on_servers.update((one.name, one) for one in kind.on_servers())
+        _add(_with_variants(kind, found) if found else kind)
         return function
 
     return register
@@ -290,6 +271,38 @@ def load_modules(names: Iterable[str]) -> None:
             raise ConfigError(f"task module {name!r} cannot be imported: {describe(error)}{where}") from error
 
 
+def _checked(kind: Kind) -> Kind:
+    """The kind with what its functions say of it. ConfigError unless they can make a task."""
+    name, function, setup = kind.name, kind.function, kind.setup
+    check_ordinary(name, function=function, size=kind.size, setup=setup, work=kind.work, warm=kind.warm)
+    check_packing(name, kind.pack, kind.unpack)
+    signature = inspect.signature(function)
+    if setup is not None:
+        check_first_parameter(name, signature)
+    parameters = without_state(signature, setup).parameters.values()
+    check_parameters(name, parameters)
+    fixed = all(parameter.kind != parameter.VAR_POSITIONAL for parameter in parameters)
+    count = len(parameters) if fixed else None
+    if kind.policy_server and (count != 1 or kind.pack is not None):
+        needs = "a function of one argument, the observation, and no pack="
+        raise ConfigError(f"task {name}: policy_server=True needs {needs}")
+    own_hash = source_hash(function, setup, kind.types, (kind.pack, kind.unpack))
+    return replace(kind, positional=count, source_hash=own_hash)
+
+
+def _add(kind: Kind) -> None:
+    """Put a kind into the registry."""
+    known = _kinds.get(kind.name)
+    if known is not None:
+        _check_same(known, kind)
+    names = sum(1 + len(one.variants) for one in _kinds.values() if one is not known)
+    if names + 1 + len(kind.variants) > KINDS_MAX:
+        allowed = f"a process has at most {KINDS_MAX} tasks, and each variant counts as one more"
+        raise ConfigError(f"task {kind.name}: {allowed}")
+    _kinds[kind.name] = kind
+    _on_servers.update((one.name, one) for one in kind.on_servers())
+
+
 def _with_variants(kind: Kind, found: Mapping[str, Variant]) -> Kind:
     """The kind with a kind for each site, named TASK@SITE."""
     name, given = kind.name, kind.signature()
@@ -303,14 +316,16 @@ def _with_variants(kind: Kind, found: Mapping[str, Variant]) -> Kind:
             function = one.function
             check_ordinary(name, variant=function, setup=one.setup)
             check_variant(name, site, function, setup=one.setup, given=given)
-            own_hash = source_hash(function, one.setup, kind.types, kind.pack, kind.unpack)
+            own_hash = source_hash(function, one.setup, kind.types, (kind.pack, kind.unpack))
         made[site] = replace(
             kind, name=f"{name}{AT}{site}", function=function, setup=one.setup, source_hash=own_hash,
             quality=one.quality,
         )  # fmt: skip
         if len(made[site].name) > NAME_LENGTH_MAX:
             raise ConfigError(f"task {name}: {made[site].name!r} has over {NAME_LENGTH_MAX} characters")
-    return replace(kind, source_hash=contract_hash(given, kind.types, kind.pack, kind.unpack), variants=made)
+    return replace(
+        kind, source_hash=contract_hash(given, kind.types, (kind.pack, kind.unpack)), variants=made
+    )
 
 
 def _meant(name: str) -> str:

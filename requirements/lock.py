@@ -13,8 +13,7 @@ EXTRAS = {
     "examples": ["examples", "bench"],
 }
 
-# Environments of tests only.
-PEERS = ("openpi",)
+FOR_TESTS = ("openpi",)  # environments of their own; NAME.in holds what they need
 
 OPTIONS = (
     *("--quiet", "--universal", "--python-version", "3.11", "--generate-hashes", "--upgrade"),
@@ -25,6 +24,6 @@ for name, extras in EXTRAS.items():
     chosen = [part for extra in extras for part in ("--extra", extra)]
     out = ("--output-file", str(HERE / f"{name}.txt"), str(HERE.parent / "pyproject.toml"))
     subprocess.run(["uv", "pip", "compile", *OPTIONS, *chosen, *out], check=True)
-for name in PEERS:
+for name in FOR_TESTS:
     files = ("--output-file", str(HERE / f"{name}.txt"), str(HERE / f"{name}.in"))
     subprocess.run(["uv", "pip", "compile", *OPTIONS, *files], check=True)

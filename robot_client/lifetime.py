@@ -9,7 +9,7 @@ import warnings
 import weakref
 from collections.abc import Callable, Collection
 from concurrent.futures import Future
-from typing import NoReturn, TypeVar
+from typing import TypeVar
 
 from offboard.common.errors import OffloadError
 from offboard.robot_client.execution.call_threads import CallThreads
@@ -43,11 +43,11 @@ class Lifetime:
         self._lock = lock
         _lifetimes.add(self)
 
-    def refuse(self) -> NoReturn:
-        """The answer to each use while `forked`."""
-        raise OffloadError(
-            "this process was forked after its offloader was made; make a new one in this process"
-        )
+    def refuse_in_fork(self) -> None:
+        """OffloadError if this is a forked process."""
+        if self.forked:
+            said = "this process was forked after its offloader was made; make a new one in this process"
+            raise OffloadError(said)
 
     def call_in_thread(self, call: Callable[[], T]) -> "Future[T]":
         """Make a call of `submit` or `run`."""

@@ -33,7 +33,7 @@ from offboard.robot_client.lifetime import Lifetime
 from offboard.robot_client.policies import BOTH, Decision, Forecast, Policy
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.policies.expectation import Expectation, expectations, missed
-from offboard.robot_client.policies.objectives import Deadline, weighed
+from offboard.robot_client.policies.objectives import by_deadline
 from offboard.robot_client.policies.observe import Observe
 from offboard.robot_client.records.recording import Recording, record_of, tell
 from offboard.robot_client.records.trace import Record
@@ -54,7 +54,8 @@ class Offloader:
     `memories`: what is known of each kind of task, and the predictors that it is learnt with.
     `allowance`: second runs, bytes and joules that tasks may spend.
     `timeout_s`: how long a remote site has for a task before the task runs onboard.
-    `observers`: called with the record of every task, in the thread that asked for it.
+    `observers`: called with the record of every task, in the thread that asked for it; with a deadline, in
+    another one.
 
     Use it as a context manager, from any number of threads. A call that the code of an onboard task makes
     runs in the thread of that task if it runs onboard.
@@ -167,8 +168,7 @@ class Offloader:
         a remote site, after which the task runs onboard. `deadline_s` bounds the wait of the caller: after
         it the call raises DeadlineMissed, and the task runs to its end in another thread.
         """
-        if self._life.forked:
-            self._life.refuse()
+        self._life.refuse_in_fork()
         budget_s = self._timeout_s if timeout_s is None else checked_timeout(timeout_s)
         kind = kind_of(function)
         args = kind.bind(args, kwargs)
@@ -195,8 +195,7 @@ class Offloader:
         in the order of the items. If tasks fail, the error of the first one is raised when all have ended.
         `where` and `timeout_s` are those of a single call. Observers are called in threads of the batch.
         """
-        if self._life.forked:
-            self._life.refuse()
+        self._life.refuse_in_fork()
         budget_s = self._timeout_s if timeout_s is None else checked_timeout(timeout_s)
         kind = kind_of(function)
         tasks = [new_task(kind, args) for args in arguments(kind, items)]
@@ -222,8 +221,7 @@ class Offloader:
         At most ASYNC_CALLS_MAX calls are made at a time; further ones wait, and can be cancelled while they
         do. `deadline_s` counts from when a call begins. A task that has begun runs to its end.
         """
-        if self._life.forked:
-            self._life.refuse()
+        self._life.refuse_in_fork()
         return self._life.call_in_thread(partial(self, function, *args, **options))
 
     async def run(self, function: Callable[..., R], *args: Any, **options: Any) -> R:
@@ -237,8 +235,7 @@ class Offloader:
         self, function: Callable[..., Any], *args: Any, deadline_s: float | None = None, **kwargs: Any
     ) -> dict[str, Expectation]:
         """What this call should take on each site, and how likely it is in time; nothing runs or counts."""
-        if self._life.forked:
-            self._life.refuse()
+        self._life.refuse_in_fork()
         if deadline_s is not None:
             checked_timeout(deadline_s, "deadline_s")
         kind = kind_of(function)
@@ -250,8 +247,7 @@ class Offloader:
 
     def savings(self) -> dict[str, Savings | None]:
         """With `observe`: what offloading would have saved, by name of the task; None while it is unknown."""
-        if self._life.forked:
-            self._life.refuse()
+        self._life.refuse_in_fork()
         with self._lock:
             return self._learner.savings()
 
@@ -261,8 +257,7 @@ class Offloader:
         Returns why some sites still cannot: a dictionary by site, which is empty if all can. It returns at
         once if waiting changes nothing, as for a server that has other source.
         """
-        if self._life.forked:
-            self._life.refuse()
+        self._life.refuse_in_fork()
         return wait_for_sites(self._runners, kind_of(function), timeout_s)
 
     def close(self) -> None:
@@ -336,7 +331,7 @@ class Offloader:
         sites = [site for site in self._runners if site not in absent] if absent else self._runners
         now_s = self._clock.now_s()
         forecast = self._forecaster.forecast(memory, task, sites, timeout_s=timeout_s, now_s=now_s)
-        return memory, forecast if deadline_s is None else weighed(forecast, Deadline(deadline_s))
+        return memory, forecast if deadline_s is None else by_deadline(forecast, deadline_s)
 
     def _decide(
         self,
@@ -367,7 +362,7 @@ class Offloader:
                 self._memories.save_soon()
             late = self._runs.take_late() if self._runs.late else ()
             regret = self._learner.regret.estimate()
-            saved = self._learner.saved(task.kind) if self._observes else None
+            saved = self._learner.savings().get(task.kind.name) if self._observes else None
         ended_s = self._clock.now_s()
         record = self.last = record_of(
             pending, executions, answer, ended_s=ended_s, late=late, regret=regret, savings=saved

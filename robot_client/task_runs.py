@@ -63,10 +63,9 @@ class TaskRuns:
             allowed=self._take_duplicate,
             late=partial(self._ended_late, pending),
         )
-        plan = plan_of(decision, pending.forecast, pending.call)
-        if (
-            plan.all and decision.policy != PINNED
-        ):  # a measurement is the choice of the caller, not of the policy
+        hurried = pending.deadline_s is not None
+        plan = plan_of(decision, pending.forecast, pending.call, hurried=hurried)
+        if decision.both and decision.policy != PINNED:  # not if the caller measures all sites
             self._take_duplicates(len(plan.first) - 1)
         try:
             return race.run(plan)

@@ -32,7 +32,7 @@ from offboard.loadgen.robot.run_settings import RunSettings
 from offboard.loadgen.scenario import event_timeline, scenario
 from offboard.loadgen.table import measured_rows
 from offboard.loadgen.testbed import docker_engine, docker_images
-from offboard.robot_client import lifetime, offloader
+from offboard.robot_client import lifetime, task_runs
 from offboard.robot_client.execution import placement
 from offboard.robot_client.learning import store
 from offboard.robot_client.policies import allowance
@@ -93,7 +93,8 @@ ROBOT = {
     ],
     "free files and threads for `connect`": [channel.FILES, channel.THREADS],
     "cancelled onboard runs that go on": [onboard.ABANDONED_MAX],
-    "calls of `Offloader.run` at a time": [lifetime.ASYNC_CALLS_MAX],
+    "calls of `Offloader.run` and `Offloader.submit` at a time": [lifetime.ASYNC_CALLS_MAX],
+    "calls with a deadline that still run, in time or late": [lifetime.ASYNC_CALLS_MAX],
     "a setup that raised": [task_states.SETUP_AGAIN_S],
     "`--in-flight`: tasks of a run that were not answered yet": [
         default(RunSettings, "in_flight"),
@@ -106,7 +107,7 @@ ROBOT = {
     ],
     "second runs saved up, or owed": [allowance.DUPLICATES_MAX],
     "observations of a kind on a site": [window.WINDOW_MAX, base.REMEMBERED],
-    "late executions that the next record names": [offloader.LATE_MAX],
+    "late executions that the next record names": [task_runs.LATE_MAX],
     "records that wait for the disk of `trace`": [trace.WAITING_MAX, trace.ROOM_WAIT_S],
     "`close`: runs onboard; each server; trace; memory": [
         onboard.CLOSE_WAIT_S,
@@ -122,6 +123,7 @@ ROBOT = {
         connection.LOG_PAUSE_S,
     ],
     "messages that are read at once from a server": [cloud.READ_MAX],
+    "arrays of one task that are sent compressed inside the request": [values.DECOMPRESSED_BYTES_MAX],
     "rows of a CSV file of sizes, or of a dataset": [same(workload.ROWS_MAX, measured_rows.ROWS_MAX)],
 }
 

@@ -1,12 +1,14 @@
 """Tasks that pack their arguments, and two that do not. Robot and server load `tests.packing_tasks`."""
 
 import os
+import time
 from typing import Any
 
 import numpy as np
 
 from offboard.common.tasks import task
 
+PACK_S = 0.2
 packed: list[int] = []  # the sizes of what this process has packed
 
 
@@ -49,6 +51,16 @@ def unreadable(value: Any) -> list[Any]:
 
 @task("packing_raises", size=lambda _: 0.0, pack=refuse, unpack=str, duplicate=False)
 def raises(value: Any) -> list[Any]:
+    return [value, os.getpid()]
+
+
+def slowly(value: Any) -> str:
+    time.sleep(PACK_S)
+    return str(value)
+
+
+@task("packing_slow", size=lambda _: 0.0, pack=slowly, unpack=str, duplicate=False)
+def slow(value: Any) -> list[Any]:
     return [value, os.getpid()]
 
 

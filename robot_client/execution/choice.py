@@ -58,11 +58,17 @@ def decided(
     return decision if decision.second is None else decision._replace(second=None)
 
 
-def plan_of(decision: Decision, forecast: Forecast, call: "Future[str] | None") -> Plan:
-    """How the race carries out a decision; `call` may name one more site while the task runs."""
+def plan_of(
+    decision: Decision, forecast: Forecast, call: "Future[str] | None" = None, *, hurried: bool = False
+) -> Plan:
+    """How the race carries out a decision; `call` may name one more site while the task runs.
+
+    `hurried`: the call has a deadline. It gets the first answer, even if the policy measures all sites.
+    """
     if decision.both:
         first = tuple(site for site in forecast.sites if site not in decision.spared)
-        return Plan(first, decision.second, all=True, call=call)
+        waits = decision.policy == PINNED or not hurried
+        return Plan(first, decision.second, all=waits, keep=True, call=call)
     if decision.measured is not None:  # that run starts after the answer
         return Plan((decision.site,), call=call)
     plan = Plan((decision.site,), decision.second, call=call)

@@ -22,6 +22,7 @@ class Plan:
 
     `first`: the sites that start at once. `second`: a second run.
     `all`: wait for every run, not for the first answer.
+    `keep`: runs that lose the race go on to their end, so that their whole time is learnt.
     `call`: a future that may name one more site while the task runs; that site then starts too.
     `patience_s`: how long the answer of a second site waits for the better one of the first site.
     """
@@ -29,6 +30,7 @@ class Plan:
     first: tuple[str, ...]
     second: Probe | Hedge | None = None
     all: bool = False
+    keep: bool = False
     call: "Future[str] | None" = None
     patience_s: float = 0.0
 
@@ -85,7 +87,7 @@ class Race:
             executions[ONBOARD] = result_of(ONBOARD, self._runs[ONBOARD][0])
         for site, (run, began_s) in self._runs.items():
             if site not in executions:
-                keep = isinstance(plan.second, Probe)
+                keep = plan.keep or isinstance(plan.second, Probe)
                 executions[site] = self._leave(site, run, began_s, keep=keep)
         return tuple(executions[site] for site in self._runs)
 

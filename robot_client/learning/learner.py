@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 
 from offboard.common.errors import Overtaken
-from offboard.common.tasks import Kind, Size, Task
+from offboard.common.tasks import Size, Task
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.regret import RegretEstimate
 from offboard.robot_client.learning.savings import Savings, SavingsEstimate
@@ -138,11 +138,6 @@ class Learner:
     def savings(self) -> dict[str, Savings | None]:
         """The present estimate for each kind."""
         return {kind: one.estimate() for kind, one in self._savings.items()}
-
-    def saved(self, kind: Kind) -> Savings | None:
-        """The present estimate for a kind."""
-        found = self._savings.get(kind.name)
-        return None if found is None else found.estimate()
 
     def _held_up(self, site: str) -> bool:
         """Whether the site does not answer heartbeats, or may be about to."""

@@ -73,6 +73,6 @@ class _Learnt:
         If its bytes did not shrink enough, an argument is tried again now and then, because its content may
         have changed. On a fast link not even an argument that vanished would pay.
         """
-        cost_s = 2.0 * self.byte_s.value  # decompressing takes a server no longer than compressing the robot
+        cost_s = 2.0 * self.byte_s.value  # a server should not take longer to decompress
         saved_s = link_s * (1.0 - self.share.value)
         return saved_s > cost_s or (self.age >= PROBE_EVERY and link_s > cost_s)

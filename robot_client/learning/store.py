@@ -70,7 +70,7 @@ class Store:
             if name not in sites:
                 self._away.setdefault(kind.name, {})[name] = site
             elif not site.source == kind.at(name).source_hash != "":
-                text = "memory %s: %s on %s starts cold because the source of its variant has changed"
+                text = "memory %s: %s on %s starts cold: the source of its variant has changed or is not here"
                 log.info(text, self.path, kind.name, name)
             elif observations := _as_learnt(self._believed(site), kept.per, memory.per_work):
                 memory.site(name).recall(observations, age=PROBE_EVERY)

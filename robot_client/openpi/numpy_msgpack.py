@@ -20,6 +20,15 @@ DIMENSIONS_MAX = 32
 _ARRAY, _SCALAR, _DATA, _DTYPE, _SHAPE = b"__ndarray__", b"__npgeneric__", b"data", b"dtype", b"shape"
 _UNSENDABLE = "VOc"  # kinds of dtypes: structured, objects, complex
 _DTYPES = re.compile(r"[<>|=]?[biufSU][1-9]\d{0,8}")
+# What a number or text holds, by the kind of its dtype. NumPy would make `n` zero bytes of the number `n`.
+_HOLDS: dict[str, set[type]] = {
+    "b": {bool},
+    "i": {int},
+    "u": {int},
+    "f": {float, int},
+    "S": {bytes},
+    "U": {str},
+}
 
 
 def pack(observation: Any) -> bytes:
@@ -78,10 +87,11 @@ def _array(tree: dict[Any, Any]) -> "np.ndarray[Any, Any]":
 
 def _scalar(tree: dict[Any, Any]) -> Any:
     data, dtype = tree.get(_DATA), _dtype(tree)
-    if not isinstance(data, bool | int | float | str | bytes):
-        raise ProtocolError(f"a number of dtype {dtype} holds {type(data).__name__}")
+    if type(data) not in _HOLDS[dtype.kind]:
+        raise ProtocolError(f"a number or text of dtype {dtype} holds {type(data).__name__}")
     try:
-        return dtype.type(data)
+        with np.errstate(over="ignore"):  # it becomes infinite
+            return dtype.type(data)
     except (ValueError, TypeError, OverflowError) as error:
         raise ProtocolError(f"a number of dtype {dtype}: {error}") from error
 

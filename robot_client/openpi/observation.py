@@ -95,6 +95,6 @@ def _run_s(value: Any) -> float | None:
     """The computing time that the server says, in seconds; None if it says nothing of the sort."""
     timing = value.get("server_timing") if isinstance(value, dict) else None
     ms = timing.get("infer_ms") if isinstance(timing, dict) else None
-    if type(ms) not in (int, float) or not (math.isfinite(ms) and ms >= 0):
+    if isinstance(ms, bool) or not isinstance(ms, int | float) or not (math.isfinite(ms) and ms >= 0):
         return None
     return ms / 1000

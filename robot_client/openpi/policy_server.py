@@ -89,7 +89,7 @@ class PolicyServerRunner:
 
     def unavailable(self, kind: Kind) -> str | None:
         if not kind.policy_server:
-            return Lasting(f"a policy server takes tasks with policy_server=True only; {kind.name} has not")
+            return Lasting(f"a policy server takes only tasks with policy_server=True; {kind.name} is none")
         if self._absent is not None:
             return self._absent
         if self._queue.owed_since_s is not None:
@@ -218,11 +218,21 @@ class PolicyServerRunner:
             self._changed.clear()
             if self._queue.idle:
                 await self._beat(socket)
-                if (observation := self._queue.send_next(time.perf_counter())) is not None:
-                    await socket.send(observation.data)
+                await self._send_next(socket)
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(self._rest_s()):
                     await self._changed.wait()
+
+    async def _send_next(self, socket: WebSocket) -> None:
+        """Send the observation whose turn it is. CloudBroken if the server does not take all of it."""
+        now_s = time.perf_counter()
+        if (observation := self._queue.send_next(now_s)) is None:
+            return
+        try:
+            async with asyncio.timeout(observation.deadline_s - now_s + ABANDONED_MAX_S):
+                await socket.send(observation.data)
+        except TimeoutError as error:
+            raise CloudBroken("it does not take the observation") from error
 
     async def _beat(self, socket: WebSocket) -> None:
         now_s = time.perf_counter()
@@ -265,11 +275,10 @@ class PolicyServerRunner:
         bad = None
         if execution.failure is None:
             self._reconnect_s = RECONNECT_S
-        else:
-            self._warn(str(execution.failure))
-            bad = CannotCross(
-                str(execution.failure)
-            )  # a server whose answers are bad is left out for a while
+        else:  # a server whose answers are bad is left out for a while
+            why = str(execution.failure)
+            self._warn(why)
+            bad = CannotCross(why)
         self._pauses.note(observation.task.kind.name, bad, now_s)
         self._queue.end(observation, execution)
 

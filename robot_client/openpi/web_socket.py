@@ -87,10 +87,12 @@ async def open_web_socket(endpoint: str, bytes_max: int) -> AsyncIterator[WebSoc
 
 
 async def _close(connection: ClientConnection) -> None:
-    with contextlib.suppress(OSError, TimeoutError):
-        async with asyncio.timeout(CLOSE_S):
-            await connection.close()
-    connection.transport.abort()
+    try:
+        with contextlib.suppress(OSError):  # TimeoutError is one
+            async with asyncio.timeout(CLOSE_S):
+                await connection.close()
+    finally:  # also if the runner is closed meanwhile
+        connection.transport.abort()
     await connection.wait_closed()
 
 

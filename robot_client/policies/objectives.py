@@ -79,13 +79,19 @@ class TimeAndEnergy:
         return expected.seconds + self.s_a_joule * expected.joules + expected.quality.lost_s
 
 
-def weighed(forecast: Forecast, objective: Objective) -> Forecast:
-    """The same forecast with the costs of this objective. A site whose time is unknown keeps its cost."""
-    sites = dict(forecast.sites)
+def by_deadline(forecast: Forecast, deadline_s: float) -> Forecast:
+    """The same forecast for a call with a deadline, against which quality is weighed instead of seconds.
+
+    A site whose time is unknown is tried, unless a task is there already: that one may take long.
+    """
+    objective, sites = Deadline(deadline_s), {}
     for site, one in forecast.sites.items():
+        quality = one.quality if one.quality is WHOLE else Quality(one.quality.value)
+        cost = 1.0 if one.in_flight else None
         if one.predicted_s is not None:
-            expected = Expected(one.predicted_s, one.spread_s, one.joules, one.quality)
-            sites[site] = one._replace(cost=objective.cost(expected, one.errors))
+            expected = Expected(one.predicted_s, one.spread_s, one.joules, quality)
+            cost = objective.cost(expected, one.errors)
+        sites[site] = one._replace(cost=cost, quality=quality)
     return forecast._replace(sites=sites)
 
 

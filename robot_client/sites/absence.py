@@ -57,7 +57,7 @@ class CrossingPauses:
 def difference(kind: Kind, site: str, there: Mapping[str, str]) -> str | None:
     """Why the server of this site cannot take a kind; `there` has the hashes of its `hello`. None if it can.
 
-    If one side does not have the function of a variant, only the parameters and dataclasses are compared.
+    If one side does not have the function of a variant, only what all variants have in common is compared.
     """
     name = kind.name
     if there.get(name) == kind.source_hash != "":
@@ -76,7 +76,7 @@ def difference(kind: Kind, site: str, there: Mapping[str, str]) -> str | None:
         return f"the source of task {name} differs on the server"
     if not any(one.name in there for one in kind.variants.values()):
         return f"task {name} has no variants on the server"
-    return f"the parameters or dataclasses of task {name} differ on the server"
+    return f"the parameters, dataclasses or packing of task {name} differ on the server"
 
 
 def absent_sites(runners: Mapping[str, Runner], kind: Kind) -> Absent:

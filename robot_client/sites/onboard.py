@@ -5,7 +5,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -158,7 +158,7 @@ class OnboardRunner:
             elif self._abandoned == ABANDONED_MAX or not self._start(self._work):
                 return
             else:
-                self._abandon(run, run.thread)
+                self._abandon(run)
         run.future.set_result(_overtaken(run, started=run.thread is not None))
 
     def prepare(self, kind: Kind) -> "Future[None]":
@@ -189,7 +189,10 @@ class OnboardRunner:
         return found
 
     def close(self) -> None:
-        """Cancel the tasks in the queue, and wait for those that run, for at most CLOSE_WAIT_S."""
+        """Cancel the tasks in the queue, and wait for those that run, for at most CLOSE_WAIT_S.
+
+        A run that goes on after that is given up, so that the process can end although a call waits for it.
+        """
         with self._lock:
             if self._closed:
                 return
@@ -200,9 +203,7 @@ class OnboardRunner:
                 del self._runs[run.task.id]
             for _ in range(self._threads):
                 self._queue.put(None)
-        for run in waiting:
-            run.future.cancel()
-            run.future.set_running_or_notify_cancel()  # or a wait for several futures would go on
+        _give_up(waiting)
         if count := join_all(self._started, CLOSE_WAIT_S):
             log.warning(
                 "%s: %d of its threads still run a task %g s after the close; if that is native code, "
@@ -211,6 +212,11 @@ class OnboardRunner:
                 count,
                 CLOSE_WAIT_S,
             )
+        with self._lock:
+            running = [run for run in self._runs.values() if not run.abandoned]
+            for run in running:
+                self._abandon(run)
+        _give_up(running)
 
     def _has_worker(self) -> bool:
         """Whether a worker will take the next task. Starts one if all others have a task already."""
@@ -229,11 +235,12 @@ class OnboardRunner:
         self._started = [*(other for other in self._started if other.is_alive()), thread]
         return True
 
-    def _abandon(self, run: _Run, thread: int) -> None:
+    def _abandon(self, run: _Run) -> None:
+        assert run.thread is not None
         run.wanted, run.abandoned = False, True
         self._abandoned += 1
         with contextlib.suppress(OSError, AttributeError):  # on systems without priorities for threads
-            os.setpriority(os.PRIO_PROCESS, thread, ABANDONED_NICE)
+            os.setpriority(os.PRIO_PROCESS, run.thread, ABANDONED_NICE)
 
     def _prepare(self, kind: Kind, prepared: "Future[None]") -> None:
         try:
@@ -271,6 +278,12 @@ class OnboardRunner:
         """Run a task in the thread of its caller."""
         with _as_a_task():
             run.future.set_result(_run(run, self._states))
+
+
+def _give_up(runs: Iterable[_Run]) -> None:
+    for run in runs:
+        run.future.cancel()
+        run.future.set_running_or_notify_cancel()  # or a wait for several futures would go on
 
 
 def _run(run: _Run, states: TaskStates) -> Execution:

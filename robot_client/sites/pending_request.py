@@ -29,7 +29,7 @@ class PendingRequest:
 
     outgoing: what of the arguments is inside the body, and what was packed.
     attempt: how often it was sent, counted from 1.
-    last_message: the number of the message that carried it last.
+    last_message: the number of the message that carried it last; 0 if it was never sent.
     doubtful: whether its large arguments were only named, and the server may lack one of them.
     """
 
@@ -88,7 +88,7 @@ class PendingRequest:
             failure=failure,
             censored=censored,
             bytes_out=self.bytes_out,
-            started=started,
+            started=started and self.last_message > 0,
             packed=self.outgoing.packed,
         )
 

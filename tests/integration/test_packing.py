@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from offboard.common.errors import CannotCross
+from offboard.common.errors import CannotCross, CloudTimeout
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import BOTH
@@ -98,6 +98,18 @@ def test_packing_that_raises_is_answered_onboard(
             assert isinstance(failed.failure, CannotCross)
             assert (str(failed.failure).removeprefix("ProtocolError: "), failed.started) == (said, False)
     assert len([one for one in caplog.records if said in one.getMessage()]) == 1
+
+
+def test_packing_that_takes_longer_than_the_timeout_is_answered_onboard(
+    testbed: Beds, connect: Connect
+) -> None:
+    """Nothing was sent, so this also holds for a task that never runs twice."""
+    offload = connect(testbed(TASKS))
+    assert offload(packing_tasks.slow, 7, where=CLOUD, timeout_s=packing_tasks.PACK_S / 2) == [7, os.getpid()]
+    late = execution(offload)
+    assert isinstance(late.failure, CloudTimeout)
+    assert (late.started, late.bytes_out) == (False, 0)
+    assert late.seconds >= packing_tasks.PACK_S
 
 
 def test_arguments_are_compressed_on_a_slow_link_if_they_shrink(

@@ -2,10 +2,12 @@
 
 import asyncio
 import queue
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import pytest
 
@@ -15,7 +17,9 @@ from offboard.robot_client import policies, predictors
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.lifetime import ASYNC_CALLS_MAX
 from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.predictors.base import WARM_UP
 from offboard.robot_client.records.trace import Record
+from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.fakes import ScriptedRunner
 
@@ -142,8 +146,66 @@ def test_a_deadline_prefers_the_site_that_misses_it_least() -> None:
     assert chances[ONBOARD].in_time == pytest.approx(1.0, abs=0.03)
 
 
+class SlowRunner(ScriptedRunner):
+    """Takes tasks, and answers them when the test says so."""
+
+    def __init__(self) -> None:
+        super().__init__(CLOUD, lambda one: Execution(CLOUD, 5.0, one.args[0]))
+        self.futures: list[Future[Execution]] = []
+
+    def submit(self, task: Task, budget_s: float) -> "Future[Execution]":  # noqa: ARG002
+        self.tasks.append(task)
+        self.futures.append(Future())
+        return self.futures[-1]
+
+    def answer_all(self) -> None:
+        for one, future in zip(self.tasks, self.futures, strict=True):
+            future.set_result(self.script(one))
+
+
+def test_a_warm_up_holds_no_answer_back() -> None:
+    """The first answer counts. A slow site is not asked alone while it has not told its time."""
+    memories = Memories(lambda: predictors.make(predictors.LEAST_SQUARES, 50))
+    cloud = SlowRunner()
+    with Offloader([cloud, OnboardRunner()], policy=policies.make("greedy"), memories=memories) as made:
+        for number in range(2, 12):
+            assert made(deadline_echo, number, deadline_s=WAIT_S) == number
+        assert len(cloud.tasks) == WARM_UP
+        cloud.answer_all()
+        assert made.expect(deadline_echo, 5)[CLOUD].seconds == pytest.approx(5.0)
+
+
+STUCK = """
+import threading
+from offboard import DeadlineMissed, Offloader, task
+from offboard.robot_client.sites import onboard
+
+onboard.CLOSE_WAIT_S = 0.05
+
+
+@task("stuck", size=float)
+def stuck(number):
+    threading.Event().wait()
+
+
+with Offloader.connect() as offload:
+    try:
+        offload(stuck, 1, deadline_s=0.05)
+    except DeadlineMissed as missed:
+        print(missed)
+"""
+
+
+def test_a_task_that_never_ends_does_not_keep_the_process() -> None:
+    """The program goes on at the deadline, and its process ends after the close."""
+    done = subprocess.run(
+        [sys.executable, "-c", STUCK], capture_output=True, text=True, timeout=WAIT_S, check=True
+    )
+    assert done.stdout == "task stuck: no answer within 0.05 s; expected: onboard unknown\n"
+
+
 def test_a_task_may_call_with_a_deadline(offload: Offloader) -> None:
-    """The inner call runs onboard in a thread of its own, beside the task that waits for it."""
+    """The inner call runs onboard in a thread of its own, while the task waits for it."""
     assert offload(deadline_nested, 4) == 4
     assert offload(deadline_nested, 5, deadline_s=WAIT_S) == 5
 

@@ -25,6 +25,10 @@ def array(**fields: Any) -> bytes:
     return bytes(msgpack.packb({b"__ndarray__": True} | {key.encode(): one for key, one in whole.items()}))
 
 
+def scalar(data: Any, dtype: str) -> bytes:
+    return bytes(msgpack.packb({b"__npgeneric__": True, b"data": data, b"dtype": dtype}))
+
+
 def test_golden_bytes() -> None:
     """The format stays as it is."""
     assert pack({"a": np.array([1, 2], np.int16), "b": np.float32(0.5)}) == GOLDEN
@@ -52,6 +56,19 @@ def test_an_array_comes_back_as_it_was(value: "np.ndarray[Any, Any]") -> None:
     assert (back.dtype, back.shape) == (value.dtype, value.shape)
     assert np.array_equal(back, value)
     assert not back.flags.writeable
+
+
+@pytest.mark.parametrize("value", [np.float16(0.1), np.bool_(True), np.uint8(9)])
+def test_a_number_comes_back_as_it_was(value: "np.generic[Any]") -> None:
+    """With its type."""
+    back = unpack(pack(value))
+    assert back == value
+    assert type(back) is type(value)
+
+
+def test_a_number_that_is_too_large_becomes_infinite() -> None:
+    """Without a warning of NumPy, which would be an error in some programs."""
+    assert unpack(scalar(1e300, "<f4")) == np.inf
 
 
 @pytest.mark.parametrize(
@@ -98,9 +115,13 @@ def test_an_observation_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
         array(dtype="f4,f4", shape=[1]),
         array(dtype="S0", shape=[10**9], data=b""),
         array(dtype=4),
-        msgpack.packb({b"__npgeneric__": True, b"data": 300, b"dtype": "|u1"}),
-        msgpack.packb({b"__npgeneric__": True, b"data": [1], b"dtype": "<f4"}),
-        msgpack.packb({b"__npgeneric__": True, b"data": "x", b"dtype": "<f4"}),
+        scalar(300, "|u1"),
+        scalar([1], "<f4"),
+        scalar("x", "<f4"),
+        scalar("1", "<i4"),
+        scalar(True, "<i4"),
+        scalar(b"x", "<U1"),
+        scalar(2**50, "|S1"),  # NumPy would take a petabyte of memory
         msgpack.packb(msgpack.ExtType(7, b"x")),
         msgpack.packb(msgpack.Timestamp(0)),
         b"\x91" * 100 + b"\xc0",

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from offboard.common.errors import CloudBroken, CloudTimeout
@@ -27,6 +28,7 @@ def sent() -> Observation:
     [
         ({"infer_ms": 1500.0}, 1.5),
         ({"infer_ms": 0}, 0.0),
+        ({"infer_ms": np.float64(1500.0)}, 1.5),
         ({"infer_ms": 5000.0}, None),  # longer than the whole time
         ({"infer_ms": -1.0}, None),
         ({"infer_ms": float("nan")}, None),

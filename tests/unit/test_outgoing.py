@@ -55,7 +55,7 @@ def body_of(one: Task, using: Outgoing) -> wire.Body:
 
 
 def test_a_task_is_packed_once_for_all_sites() -> None:
-    """The second site gets the same value, and no second passes for it twice."""
+    """The second site gets the same value, and packing takes no time for it."""
     packed.clear()
     one = new_task(kind_of(half_sum), (np.ones(1000),))
     assert packed == []

@@ -134,6 +134,7 @@ def memory(predictor: str) -> KindMemory:
         energy=Energy(),
         shared_work=False,
         measured=predictor == predictors.PARTS,
+        s_per_quality=1.0,
     )
 
 

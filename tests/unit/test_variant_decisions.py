@@ -41,11 +41,11 @@ class Robot:
         self.onboard = VirtualRunner(ONBOARD, self.clock, HALF_S)
         self.cloud = VirtualRunner(CLOUD, self.clock, WHOLE_S)
         self.records: list[Record] = []
-        made = Settings(predictor=predictors.LEAST_SQUARES, **settings)
+        made = Settings(predictor=predictors.LEAST_SQUARES, window=50, **settings)
         self.offload = Offloader(
             [self.onboard, self.cloud],
             policy=made.make_policy(policy),
-            memories=made.make_memories(policy, 50),
+            memories=made.make_memories(policy),
             allowance=made.allowance(),
             clock=self.clock,
             observers=[self.records.append],

@@ -142,7 +142,7 @@ CHANGED = "f" * 64
             sort_out,
             CLOUD,
             {"sort_out": CHANGED},
-            "the parameters or dataclasses of task sort_out differ on the server",
+            "the parameters, dataclasses or packing of task sort_out differ on the server",
         ),
         (
             sort_out,
@@ -188,6 +188,7 @@ def test_check_compares_the_variant_of_the_cloud() -> None:
         ({"variants": HERE}, "quality= is None; a task with variants needs variants= and quality="),
         ({"quality": GRADES}, "variants= is None; a task with variants needs variants= and quality="),
         ({"variants": {}, "quality": GRADES}, "variants= is {}; a task with variants needs"),
+        ({"variants": HERE, "quality": 0.8}, "quality= is 0.8; a task with variants needs"),
         ({"variants": [small], "quality": GRADES}, r"variants= is \[.*; a task with variants needs"),
         (
             {"variants": {"onbord": small}, "quality": GRADES},
@@ -256,6 +257,18 @@ def test_the_name_of_a_variant_fits_into_a_message() -> None:
     """The names of task and site together have a limit."""
     with pytest.raises(ConfigError, match=r"'x{60}@onboard' has over 64 characters"):
         task("x" * 60, size=float, variants={"onboard": small}, quality=GRADES)(small)
+
+
+def test_each_variant_counts_as_a_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All names of a process fit into one `hello`; a task that is registered again counts once."""
+    count = sum(1 + len(kind.variants) for kind in tasks.kinds())
+    monkeypatch.setattr(tasks, "KINDS_MAX", count + 2)
+    said = f"has at most {count + 2} tasks, and each variant counts as one more"
+    with pytest.raises(ConfigError, match=said):
+        register(small, variants=HERE, quality=GRADES)
+    for _ in range(2):
+        task("counted_once", size=float)(small)
+        task("counted_too", size=float)(large)
 
 
 def test_dataclasses_are_common_to_all_variants() -> None:

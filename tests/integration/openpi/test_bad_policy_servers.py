@@ -97,7 +97,7 @@ def test_a_task_that_is_not_declared_stays_onboard() -> None:
     with serving(stays) as endpoint, Offloader.connect(sites={"gpu": endpoint}) as offload:
         absent = offload.wait_for_sites(undeclared, START_S)
         assert absent == {
-            "gpu": "a policy server takes tasks with policy_server=True only; openpi_undeclared has not"
+            "gpu": "a policy server takes only tasks with policy_server=True; openpi_undeclared is none"
         }
         assert offload(undeclared, 5) == 5
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from offboard.common.errors import CloudBroken, CloudTimeout
@@ -28,6 +29,7 @@ ROOT = Path(__file__).parents[3]
 PAGE, ENDPOINT = ROOT / "docs" / "policy_servers.md", "ws://127.0.0.1:8000"
 CALLS, KILL_AT, RESTART_AT, LATE_AT = 200, 80, 110, 160
 TIMEOUT_S = 0.25
+LARGE = 32 * 2**20  # bytes, more than the kernel keeps for a connection
 RUN_S = 60.0
 SLACK_S = 1.0  # of a busy machine
 USED_MIN = 0.7  # of the calls while the server is there; the default policy also probes
@@ -135,6 +137,23 @@ def test_a_frozen_server_is_silent_and_a_busy_one_is_not(policy_server: Callable
         assert runner.unavailable(kind) is None
         server.signal(signal.SIGCONT)
         until(lambda: not runner.condition().silent)
+
+
+def test_a_frozen_server_that_does_not_take_an_observation(
+    policy_server: Callable[[], PolicyServer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its task ends in time. After ABANDONED_MAX_S more the robot connects again."""
+    monkeypatch.setattr("offboard.robot_client.openpi.policy_server.ABANDONED_MAX_S", TIMEOUT_S)
+    server, kind = policy_server(), kind_of(act)
+    with closing(PolicyServerRunner(server.endpoint, site="gpu")) as runner:
+        until(lambda: runner.unavailable(kind) is None)
+        server.signal(signal.SIGSTOP)
+        large = observation(more=np.zeros(LARGE, np.uint8))
+        late = runner.submit(Task(kind, (large,), 2), TIMEOUT_S).result(START_S)
+        assert isinstance(late.failure, CloudTimeout)
+        until(lambda: "it does not take the observation" in str(runner.unavailable(kind)))
+        server.signal(signal.SIGCONT)
+        until(lambda: runner.unavailable(kind) is None)
 
 
 def test_the_example_of_the_page_runs(policy_server: Callable[[], PolicyServer], tmp_path: Path) -> None:

@@ -76,6 +76,18 @@ def test_a_compressed_blob_counts_with_all_its_bytes(serve: Serve, join: Join) -
     assert running.counted("blob_bytes") == 800_000
 
 
+def test_a_flood_of_compressed_blobs_is_cut_off(serve: Serve, join: Join) -> None:
+    """Few bytes that stand for far more than a robot may send end its connection, as so many bytes would."""
+    most, size = 2**23, 2**23 - 2**19
+    running = serve(robot_bytes_per_s=2**20, message_bytes_max=most, blob_bytes_max=most)
+    peer, packed = join(running.server.endpoint), compress(bytes(size))
+    for _ in range(4):
+        peer.send(Blob(packed, size))
+    until(lambda: running.counted("cut_off_total") == 1)
+    assert running.counted("blob_bytes") == size
+    assert running.counted("dropped_total", reason="quota") == 3
+
+
 def test_a_waiting_request_keeps_its_blobs(serve: Serve, join: Join, pipe: Path) -> None:
     """A blob that leaves the store while a request waits for its turn is still there when it runs."""
     peer = join(serve(blob_bytes_max=500_000).server.endpoint)
