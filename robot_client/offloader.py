@@ -168,7 +168,8 @@ class Offloader:
         a remote site, after which the task runs onboard. `deadline_s` bounds the wait of the caller: after
         it the call raises DeadlineMissed, and the task runs to its end in another thread.
         """
-        self._life.refuse_in_fork()
+        if self._life.forked:
+            self._life.refuse_in_fork()
         budget_s = self._timeout_s if timeout_s is None else checked_timeout(timeout_s)
         kind = kind_of(function)
         args = kind.bind(args, kwargs)

@@ -101,7 +101,8 @@ class TaskRuns:
         return late
 
     def _begun(self, pending: PendingTask, site: str) -> None:
-        predicted_s = pending.predicted_s(site)
+        outlook = pending.forecast.sites.get(site)
+        predicted_s = (outlook.predicted_s if outlook else None) or 0.0
         with self._lock:
             self._flights.begin(site, pending.task.id, predicted_s=predicted_s, now_s=self._clock.now_s())
             self._begun_onboard += site == ONBOARD

@@ -69,11 +69,12 @@ def plan_of(
         first = tuple(site for site in forecast.sites if site not in decision.spared)
         waits = decision.policy == PINNED or not hurried
         return Plan(first, decision.second, all=waits, keep=True, call=call)
-    if decision.measured is not None:  # that run starts after the answer
-        return Plan((decision.site,), call=call)
-    plan = Plan((decision.site,), decision.second, call=call)
-    if isinstance(decision.second, Probe):
+    second = decision.second
+    if isinstance(second, Probe) and not second.answers:  # that run starts after the answer
+        second = None
+    plan = Plan((decision.site,), second, call=call)
+    if isinstance(second, Probe):
         # A hedge waits for nothing: it starts because the chosen site is late by more than this.
         sites = forecast.sites
-        plan.patience_s = sites[decision.second.site].quality.lost_s - sites[decision.site].quality.lost_s
+        plan.patience_s = sites[second.site].quality.lost_s - sites[decision.site].quality.lost_s
     return plan

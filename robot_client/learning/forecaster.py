@@ -8,11 +8,9 @@ from collections.abc import Collection, Mapping
 from offboard.common.tasks import Size, Task
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.runs_in_flight import Flights
-from offboard.robot_client.learning.site import SiteMemory
 from offboard.robot_client.policies import Forecast, Outlook
 from offboard.robot_client.policies.allowance import Allowance
-from offboard.robot_client.policies.forecast import Packing
-from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Runner, Sending
+from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Runner
 
 
 class Forecaster:
@@ -27,7 +25,7 @@ class Forecaster:
         self, memory: KindMemory, task: Task, sites: Collection[str], *, timeout_s: float, now_s: float
     ) -> Forecast:
         """The forecast of one task on these sites, behind all runs that are under way."""
-        amount, outlooks = memory.amount(task.size), {}
+        amount, outlooks, packs = memory.amount(task.size), {}, task.kind.pack is not None
         for site in sites:
             known, in_flight = memory.site(site), self._flights.count(site)
             condition = self._behind(site, in_flight, now_s) if known.measured else UNMEASURED
@@ -38,7 +36,8 @@ class Forecaster:
                 in_flight=in_flight,
                 timeout_s=timeout_s,
                 bytes_out=sending.bytes,
-                packing=_packing(memory, known, sending),
+                # Most tasks have nothing to make smaller, so that is asked first.
+                packing=memory.packing.plan(sending, known.link_s) if packs or sending.large else None,
             )
         return self._with_allowance(memory, task.size, outlooks)
 
@@ -49,7 +48,7 @@ class Forecaster:
 
         `own` holds the sites that may be used, and how many tasks of the batch each of them has.
         """
-        amount, outlooks = memory.amount(task.size), {}
+        amount, outlooks, packs = memory.amount(task.size), {}, task.kind.pack is not None
         for site, count in own.items():
             known = memory.site(site)
             condition = self._apart_from(site, count) if known.measured else UNMEASURED
@@ -60,7 +59,7 @@ class Forecaster:
                 in_flight=count,
                 timeout_s=timeout_s,
                 bytes_out=sending.bytes,
-                packing=_packing(memory, known, sending),
+                packing=memory.packing.plan(sending, known.link_s) if packs or sending.large else None,
             )
         return self._with_allowance(memory, task.size, outlooks)
 
@@ -90,10 +89,3 @@ class Forecaster:
     def _apart_from(self, site: str, own: int) -> Condition:
         condition = self._runners[site].condition()
         return condition._replace(queue=max(0, condition.queue - own))
-
-
-def _packing(memory: KindMemory, known: SiteMemory, sending: Sending) -> Packing | None:
-    """What to make smaller on the way to the site. Most tasks have nothing, so that is asked first."""
-    if not sending.large and memory.kind.pack is None:
-        return None
-    return memory.packing.plan(sending, known.link_s)

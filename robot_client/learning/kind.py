@@ -98,6 +98,8 @@ class KindMemory:
 
     def work_of_any(self, executions: Iterable[Execution]) -> float | None:
         """The work of a task, by the first of its executions whose result says it."""
+        if self._work is None:
+            return None
         return next((work for one in executions if (work := self.work_of(one)) is not None), None)
 
     def learn_size(self, size: Size, work: float) -> None:

@@ -42,11 +42,6 @@ class PendingTask:
     deadline_s: float | None = None
     ended: dict[str, Execution] = field(default_factory=dict)
 
-    def predicted_s(self, site: str) -> float:
-        """What the task should take there; 0 if that is unknown."""
-        outlook = self.forecast.sites.get(site)
-        return (outlook.predicted_s if outlook else None) or 0.0
-
     def task_for(self, site: str) -> Task:
         """The task as this site gets it."""
         outlook = self.forecast.sites.get(site)

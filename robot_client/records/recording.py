@@ -73,7 +73,7 @@ def record_of(
         size=pending.task.size,
         sites=pending.forecast.sites,
         decision=pending.decision,
-        executions=tuple(execution.without_value() for execution in executions),
+        executions=tuple([execution.without_value() for execution in executions]),
         used=answer.site if answer.ok else None,
         waited_s=ended_s - pending.started_s,
         amount=pending.amount,

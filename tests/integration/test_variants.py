@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from offboard import Offloader
+from offboard import Offloader, Settings
 from offboard.common.tasks import kind_of
 from offboard.loadgen.play.play_scenario import play
 from offboard.loadgen.play.run_files import EVENTS, TRACE
@@ -69,8 +69,8 @@ def shown(record: Record) -> str:
 
 def test_a_batch_stays_on_the_better_variant(testbed: Beds) -> None:
     """Onboard is free, but an item there would lose more than the cloud's queue costs; warm-up aside."""
-    bed = testbed(SERVED, delay_ms=5.0)
-    with Offloader.connect(bed.endpoint) as offload:
+    bed, settings = testbed(SERVED, delay_ms=5.0), Settings(s_per_quality=10.0)
+    with Offloader.connect(bed.endpoint, settings=settings) as offload:
         assert offload.wait_for_sites(grade, CONNECT_S) == {}
         answers = offload.map(grade, range(30))
         assert [one[2] for one in answers] == list(range(30))
