@@ -3,12 +3,13 @@
 Each task runs in the cloud, then onboard, so that both times and both answers can be compared.
 """
 
+import contextlib
 import importlib
 import itertools
 import os
 import statistics
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -18,6 +19,7 @@ from benchmarks.measure import Requirement, Table
 from offboard.common.command_line import CommandParser, add_flags, run_command
 from offboard.common.config import check, resolve, setting
 from offboard.common.errors import ConfigError, OffloadError
+from offboard.common.task_states import TaskStates
 from offboard.common.toml_file import unknown
 from offboard.common.wire.compression import compressions
 from offboard.common.wire.payload import payload_bytes
@@ -116,29 +118,55 @@ def measure(name: str, config: PackingConfig) -> Table:
     config.out.mkdir(parents=True, exist_ok=True)
     with LocalTestbed(config.out / name, {"cloud": Setup(cloud), "wan": Setup(link)}) as bed:
         bed.start()
-        ways = {way: play(module, way, bed.endpoint, config) for way in WAYS}
+        ways = play(module, bed.endpoint, config)
     title = f"{name}, {config.bandwidth_mbps:g} Mbit/s, {config.delay_ms:g} ms each way"
-    medians = {way: statistics.median(one.seconds for one in known) for way, known in ways.items()}
-    loss = medians[AUTOMATIC] / medians[RAW]
+    pairs = zip(ways[AUTOMATIC], ways[RAW], strict=True)
+    loss = statistics.median(automatic.seconds / raw.seconds for automatic, raw in pairs)
     needed = Requirement(f"{name}: true time of {AUTOMATIC}, relative to {RAW}", loss, LOSS_MAX)
     return Table(title, COLUMNS, [row(way, known) for way, known in ways.items()], [needed])
 
 
-def play(module: ModuleType, way: str, endpoint: str, config: PackingConfig) -> list[Measured]:
-    """The tasks of one way, without those of the warm-up."""
+def play(module: ModuleType, endpoint: str, config: PackingConfig) -> dict[str, list[Measured]]:
+    """The tasks of each way, without those of the warm-up.
+
+    Each task runs in all ways before the next one, so that what else the computer does affects all of them.
+    """
+    found: dict[str, list[Measured]] = {way: [] for way in WAYS}
+    states = TaskStates(workers=1)
+    with contextlib.ExitStack() as opened:
+        robots = {
+            way: opened.enter_context(_robot(module, way, endpoint, config=config, states=states))
+            for way in WAYS
+        }
+        for number, args in enumerate(itertools.islice(module.inputs(config.seed), config.tasks)):
+            turn = number % len(WAYS)
+            for way in (*WAYS[turn:], *WAYS[:turn]):
+                one = _measured(robots[way], _function(module, way), args, module.same)
+                if one is not None:
+                    found[way].append(one)
+    print(f"{module.__name__}: {config.tasks} tasks in each way", file=sys.stderr, flush=True)
+    return found
+
+
+def _function(module: ModuleType, way: str) -> Callable[..., Any]:
     function: Callable[..., Any] = module.packed if way == PACKED else module.PLAIN
+    return function
+
+
+@contextlib.contextmanager
+def _robot(
+    module: ModuleType, way: str, endpoint: str, *, config: PackingConfig, states: TaskStates
+) -> Iterator[Offloader]:
+    """A robot that sends its arguments in this way."""
     trace = config.out / f"{module.__name__.rpartition('_')[2]}-{way}.jsonl"
     trace.unlink(missing_ok=True)
-    settings = Settings(predictor=PARTS, heartbeats=True, compress=way == AUTOMATIC)
+    settings = Settings(predictor=PARTS, heartbeats=True, compress=way == AUTOMATIC, states=states)
     with Offloader.connect(
         endpoint, policy=CLOUD, timeout_s=TIMEOUT_S, trace=trace, settings=settings
     ) as offload:
-        if absent := offload.wait_for_sites(function, READY_S):
+        if absent := offload.wait_for_sites(_function(module, way), READY_S):
             raise OffloadError(str(absent))
-        tasks = itertools.islice(module.inputs(config.seed), config.tasks)
-        found = [one for args in tasks if (one := _measured(offload, function, args, module.same))]
-    print(f"{module.__name__}, {way}: {config.tasks} tasks", file=sys.stderr, flush=True)
-    return found
+        yield offload
 
 
 def _measured(

@@ -174,4 +174,4 @@ def test_the_example_of_the_page_runs(policy_server: Callable[[], PolicyServer],
     first, *steps = done.stdout.splitlines()
     assert first == "all sites can take this task"
     assert [line.split()[0] for line in steps] == [str(step) for step in range(20)]
-    assert any(line.split()[1] == "gpu" for line in steps), steps
+    assert [line.split()[1] for line in steps].count("gpu") > len(steps) / 2, steps
