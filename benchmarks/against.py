@@ -98,6 +98,7 @@ def main() -> int:
     parser.add_argument("before", type=Path, metavar="CHECKOUT", help="the other checkout")
     parser.add_argument("--cases", default=",".join(CASES), help="some of %(default)s")
     parser.add_argument("--strategies", default=",".join(STRATEGIES), help="some of %(default)s")
+    parser.add_argument("--tasks", type=int, help="tasks of each run (default: 150 of plans, 60 of others)")
     parser.add_argument("--seeds", type=int, default=1, help="runs of each (default: %(default)s)")
     parser.add_argument("--first-seed", type=int, default=1, help="(default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("out/against"), help="(default: %(default)s)")
@@ -121,7 +122,14 @@ def main() -> int:
             for strategy in [*strategies[turn:], *strategies[:turn]]:
                 checkout, policy = STRATEGIES[strategy]
                 out = file.parent / f"{seed}-{strategy}"
-                play(checkouts[checkout], file, out, policy=policy, seed=seed, tasks=CASES[name].tasks)
+                play(
+                    checkouts[checkout],
+                    file,
+                    out,
+                    policy=policy,
+                    seed=seed,
+                    tasks=flags.tasks or CASES[name].tasks,
+                )
                 runs[strategy].append(read(out))
         found[name] = runs
         print(table(name, runs), flush=True)

@@ -65,14 +65,11 @@ class Forecaster:
 
     def _with_allowance(self, memory: KindMemory, size: Size, outlooks: Mapping[str, Outlook]) -> Forecast:
         allowance = self._allowance
-        return Forecast(
-            size=size,
-            sites=outlooks,
-            last_site=memory.last_site,
-            duplicates=allowance.duplicates if memory.kind.duplicate else 0.0,
-            bytes_left=allowance.bytes_left,
-            joules_left=allowance.joules_left,
-        )
+        duplicates = allowance.duplicates if memory.kind.duplicate else 0.0
+        forecast = Forecast(size, outlooks, last_site=memory.last_site, duplicates=duplicates)
+        if not allowance.capped:
+            return forecast
+        return forecast._replace(bytes_left=allowance.bytes_left, joules_left=allowance.joules_left)
 
     def _behind(self, site: str, in_flight: int, now_s: float) -> Condition:
         """The condition of a site behind the runs under way there.

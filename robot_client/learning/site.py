@@ -20,6 +20,8 @@ from offboard.robot_client.predictors.line import RunningMean
 from offboard.robot_client.predictors.parts import Parts
 from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Execution
 
+NOT_OF_THE_SITE = (TaskError, CannotCross)  # failures that another site would have too
+
 
 @dataclass(slots=True)
 class Observation:
@@ -162,11 +164,11 @@ class SiteMemory:
         nothing to any. With `beside`, the robot ran the same task itself.
         """
         expected_s, ok = outlook.predicted_s if outlook else None, execution.ok
-        overtaken = isinstance(execution.failure, Overtaken)
+        overtaken = not ok and isinstance(execution.failure, Overtaken)
         if overtaken and execution.seconds <= (expected_s or 0.0):
             return  # stopped before its predicted time: the site may be as fast as predicted
         self.age = 0
-        if isinstance(execution.failure, TaskError | CannotCross):
+        if isinstance(execution.failure, NOT_OF_THE_SITE):
             if isinstance(execution.failure, TaskError) and not execution.started:
                 self._failures += 1  # its setup failed: the site is at fault, not the task
             return

@@ -81,7 +81,10 @@ class Named:
         self._name = name
 
     def decide(self, forecast: Forecast) -> Decision:
-        return self._policy.decide(forecast)._replace(policy=self._name)
+        found = self._policy.decide(forecast)
+        return Decision(  # `_replace` is slower
+            found.site, found.why, self._name, both=found.both, second=found.second, spared=found.spared
+        )
 
 
 def decide_among(sites: Collection[str], forecast: Forecast, policy: Policy) -> Decision:

@@ -20,7 +20,7 @@ TAIL_SHARE = 0.2  # of the errors, the largest ones: they say how much longer a 
 BEYOND = 0.25  # of the distance from the median to the largest error: later than that, no task has ended
 
 
-@dataclass(frozen=True)
+@dataclass
 class PredictionErrors:
     """How wrong the last predictions for one site were; a value that never changes.
 

@@ -23,15 +23,10 @@ class WithProbes:
         decision = self._inner.decide(forecast)
         if decision.both or decision.second or forecast.duplicates < 2:  # one is left for a hedge
             return decision
-        ages = {
-            site: one.age
-            for site, one in forecast.sites.items()
-            if one.age >= PROBE_EVERY
-            and site != decision.site
-            and not one.in_flight
-            and not one.condition.silent
-        }
-        if not ages:
+        stalest, age = None, PROBE_EVERY - 1
+        for site, one in forecast.sites.items():
+            if one.age > age and site != decision.site and not (one.in_flight or one.condition.silent):
+                stalest, age = site, one.age
+        if stalest is None:
             return decision
-        stalest = max(ages, key=ages.__getitem__)
         return decision._replace(second=Probe(stalest), why=f"{decision.reason}; {stalest} is probed")

@@ -64,9 +64,9 @@ class Line:
             self._begin(x, y, known)
             return
         rate = max(RATE, 1.0 / self.count)
-        error = y - self.a - self.b * x
-        unit = 0.5 * (max(0.0, self.a + self.b * x + known) + self._usual) or 1.0
-        self._usual += rate * (min(y + known, ODD * self._usual) - self._usual)
+        error, usual = y - self.a - self.b * x, self._usual
+        unit = 0.5 * (max(0.0, self.a + self.b * x + known) + usual) or 1.0
+        self._usual += rate * (min(y + known, ODD * usual) - usual)
         self._loosen(PACE * PACE, known)
         variance, reach = self._reach(x, unit)
         side = math.copysign(1.0, error) if abs(error) > reach else 0.0
@@ -152,4 +152,5 @@ class RunningMean:
 
     def add(self, one: float) -> None:
         self.count += 1
-        self.value += max(RATE, 1.0 / self.count) * (one - self.value)
+        rate = 1.0 / self.count
+        self.value += (rate if rate > RATE else RATE) * (one - self.value)
