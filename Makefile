@@ -14,7 +14,9 @@ PEERS_READY := $(VENV)/.peers-ready
 EXAMPLES_BIN := .cache/examples/bin
 EXAMPLES_READY := .cache/examples/.ready
 
-.PHONY: help demo install format lint type test unit pythons integration compose chaos state bench examples browser torch up down table lock wheel clean
+ROS2_READY := .cache/ros2-kilted/.ready .cache/ros2-jazzy/.ready
+
+.PHONY: help demo install format lint type test unit pythons integration compose chaos state bench examples ros2 browser torch up down table lock wheel clean
 
 help: ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -42,7 +44,7 @@ type: $(DEV_READY) ## check types with mypy, strict, on the unpacked wheel
 CROWDED := tests/unit tests/integration/executors tests/integration/keys tests/integration/toxiproxy $(addprefix tests/integration/test_,$(addsuffix .py,alone attacks blobs channel check compare cpu_time crashes dataset demo fuzz own_task local_testbed robot_workload values_cross wheel))
 test: $(DEV_READY) ## run every test that this machine can run; skipped tests say why
 	$(BIN)/pytest --numprocesses 2 $(CROWDED)
-	$(BIN)/pytest $(addprefix --ignore ,$(CROWDED))
+	$(BIN)/pytest --ignore tests/ros2 $(addprefix --ignore ,$(CROWDED))
 
 unit: $(DEV_READY) ## run the tests without sockets
 	$(BIN)/pytest --numprocesses 2 tests/unit
@@ -69,6 +71,9 @@ bench: $(PEERS_READY) ## measure speed next to other libraries; needs an otherwi
 
 examples: $(EXAMPLES_READY) ## measure the five applications with one seed, FULL=1: with three; needs an otherwise idle machine
 	$(EXAMPLES_BIN)/python -m benchmarks.applications $(if $(FULL),--seeds 3)
+
+ros2: $(DEV_READY) $(ROS2_READY) ## build two environments with real rclpy, and test the planner node in them; needs python3.11, python3.12, cmake and a C++ compiler
+	tests/ros2/alone.sh $(BIN)/pytest tests/ros2
 
 browser: $(DEV_READY) ## run the tests in a real browser; needs Chromium
 	$(BIN)/pytest tests/browser
@@ -121,4 +126,11 @@ $(EXAMPLES_READY): requirements/examples.txt pyproject.toml
 	test -x $(EXAMPLES_BIN)/python || $(PYTHON) -m venv .cache/examples
 	$(EXAMPLES_BIN)/python -m pip install --quiet --require-hashes -r requirements/examples.txt
 	$(EXAMPLES_BIN)/python -m pip install --quiet --no-deps --editable .
+	touch $@
+
+# Nothing else may live in these environments: the wheels of ROS restart Python, and bring an old OpenSSL.
+.cache/ros2-kilted/.ready: ROS2_PYTHON := python3.11
+.cache/ros2-jazzy/.ready: ROS2_PYTHON := python3.12
+.cache/ros2-%/.ready: requirements/ros2-%.txt tests/ros2/build.py $(wildcard tests/ros2/interfaces/*/*/*)
+	$(ROS2_PYTHON) tests/ros2/build.py $* .cache/ros2-$*
 	touch $@

@@ -21,7 +21,7 @@ def _run(package: str, argv: Sequence[str]) -> int:
 
 COMMANDS = {
     "client": Command(
-        "make the keys of a robot, and check its way to a server (robot-client)",
+        "make the keys of a robot, check its way to a server, plan for nav2 (robot-client)",
         partial(_run, "robot_client"),
     ),
     "server": Command("run tasks for robots (cloud-server)", partial(_run, "cloud_server")),

@@ -13,17 +13,18 @@ EXTRAS = {
     "examples": ["examples", "bench"],
 }
 
-FOR_TESTS = ("openpi",)  # environments of their own; NAME.in holds what they need
+# Environments of tests, each with its oldest Python; NAME.in holds what they need.
+FOR_TESTS = {"openpi": "3.11", "ros2-kilted": "3.11", "ros2-jazzy": "3.12"}
 
 OPTIONS = (
-    *("--quiet", "--universal", "--python-version", "3.11", "--generate-hashes", "--upgrade"),
+    *("--quiet", "--universal", "--generate-hashes", "--upgrade"),
     *("--no-emit-index-url", "--no-emit-find-links", "--no-header", "--no-annotate"),
 )
 
 for name, extras in EXTRAS.items():
     chosen = [part for extra in extras for part in ("--extra", extra)]
     out = ("--output-file", str(HERE / f"{name}.txt"), str(HERE.parent / "pyproject.toml"))
-    subprocess.run(["uv", "pip", "compile", *OPTIONS, *chosen, *out], check=True)
-for name in FOR_TESTS:
+    subprocess.run(["uv", "pip", "compile", *OPTIONS, "--python-version", "3.11", *chosen, *out], check=True)
+for name, python in FOR_TESTS.items():
     files = ("--output-file", str(HERE / f"{name}.txt"), str(HERE / f"{name}.in"))
-    subprocess.run(["uv", "pip", "compile", *OPTIONS, *files], check=True)
+    subprocess.run(["uv", "pip", "compile", *OPTIONS, "--python-version", python, *files], check=True)

@@ -1,6 +1,6 @@
-"""`robot-client`: the commands that prepare a robot.
+"""`robot-client`: the commands that prepare a robot, and the planner server for ROS 2.
 
-What a command does is in `check` and `common.security.keys`.
+What a command does is in `check`, `common.security.keys` and `offboard/ros2`.
 """
 
 import os
@@ -14,7 +14,7 @@ from offboard.robot_client.sites.runner import check_endpoint
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    about = "Prepares a robot: makes its keys, and checks whether it can use a server."
+    about = "Makes the keys of a robot, checks whether it can use a server, and plans its paths with ROS 2."
     return run_commands("robot-client", about, COMMANDS, sys.argv[1:] if argv is None else argv)
 
 
@@ -50,9 +50,16 @@ def _make_keys(argv: Sequence[str]) -> int:
     return 0
 
 
+def _ros2(argv: Sequence[str]) -> int:
+    from offboard.ros2.command import run_ros2
+
+    return run_ros2(argv)
+
+
 COMMANDS = {
     "check": Command("check whether this robot can use a server", _check),
     "keys": Command("make the keys of this robot", _make_keys),
+    "ros2": Command("plan paths for nav2, in place of its planner_server", _ros2),
 }
 
 if __name__ == "__main__":

@@ -1,0 +1,78 @@
+"""The command `robot-client ros2`: reads the settings, and runs the planner server as a node of ROS 2.
+
+What the node does is in `node`.
+"""
+
+import logging
+import os
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+from offboard.common.command_line import load
+from offboard.common.config import as_dict
+from offboard.ros2.config import Ros2Config
+
+if TYPE_CHECKING:
+    from offboard.robot_client.offloader import Offloader
+    from offboard.ros2.diagnostics import Diagnostics
+
+ROS_ARGS = "--ros-args"
+ABOUT = (
+    "Plan paths for nav2 onboard or in the cloud: a node that replaces nav2's planner_server. "
+    f"What follows {ROS_ARGS} is for ROS, for example: {ROS_ARGS} -p robot_radius:=0.2."
+)
+
+log = logging.getLogger(__name__)
+
+
+def run_ros2(argv: Sequence[str]) -> int:
+    """Run the node, or the bridge, until it is interrupted."""
+    own = list(argv[: argv.index(ROS_ARGS)] if ROS_ARGS in argv else argv)
+    for_ros = list(argv[len(own) :])
+    config = load(
+        Ros2Config, own, prog="robot-client ros2", description=ABOUT, environ=os.environ, prefix="ROBOT_ROS2"
+    )
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    serve = _bridge(for_ros) if config.bridge else _node(for_ros)
+    log.info("settings: %s", as_dict(config))
+    from offboard.robot_client.records.recording import Recording
+    from offboard.ros2.diagnostics import Diagnostics
+    from offboard.ros2.planner_server import prepare
+    from offboard.ros2.stop import connect
+
+    with ExitStack() as stack:
+        recording = Recording(trace=config.trace, metrics=config.metrics)
+        stack.callback(recording.close)
+        facts = Diagnostics()
+        offload = stack.enter_context(
+            connect(
+                config.cloud,
+                policy=config.policy,
+                timeout_s=config.timeout_s,
+                keys=config.keys,
+                settings=config.settings(),
+                observers=[facts, *recording.observers],
+            )
+        )
+        for line in prepare(offload, config.connect_s):
+            log.warning("starting without %s; goals are planned elsewhere", line)
+        serve(offload, facts)
+    return 0
+
+
+Serve = Callable[["Offloader", "Diagnostics"], None]
+
+
+def _node(arguments: Sequence[str]) -> Serve:
+    from offboard.ros2.node import serve  # needs rclpy
+
+    return lambda offload, facts: serve(offload, facts, arguments)
+
+
+def _bridge(arguments: Sequence[str]) -> Serve:
+    from offboard.ros2.bridge import serve  # needs cyclonedds
+    from offboard.ros2.parameters import read_arguments
+
+    parameters = read_arguments(arguments)
+    return lambda offload, facts: serve(offload, facts, parameters)

@@ -1,0 +1,151 @@
+"""What the messages of each topic mean to the planner server, whatever library carries them.
+
+`node` carries them with rclpy, `bridge` with cyclonedds.
+"""
+
+import logging
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+
+from offboard.common.planning.planner import Pose
+from offboard.robot_client.offloader import Offloader
+from offboard.ros2.converters import (
+    Header,
+    Library,
+    grid_of,
+    moved,
+    moved_scan,
+    path_message,
+    pose_of,
+    scan_of,
+)
+from offboard.ros2.diagnostics import Diagnostics
+from offboard.ros2.parameters import Parameters
+from offboard.ros2.planner_server import ABORTED, Goal, Outcome, PendingGoal, PlannerServer
+from offboard.ros2.world import World
+
+NAME = "planner_server"
+SAME = Pose(0.0, 0.0)
+
+log = logging.getLogger(__name__)
+
+
+class Transforms(Protocol):
+    """Knows where frames are."""
+
+    def of(self, frame: str, seen_from: str) -> Pose | None:
+        """The pose of a frame in another one; None if it is unknown."""
+
+
+class SameFrames:
+    """Knows only that a frame is where it is."""
+
+    def of(self, frame: str, seen_from: str) -> Pose | None:
+        return SAME if frame == seen_from else None
+
+
+class Topics:
+    """The planner server and its world, told of by messages. One thread calls all methods but `path`."""
+
+    def __init__(
+        self,
+        library: Library,
+        offload: Offloader,
+        *,
+        parameters: Parameters,
+        facts: Diagnostics,
+        transforms: Transforms,
+    ) -> None:
+        self._library = library
+        self._map_frame, self._robot_frame = parameters.limits.frame, parameters.robot_frame
+        self._world = World(allow_unknown=parameters.allow_unknown, costmap=parameters.costmap)
+        self._planner = PlannerServer(offload, self._world, parameters.limits)
+        self._facts = facts
+        self._transforms = transforms
+        self._warned: set[str] = set()
+
+    def close(self) -> None:
+        self._planner.close()
+
+    def see_map(self, message: Any) -> None:
+        """An OccupancyGrid."""
+        try:
+            self._world.see_map(grid_of(message))
+        except ValueError as error:
+            self._warn(f"a map is ignored: {error}")
+
+    def update_map(self, message: Any) -> None:
+        """An OccupancyGridUpdate."""
+        cells = np.frombuffer(message.data, np.int8)
+        fits = cells.size == message.height * message.width
+        if not fits or not self._world.update_map(
+            message.x, message.y, cells.reshape(message.height, message.width)
+        ):
+            self._warn("an update does not fit the map, and is ignored")
+
+    def see_pose(self, message: Any) -> None:
+        """A PoseWithCovarianceStamped or an Odometry; one in another frame says nothing."""
+        if message.header.frame_id == self._map_frame:
+            self._world.see_pose(pose_of(message.pose.pose))
+
+    def see_scan(self, message: Any) -> None:
+        """A LaserScan."""
+        frame = message.header.frame_id
+        laser = self._transforms.of(frame, self._robot_frame)
+        if laser is None:
+            self._warn(f"scans in frame {frame!r} are ignored: its place on the robot is not known")
+            return
+        scan = scan_of(message)
+        self._world.see_scan(scan if laser == SAME else moved_scan(scan, laser))
+
+    def accept(self, goal: Any, start: Any, planner: str, done: Callable[[Outcome], None]) -> PendingGoal:
+        """Plan for a PoseStamped from another one, or from the robot (None). `done` is for the planner."""
+        robot = self._transforms.of(self._robot_frame, self._map_frame)
+        if robot is not None:
+            self._world.see_pose(robot)
+        end, frame = self._in_map(goal)
+        begin, start_frame = (None, "") if start is None else self._in_map(start)
+        return self._planner.accept(
+            Goal(end, frame, start=begin, start_frame=start_frame, planner=planner), done
+        )
+
+    def cancel(self, pending: PendingGoal) -> None:
+        self._planner.cancel(pending)
+
+    def path(self, outcome: Outcome, stamp_ns: int) -> Any:
+        """The Path of an outcome, which is empty if there is none. Any thread may call this."""
+        if outcome.ending == ABORTED:
+            log.warning("no plan: %s: %s", outcome.status, outcome.message)
+        return path_message(self._library, outcome.poses, Header(self._map_frame, stamp_ns))
+
+    def diagnostics(self, stamp_ns: int) -> Any:
+        """A DiagnosticArray with the facts of the offloader."""
+        make = self._library.make
+        values = [
+            make("diagnostic_msgs/msg/KeyValue", key=key, value=value)
+            for key, value in self._facts.values().items()
+        ]
+        status = make(
+            "diagnostic_msgs/msg/DiagnosticStatus",
+            level=self._library.byte(self._facts.level()),
+            name=f"{NAME}: offboard",
+            message=self._facts.summary(),
+            hardware_id="",
+            values=values,
+        )
+        header = Header("", stamp_ns).message(self._library)
+        return make("diagnostic_msgs/msg/DiagnosticArray", header=header, status=[status])
+
+    def _in_map(self, stamped: Any) -> tuple[Pose, str]:
+        """A pose in the frame of the map, or in its own frame if that is unknown."""
+        pose, frame = pose_of(stamped.pose), stamped.header.frame_id
+        place = self._transforms.of(frame, self._map_frame)
+        return (pose, frame) if place is None else (moved(pose, place), self._map_frame)
+
+    def _warn(self, text: str) -> None:
+        """Say it once: the same thing comes with every message of the topic."""
+        if text not in self._warned:
+            self._warned.add(text)
+            log.warning("%s", text)

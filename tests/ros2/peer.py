@@ -1,0 +1,267 @@
+"""A client of nav2's planner server, in a process and an environment of its own.
+
+It imports nothing of Offboard, so that both sides of every message are written independently. It reads one
+JSON command a line from stdin, and answers each with one line.
+"""
+
+import array
+import contextlib
+import json
+import math
+import sys
+import threading
+import time
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid, Path
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from sensor_msgs.msg import Image, LaserScan
+
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+WAIT_S = 30.0
+CODES = (
+    *("NONE", "UNKNOWN", "INVALID_PLANNER", "TF_ERROR", "START_OUTSIDE_MAP", "GOAL_OUTSIDE_MAP"),
+    *("START_OCCUPIED", "GOAL_OCCUPIED", "TIMEOUT", "NO_VALID_PATH"),
+)
+
+
+class Peer:
+    """Publishes what a robot publishes, and asks for paths."""
+
+    def __init__(self) -> None:
+        self.node = rclpy.create_node("peer")
+        self.plans: list[tuple[float, Path]] = []
+        self.facts: dict[str, Any] = {}
+        self.maps = self.node.create_publisher(OccupancyGrid, "map", LATCHED)
+        self.poses = self.node.create_publisher(PoseWithCovarianceStamped, "amcl_pose", LATCHED)
+        self.scans = self.node.create_publisher(LaserScan, "scan", 5)
+        self.goal_poses = self.node.create_publisher(PoseStamped, "goal_pose", 10)
+        self.node.create_subscription(Path, "plan", self._see_plan, 1)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._see_facts, 10)
+
+    def _see_plan(self, message: Path) -> None:
+        self.plans.append((time.perf_counter(), message))
+
+    def _see_facts(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self.facts = {one.key: one.value for one in status.values}
+            self.facts["level"] = int.from_bytes(status.level, "big")
+
+    def map(self, file: str, resolution: float, origin: list[float], frame: str = "map") -> None:
+        """Publish a map from a file of raw int8 cells, whose first line has width and height."""
+        with open(file, "rb") as raw:  # noqa: PTH123 - as few imports as possible
+            width, height = map(int, raw.readline().split())
+            cells = array.array("b", raw.read())
+        message = OccupancyGrid()
+        message.header.frame_id = frame
+        message.info.resolution, message.info.width, message.info.height = resolution, width, height
+        message.info.origin.position.x, message.info.origin.position.y = origin
+        message.info.origin.orientation.w = 1.0
+        message.data = cells
+        self.maps.publish(message)
+
+    def update(self, x: int, y: int, width: int, height: int, value: int) -> None:
+        """Change a rectangle of the map."""
+        from map_msgs.msg import OccupancyGridUpdate
+
+        if not hasattr(self, "updates"):
+            self.updates = self.node.create_publisher(OccupancyGridUpdate, "map_updates", 10)
+            while self.updates.get_subscription_count() == 0:
+                time.sleep(0.01)
+        message = OccupancyGridUpdate(x=x, y=y, width=width, height=height)
+        message.data = array.array("b", [value] * (width * height))
+        self.updates.publish(message)
+
+    def pose(self, x: float, y: float, yaw: float = 0.0, frame: str = "map") -> None:
+        message = PoseWithCovarianceStamped()
+        message.header.frame_id = frame
+        fill(message.pose.pose, x, y, yaw)
+        self.poses.publish(message)
+
+    def scan(self, ranges: list[float], frame: str = "base_link") -> None:
+        """A turn of beams, the first one straight ahead."""
+        message = LaserScan()
+        message.header.frame_id = frame
+        message.angle_increment = 2 * math.pi / len(ranges)
+        message.range_max = 10.0
+        message.ranges = ranges
+        self.scans.publish(message)
+
+    def look(self, row: int, col: int, stamp: int, height: int = 240, width: int = 320) -> list[float]:
+        """Publish an image with one bright spot, and wait for where the node saw it."""
+        if not hasattr(self, "images"):
+            self.spots: list[PointStamped] = []
+            self.images = self.node.create_publisher(Image, "image", qos_profile_sensor_data)
+            self.node.create_subscription(PointStamped, "spot", self.spots.append, 10)
+            while self.images.get_subscription_count() == 0 or self.node.count_publishers("spot") == 0:
+                time.sleep(0.01)
+            time.sleep(0.5)  # each side hears of the other by itself
+        pixels = bytearray(height * width)
+        for line in range(row - 4, row + 5):
+            pixels[line * width + col - 4 : line * width + col + 5] = b"\xff" * 9
+        message = Image(height=height, width=width, encoding="mono8", step=width)
+        message.header.stamp.sec = stamp
+        message.data = array.array("B", bytes(pixels))
+        self.spots.clear()
+        self.images.publish(message)
+        end_s = time.perf_counter() + WAIT_S
+        while not self.spots and time.perf_counter() < end_s:
+            time.sleep(0.0005)
+        spot = self.spots[-1]
+        return [spot.point.y, spot.point.x, spot.header.stamp.sec]
+
+    def topic(self, goal: dict[str, Any]) -> dict[str, Any]:
+        """Ask by topic, and wait for the plan."""
+        before, sent_s = len(self.plans), time.perf_counter()
+        self.goal_poses.publish(stamped(goal))
+        while len(self.plans) == before and time.perf_counter() - sent_s < goal.get("wait_s", WAIT_S):
+            time.sleep(0.0005)
+        if len(self.plans) == before:
+            return {"poses": None}
+        got_s, path = self.plans[-1]
+        return {"poses": rows(path), "seconds": got_s - sent_s, "frame": path.header.frame_id}
+
+
+class Actions:
+    """The client of the action."""
+
+    def __init__(self, node: Any) -> None:
+        from nav2_msgs.action import ComputePathToPose
+        from rclpy.action import ActionClient
+
+        self.type = ComputePathToPose
+        self.client = ActionClient(node, ComputePathToPose, "compute_path_to_pose")
+        if not self.client.wait_for_server(timeout_sec=60.0):
+            raise TimeoutError("no action server compute_path_to_pose")
+
+    def ask(
+        self, goals: list[dict[str, Any]], each_s: float = 0.0, cancel_s: float | None = None
+    ) -> list[Any]:
+        """Send all goals, `each_s` apart, and wait for all results. Negative: each after the one before."""
+        asked = []
+        for goal in goals:
+            asked.append(Asked(self, goal))
+            if each_s < 0:
+                asked[-1].wait()
+            elif each_s > 0:
+                time.sleep(each_s)
+        if cancel_s is not None:
+            for one in asked:
+                one.cancel(cancel_s)
+        return [one.wait() for one in asked]
+
+
+class Asked:
+    """One goal on its way."""
+
+    def __init__(self, actions: Actions, goal: dict[str, Any]) -> None:
+        request = actions.type.Goal()
+        request.goal = stamped(goal)
+        request.planner_id = goal.get("planner", "")
+        if "start" in goal:
+            request.use_start = True
+            request.start = stamped(goal["start"])
+        self._codes = {value: name for name, value in vars_of(actions.type.Result)}
+        self._done = threading.Event()
+        self._accepted = threading.Event()
+        self.sent_s = time.perf_counter()
+        self.accepted_s = self.ended_s = self.canceled_s = math.nan
+        actions.client.send_goal_async(request).add_done_callback(self._accept)
+
+    def _accept(self, future: Any) -> None:
+        self.accepted_s = time.perf_counter()
+        self.handle = future.result()
+        self._accepted.set()
+        self.handle.get_result_async().add_done_callback(self._end)
+
+    def _end(self, future: Any) -> None:
+        self.ended_s = time.perf_counter()
+        self.answer = future.result()
+        self._done.set()
+
+    def cancel(self, after_s: float) -> None:
+        assert self._accepted.wait(WAIT_S)
+        time.sleep(max(0.0, self.accepted_s + after_s - time.perf_counter()))
+        self.canceled_s = time.perf_counter()
+        self.handle.cancel_goal_async()
+
+    def wait(self) -> dict[str, Any]:
+        assert self._done.wait(WAIT_S), "no result"
+        result, planning = self.answer.result, self.answer.result.planning_time
+        return {
+            "status": {4: "succeeded", 5: "canceled", 6: "aborted"}.get(
+                self.answer.status, self.answer.status
+            ),
+            "code": self._codes.get(result.error_code, result.error_code),
+            "message": getattr(result, "error_msg", ""),
+            "poses": rows(result.path),
+            "frame": result.path.header.frame_id,
+            "accept_s": self.accepted_s - self.sent_s,
+            "seconds": self.ended_s - self.sent_s,
+            "after_cancel_s": self.ended_s - self.canceled_s,
+            "ended_s": self.ended_s,
+            "planning_s": planning.sec + planning.nanosec * 1e-9,
+        }
+
+
+def vars_of(result: Any) -> list[tuple[str, int]]:
+    return [(name, getattr(result, name)) for name in CODES]
+
+
+def stamped(goal: dict[str, Any]) -> PoseStamped:
+    message = PoseStamped()
+    message.header.frame_id = goal.get("frame", "map")
+    fill(message.pose, goal["x"], goal["y"], goal.get("yaw", 0.0))
+    return message
+
+
+def fill(pose: Any, x: float, y: float, yaw: float) -> None:
+    pose.position.x, pose.position.y = float(x), float(y)
+    pose.orientation.z, pose.orientation.w = math.sin(yaw / 2), math.cos(yaw / 2)
+
+
+def rows(path: Path) -> list[list[float]]:
+    return [
+        [
+            one.pose.position.x,
+            one.pose.position.y,
+            2 * math.atan2(one.pose.orientation.z, one.pose.orientation.w),
+        ]
+        for one in path.poses
+    ]
+
+
+def spin(executor: SingleThreadedExecutor) -> None:
+    with contextlib.suppress(ExternalShutdownException):
+        executor.spin()
+
+
+def main() -> None:
+    rclpy.init()
+    peer = Peer()
+    executor = SingleThreadedExecutor()
+    executor.add_node(peer.node)
+    threading.Thread(target=spin, args=(executor,), daemon=True).start()
+    actions = None
+    for line in sys.stdin:
+        command = json.loads(line)
+        name = command.pop("do")
+        if name == "ask":
+            actions = actions or Actions(peer.node)
+            answer: Any = actions.ask(**command)
+        elif name == "facts":
+            answer = peer.facts
+        elif name == "plans":
+            answer = len(peer.plans)
+        else:
+            answer = getattr(peer, name)(**command)
+        print(json.dumps(answer), flush=True)
+    executor.shutdown(0)
+
+
+if __name__ == "__main__":
+    main()
