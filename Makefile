@@ -19,7 +19,7 @@ ROS2_READY := .cache/ros2-kilted/.ready .cache/ros2-jazzy/.ready
 .PHONY: help demo install format lint type test unit pythons integration compose chaos state bench examples ros2 browser torch up down table lock wheel clean
 
 help: ## list the targets
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+	@grep -E '^[a-z0-9]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
 demo: $(BENCH_READY) ## plan 350 paths on a real map with three processes on loopback; writes out/demo/
 	$(BIN)/loadgen demo --out out/demo
@@ -72,8 +72,8 @@ bench: $(PEERS_READY) ## measure speed next to other libraries; needs an otherwi
 examples: $(EXAMPLES_READY) ## measure the five applications with one seed, FULL=1: with three; needs an otherwise idle machine
 	$(EXAMPLES_BIN)/python -m benchmarks.applications $(if $(FULL),--seeds 3)
 
-ros2: $(DEV_READY) $(ROS2_READY) ## build two environments with real rclpy, and test the planner node in them; needs python3.11, python3.12, cmake and a C++ compiler
-	tests/ros2/alone.sh $(BIN)/pytest tests/ros2
+ros2: $(DEV_READY) $(ROS2_READY) ## test with real rclpy of two releases of ROS; needs python3.11, python3.12 and a C++ compiler
+	tests/ros2/alone.sh $(BIN)/pytest -s tests/ros2
 
 browser: $(DEV_READY) ## run the tests in a real browser; needs Chromium
 	$(BIN)/pytest tests/browser
@@ -129,8 +129,6 @@ $(EXAMPLES_READY): requirements/examples.txt pyproject.toml
 	touch $@
 
 # Nothing else may live in these environments: the wheels of ROS restart Python, and bring an old OpenSSL.
-.cache/ros2-kilted/.ready: ROS2_PYTHON := python3.11
-.cache/ros2-jazzy/.ready: ROS2_PYTHON := python3.12
 .cache/ros2-%/.ready: requirements/ros2-%.txt tests/ros2/build.py $(wildcard tests/ros2/interfaces/*/*/*)
-	$(ROS2_PYTHON) tests/ros2/build.py $* .cache/ros2-$*
+	$(PYTHON) tests/ros2/build.py $* .cache/ros2-$*
 	touch $@

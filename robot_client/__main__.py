@@ -59,7 +59,7 @@ def _ros2(argv: Sequence[str]) -> int:
 COMMANDS = {
     "check": Command("check whether this robot can use a server", _check),
     "keys": Command("make the keys of this robot", _make_keys),
-    "ros2": Command("plan paths for nav2, in place of its planner_server", _ros2),
+    "ros2": Command("plan paths for nav2, onboard or in the cloud", _ros2),
 }
 
 if __name__ == "__main__":

@@ -4,9 +4,11 @@ It has the topics of the node, but not its action. What the messages mean is `to
 `dds_types`.
 """
 
+import contextlib
 import logging
 import os
 import queue
+import signal
 import time
 from collections.abc import Callable
 from functools import partial
@@ -30,9 +32,15 @@ from cyclonedds.topic import Topic  # isort: skip
 from cyclonedds.util import duration  # isort: skip
 
 # The type information of Fast DDS differs from ours although the types are the same; 1.15 is its vendor id.
+# Where ROS is limited to its computer (ROS_AUTOMATIC_DISCOVERY_RANGE), it listens to no multicast, so the bridge
+# also calls at the ports of the first participants there.
 SETTINGS = """
 <CycloneDDS><Domain id="any">
   <Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>
+  <Discovery>
+    <ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
+    <Peers><Peer Address="localhost"/></Peers>
+  </Discovery>
 </Domain></CycloneDDS>
 """
 DOMAIN_MAX = 232
@@ -122,8 +130,10 @@ def serve(offload: Offloader, facts: Diagnostics, parameters: Parameters) -> Non
     """Serve the topics until interrupted."""
     bridge = Bridge(domain_of(os.environ.get("ROS_DOMAIN_ID", "0")))
     topics = Topics(DDS, offload, parameters=parameters, facts=facts, transforms=SameFrames())
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        bridge.run(topics, parameters)
+        with contextlib.suppress(KeyboardInterrupt):
+            bridge.run(topics, parameters)
     finally:
         topics.close()
 

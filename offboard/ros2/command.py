@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 ROS_ARGS = "--ros-args"
 ABOUT = (
-    "Plan paths for nav2 onboard or in the cloud: a node that replaces nav2's planner_server. "
+    "Plan paths for nav2 onboard or in the cloud: a node with the action of nav2's planner_server. "
     f"What follows {ROS_ARGS} is for ROS, for example: {ROS_ARGS} -p robot_radius:=0.2."
 )
 

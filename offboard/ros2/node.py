@@ -34,9 +34,9 @@ except ImportError as error:
         "'ros-kilted-rclpy[fastrtps]' ros-kilted-nav-msgs (docs/ros2.md)"
     ) from error
 
-ACTION = "compute_path_to_pose"
 DIAGNOSTICS_EVERY_S = 1.0
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+REQUESTS = QoSProfile(depth=100)  # of goals at once; services keep 10 by default, and lose the others
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +54,7 @@ class PlannerNode:
             find("diagnostic_msgs/msg/DiagnosticArray"), "/diagnostics", 10
         )
         self._subscribe(parameters)
-        self._serve()
+        self._serve(parameters.action)
         node.create_timer(DIAGNOSTICS_EVERY_S, self._tell)
 
     def _subscribe(self, parameters: Parameters) -> None:
@@ -72,14 +72,21 @@ class PlannerNode:
         else:
             log.info("map_msgs is not installed: %s_updates is ignored", parameters.map_topic)
 
-    def _serve(self) -> None:
+    def _serve(self, name: str) -> None:
         """The action, or without nav2_msgs the topic `goal_pose`."""
         if _installed("nav2_msgs/action/ComputePathToPose"):
             self._action: Any = find("nav2_msgs/action/ComputePathToPose")
             self._server = ActionServer(
-                self.node, self._action, ACTION, self._execute, cancel_callback=self._cancel
+                self.node,
+                self._action,
+                name,
+                self._execute,
+                cancel_callback=self._cancel,
+                goal_service_qos_profile=REQUESTS,
+                result_service_qos_profile=REQUESTS,
+                cancel_service_qos_profile=REQUESTS,
             )
-            log.info("ready: action %s", ACTION)
+            log.info("ready: action %s", name)
         else:
             self.node.create_subscription(
                 find("geometry_msgs/msg/PoseStamped"), "goal_pose", self._take_goal, 10
@@ -207,6 +214,6 @@ def _transforms(node: Any) -> Frames:
 def _installed(name: str) -> bool:
     try:
         find(name)
-    except ImportError:
+    except ConfigError:
         return False
     return True

@@ -17,10 +17,12 @@ PARAMETER_FLAGS = ("-p", "--param")
 class Parameters:
     """What a plan and its topics depend on.
 
-    robot_frame: the frame of the robot. costmap: the map is nav2's costmap. scan_topic: empty for no scan.
+    action: its name. robot_frame: the frame of the robot. costmap: the map is nav2's costmap.
+    scan_topic: empty for no scan.
     """
 
     limits: Limits
+    action: str
     robot_frame: str
     allow_unknown: bool
     map_topic: str
@@ -41,6 +43,7 @@ class Parameters:
         )
         return cls(
             limits=limits,
+            action=declare("action_name", "compute_path_to_pose"),
             robot_frame=declare("robot_base_frame", "base_link"),
             allow_unknown=declare(f"{planners[0]}.allow_unknown", True),
             map_topic=declare("map_topic", "map"),

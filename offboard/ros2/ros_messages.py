@@ -12,14 +12,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.common.errors import ConfigError
 from offboard.ros2.converters import Library
 
 
 @functools.cache
 def find(name: str) -> Callable[..., Any]:
-    """The class of `PACKAGE/msg/NAME`."""
+    """The class of `PACKAGE/msg/NAME`; ConfigError if its package is not installed."""
     package, folder, kind = name.split("/")
-    found: Callable[..., Any] = getattr(importlib.import_module(f"{package}.{folder}"), kind)
+    try:
+        module = importlib.import_module(f"{package}.{folder}")
+    except ImportError as error:
+        raise ConfigError(f"{name} cannot be imported ({error}): install {package} for this ROS") from error
+    found: Callable[..., Any] = getattr(module, kind)
     return found
 
 

@@ -1,20 +1,20 @@
 """Builds an environment with rclpy from PyPI, with `nav2_msgs` and `map_msgs` from our own interface files.
 
-`python tests/ros2/build.py RELEASE FOLDER`, with the Python of that release. Nothing else may live in FOLDER:
-the wheels of ROS restart Python at start, and bring libraries of their own.
+`python tests/ros2/build.py RELEASE FOLDER`. Nothing else may live in FOLDER: the wheels of ROS restart Python
+at start, and bring libraries of their own.
 """
 
 import os
 import shutil
 import subprocess
 import sys
-import venv
 from dataclasses import dataclass
 from pathlib import Path
 
 HERE = Path(__file__).parent
 INTERFACES = HERE / "interfaces"
-PYTHONS = {"kilted": (3, 11), "jazzy": (3, 12)}
+PYTHONS = {"kilted": "3.11", "jazzy": "3.12"}  # for which PyPI has wheels
+BUILDERS = "/opt/python/"  # a folder of the machine that built the wheels
 
 
 @dataclass(frozen=True)
@@ -37,27 +37,33 @@ PACKAGES = (
 
 
 def main(release: str, folder: Path) -> None:
-    wanted, found = PYTHONS[release], sys.version_info[:2]
-    if found != wanted:
-        sys.exit(f"build.py: {release} needs Python {wanted[0]}.{wanted[1]}, not {found[0]}.{found[1]}")
-    if not (folder / "pyvenv.cfg").exists():
-        venv.create(folder, with_pip=True)
     python = folder / "bin" / "python"
     requirements = HERE.parents[1] / "requirements" / f"ros2-{release}.txt"
-    run([python, "-m", "pip", "install", "--quiet", "--require-hashes", "-r", requirements], os.environ)
+    shutil.rmtree(folder, ignore_errors=True)
+    run([python_of(release), "-m", "venv", folder])
+    run([python, "-m", "pip", "install", "--quiet", "--require-hashes", "-r", requirements])
     correct_paths(folder)
     for package in PACKAGES:
         generate(package, folder)
 
 
+def python_of(release: str) -> str:
+    """A Python of the version that the release needs: on the PATH, or of pyenv, which may hide it there."""
+    version = PYTHONS[release]
+    of_pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
+    for found in (shutil.which(f"python{version}"), *of_pyenv.glob(f"{version}.*/bin/python")):
+        if found and subprocess.run([found, "--version"], capture_output=True, check=False).returncode == 0:
+            return str(found)
+    sys.exit(f"build.py: {release} needs python{version} on the PATH")
+
+
 def generate(package: Package, folder: Path) -> None:
     """Generate, compile and install one interface package into the environment."""
     build = folder / "build" / package.name
-    shutil.rmtree(build, ignore_errors=True)
     source = build / "source"
     shutil.copytree(INTERFACES / package.name, source)
     shutil.copy(INTERFACES / "CMakeLists.txt", source)
-    environ = os.environ | {
+    environ = {
         "PATH": f"{folder / 'bin'}{os.pathsep}{os.environ['PATH']}",
         "AMENT_PREFIX_PATH": str(folder),
         "PYTHONPATH": "",
@@ -83,19 +89,22 @@ def correct_paths(folder: Path) -> None:
     include, of_numpy = done.stdout.split()
     for path in (folder / "share").glob("*/cmake/*Export.cmake"):
         text = path.read_text()
-        for line in [line for line in text.splitlines() if "/opt/python/" in line]:
+        for line in [line for line in text.splitlines() if BUILDERS in line]:
             corrected = line
             for word in line.split('"')[1].split(";"):
-                if word.startswith("/opt/python/"):
+                if word.startswith(BUILDERS):
                     corrected = corrected.replace(word, of_numpy if "numpy" in word else include)
             text = text.replace(line, corrected)
         path.write_text(text)
 
 
-def run(command: list[object], environ: "os._Environ[str] | dict[str, str]") -> None:
-    done = subprocess.run(list(map(str, command)), env=environ, capture_output=True, text=True, check=False)
+def run(command: list[object], environ: dict[str, str] | None = None) -> None:
+    words = list(map(str, command))
+    done = subprocess.run(
+        words, env=os.environ | (environ or {}), capture_output=True, text=True, check=False
+    )
     if done.returncode:
-        sys.exit(f"build.py: {' '.join(map(str, command))}\n{done.stdout}{done.stderr}")
+        sys.exit(f"build.py: {' '.join(words)}\n{done.stdout}{done.stderr}")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,9 @@
-"""Fixtures that start the node and a peer in an environment with rclpy, and the server behind a relay."""
+"""Fixtures that start planner nodes, bridges and peers in processes of their own.
 
-import contextlib
+Nodes and peers with rclpy run in the environments that `make ros2` builds. The bridge and its peer run in the
+environment of the tests, which has no ROS.
+"""
+
 import json
 import os
 import queue
@@ -8,7 +11,7 @@ import secrets
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,28 +21,30 @@ from offboard.common.planning.map_files import read_map
 from offboard.common.planning.maps import GridMap
 
 ROOT = Path(__file__).parents[2]
-ENVIRONMENTS = ROOT / ".cache"
 RELEASES = ("kilted", "jazzy")
+DDS = "cyclonedds"  # a peer without ROS
 PLANNER = {"tasks": "offboard.common.planning.planner", "workers": 1}
 ANSWER_S = 120.0
+END_S = 10.0
+ACTION = "compute_path_to_pose"
+# Where DDS looks for others: everywhere in a network of its own, else only on this computer.
+RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+NETWORK = os.environ.get(RANGE, "LOCALHOST")
 
 
 class Process:
-    """A process of an environment with ROS, which answers JSON lines if it is a peer."""
+    """A process that answers JSON lines if it is a peer."""
 
-    def __init__(self, python: Path, arguments: list[str], log: Path, domain: int) -> None:
+    def __init__(self, command: Sequence[str | Path], log: Path, environ: dict[str, str]) -> None:
         self._log = log
-        environ = os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONPATH": str(ROOT)}
-        environ["NUMBA_CACHE_DIR"] = str(python.parents[1] / "numba")  # each version of numba has its own
-        environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "PYTHONUNBUFFERED": "1"}
         self._err = log.open("a")
         self.process = subprocess.Popen(
-            [str(python), *arguments],
+            list(map(str, command)),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._err,
             text=True,
-            env=environ,
+            env=os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"} | environ,
             cwd=ROOT,
         )
         self._lines: queue.Queue[str] = queue.Queue()
@@ -50,6 +55,7 @@ class Process:
         assert self.process.stdout is not None
         for line in self.process.stdout:
             self._lines.put(line)
+        self._lines.put("")
 
     def do(self, name: str, **arguments: Any) -> Any:
         """Send a command, and return its answer."""
@@ -62,92 +68,92 @@ class Process:
         self.process.stdin.flush()
 
     def answer(self) -> Any:
-        try:
-            return json.loads(self._lines.get(timeout=ANSWER_S))
-        except queue.Empty:
-            raise AssertionError(f"no answer: {self.log()}") from None
+        line = self._lines.get(timeout=ANSWER_S)
+        assert line, f"the process ended: {self.log()}"
+        return json.loads(line)
 
     def log(self) -> str:
         return self._log.read_text()
 
-    def close(self) -> None:
+    def close(self) -> int:
+        """End the process; returns its exit code."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.close()  # the end of its commands ends a peer
         self.process.terminate()
         try:
-            self.process.wait(10.0)
+            code = self.process.wait(END_S)
         except subprocess.TimeoutExpired:
             self.process.kill()
-            self.process.wait()
-        self._reader.join(10.0)
-        for file in (self.process.stdin, self.process.stdout, self._err):
-            assert file is not None
-            with contextlib.suppress(BrokenPipeError):
-                file.close()
+            code = self.process.wait()
+        self._reader.join(END_S)
+        self.process.stdout.close()
+        self._err.close()
+        return code
 
 
 def python_of(release: str) -> Path:
     """The Python of a release; the test is skipped if `make ros2` has not built it."""
-    python = ENVIRONMENTS / f"ros2-{release}" / "bin" / "python"
+    python = ROOT / ".cache" / f"ros2-{release}" / "bin" / "python"
     if not python.exists():
         pytest.skip(f"no environment for {release}: make ros2 builds it")
     return python
 
 
 @pytest.fixture
-def domain() -> int:
-    """A DDS domain of its own, so that tests do not hear each other."""
-    return 1 + secrets.randbelow(100)
+def reach() -> str:
+    """Where DDS looks for others in this test."""
+    return NETWORK
 
 
 @pytest.fixture
-def start(tmp_path: Path, domain: int) -> Iterator[Callable[..., Process]]:
-    """Factory: a process of a release, in the domain of this test."""
-    made: list[Process] = []
+def start(tmp_path: Path, reach: str) -> Iterator[Callable[..., Process]]:
+    """Factory: a process with the Python of a release, or with that of the tests for DDS.
 
-    def factory(release: str, *arguments: str) -> Process:
-        log = tmp_path / f"process-{len(made)}.log"
-        made.append(Process(python_of(release), list(arguments), log, domain))
+    A test has a DDS domain of its own, so that tests do not hear each other.
+    """
+    made: list[Process] = []
+    domain = {"ROS_DOMAIN_ID": str(1 + secrets.randbelow(100)), RANGE: reach}
+
+    def factory(where: str, *arguments: str) -> Process:
+        python, environ = Path(sys.executable), domain
+        if where == DDS:
+            pytest.importorskip("cyclonedds")
+        else:
+            python = python_of(where)
+            environ = domain | {"NUMBA_CACHE_DIR": str(python.parents[1] / "numba")}  # of its own numba
+        made.append(Process([python, *arguments], tmp_path / f"process-{len(made)}.log", environ))
         return made[-1]
 
     yield factory
-    for process in made:
-        process.close()
+    codes = [process.close() for process in reversed(made)]
+    assert codes == [0] * len(codes), [process.log() for process in made]
 
 
 @pytest.fixture
 def node(start: Callable[..., Process]) -> Callable[..., Process]:
-    """Factory: a planner node; flags of Offboard first, parameters by name."""
+    """Factory: a planner node of a release, or for DDS a bridge; flags of Offboard, and parameters by name."""
 
-    def factory(release: str, *flags: str, **parameters: Any) -> Process:
-        return start(
-            release, "-m", "offboard.robot_client", "ros2", *flags, "--ros-args", *assigned(parameters)
-        )
+    def factory(where: str, *flags: str, **parameters: Any) -> Process:
+        chosen = ("--bridge",) if where == DDS else ()
+        command = ("-m", "offboard.robot_client", "ros2", *chosen, *flags)
+        return start(where, *command, "--ros-args", *assigned(parameters))
 
     return factory
 
 
 @pytest.fixture
-def bridge(tmp_path: Path, domain: int) -> Iterator[Callable[..., Process]]:
-    """Factory: a bridge in the environment of the tests, which has no ROS."""
-    pytest.importorskip("cyclonedds")
-    made: list[Process] = []
+def topic_node(start: Callable[..., Process], node: Callable[..., Process]) -> Callable[..., Process]:
+    """Factory: a planner node without nav2_msgs, which serves topics only; for DDS a bridge."""
+    hidden = "import sys; sys.modules['nav2_msgs'] = None; from offboard.robot_client.__main__ import main; "
 
-    def factory(*flags: str, **parameters: Any) -> Process:
-        log = tmp_path / f"bridge-{len(made)}.log"
-        arguments = [
-            "-m",
-            "offboard.robot_client",
-            "ros2",
-            "--bridge",
-            *flags,
-            "--ros-args",
-            *assigned(parameters),
-        ]
-        made.append(Process(Path(sys.executable), arguments, log, domain))
-        return made[-1]
+    def factory(where: str, *flags: str, **parameters: Any) -> Process:
+        if where == DDS:
+            return node(DDS, *flags, **parameters)
+        command = ["ros2", *flags, "--ros-args", *assigned(parameters)]
+        return start(where, "-c", f"{hidden}sys.exit(main({command}))")
 
-    yield factory
-    for process in made:
-        process.close()
+    return factory
 
 
 def assigned(parameters: dict[str, Any]) -> list[str]:
@@ -158,30 +164,28 @@ def assigned(parameters: dict[str, Any]) -> list[str]:
 
 @pytest.fixture
 def peer(start: Callable[..., Process], tmp_path: Path) -> Callable[..., Process]:
-    """Factory: a client, which has published this map."""
+    """Factory: a peer of a release, or one without ROS, which has published this map."""
 
-    def factory(release: str, grid: GridMap | None = None) -> Process:
-        made = start(release, "tests/ros2/peer.py")
+    def factory(where: str, grid: GridMap | None = None, action: str = ACTION) -> Process:
+        made = start(where, *(["tests/ros2/dds_peer.py"] if where == DDS else ["tests/ros2/peer.py", action]))
         if grid is not None:
-            made.do(
-                "map", file=str(raw_map(grid, tmp_path)), resolution=grid.resolution, origin=grid.origin[:2]
-            )
+            publish_map(made, grid, tmp_path)
         return made
 
     return factory
 
 
-def raw_map(grid: GridMap, folder: Path) -> Path:
-    """A file that the peer can read without a library."""
-    path = folder / f"map-{grid.cells.shape[1]}x{grid.cells.shape[0]}.raw"
+def publish_map(peer: Process, grid: GridMap, folder: Path) -> None:
+    """Let a peer publish a map, from a file that it can read without a library."""
     height, width = grid.cells.shape
+    path = folder / f"map-{width}x{height}.raw"
     path.write_bytes(f"{width} {height}\n".encode() + grid.cells.tobytes())
-    return path
+    peer.do("map", file=str(path), resolution=grid.resolution, origin=grid.origin[:2])
 
 
-@pytest.fixture(scope="session", params=["willow-full-0.05", "depot"])
-def named_grid(request: pytest.FixtureRequest) -> GridMap:
-    return read_map(ROOT / "maps" / f"{request.param}.yaml")
+@pytest.fixture(scope="session")
+def willow() -> GridMap:
+    return read_map(ROOT / "maps" / "willow-full-0.05.yaml")
 
 
 @pytest.fixture(scope="session")

@@ -1,28 +1,33 @@
 """A client of nav2's planner server, in a process and an environment of its own.
 
 It imports nothing of Offboard, so that both sides of every message are written independently. It reads one
-JSON command a line from stdin, and answers each with one line.
+JSON command a line from stdin, and answers each with one line. Its argument is the name of the action.
 """
 
 import array
-import contextlib
 import json
 import math
+import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid, Path
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image, LaserScan
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+ANSWERS = QoSProfile(depth=100)  # by default, a client drops what it has not read when 10 more have come
 WAIT_S = 30.0
+TRIES = 10
 CODES = (
     *("NONE", "UNKNOWN", "INVALID_PLANNER", "TF_ERROR", "START_OUTSIDE_MAP", "GOAL_OUTSIDE_MAP"),
     *("START_OCCUPIED", "GOAL_OCCUPIED", "TIMEOUT", "NO_VALID_PATH"),
@@ -35,6 +40,7 @@ class Peer:
     def __init__(self) -> None:
         self.node = rclpy.create_node("peer")
         self.plans: list[tuple[float, Path]] = []
+        self.latched: set[Any] = set()  # publishers that have published
         self.facts: dict[str, Any] = {}
         self.maps = self.node.create_publisher(OccupancyGrid, "map", LATCHED)
         self.poses = self.node.create_publisher(PoseWithCovarianceStamped, "amcl_pose", LATCHED)
@@ -63,6 +69,7 @@ class Peer:
         message.info.origin.orientation.w = 1.0
         message.data = cells
         self.maps.publish(message)
+        self.latched.add(self.maps)
 
     def update(self, x: int, y: int, width: int, height: int, value: int) -> None:
         """Change a rectangle of the map."""
@@ -70,17 +77,23 @@ class Peer:
 
         if not hasattr(self, "updates"):
             self.updates = self.node.create_publisher(OccupancyGridUpdate, "map_updates", 10)
-            while self.updates.get_subscription_count() == 0:
-                time.sleep(0.01)
+        listened_to(self.updates)
         message = OccupancyGridUpdate(x=x, y=y, width=width, height=height)
         message.data = array.array("b", [value] * (width * height))
         self.updates.publish(message)
+
+    def arrive(self) -> None:
+        """Wait until the node has got what was published last on each latched topic."""
+        for publisher in self.latched:
+            listened_to(publisher)
+            assert publisher.wait_for_all_acked(Duration(seconds=WAIT_S))
 
     def pose(self, x: float, y: float, yaw: float = 0.0, frame: str = "map") -> None:
         message = PoseWithCovarianceStamped()
         message.header.frame_id = frame
         fill(message.pose.pose, x, y, yaw)
         self.poses.publish(message)
+        self.latched.add(self.poses)
 
     def scan(self, ranges: list[float], frame: str = "base_link") -> None:
         """A turn of beams, the first one straight ahead."""
@@ -89,6 +102,7 @@ class Peer:
         message.angle_increment = 2 * math.pi / len(ranges)
         message.range_max = 10.0
         message.ranges = ranges
+        listened_to(self.scans)
         self.scans.publish(message)
 
     def look(self, row: int, col: int, stamp: int, height: int = 240, width: int = 320) -> list[float]:
@@ -97,9 +111,6 @@ class Peer:
             self.spots: list[PointStamped] = []
             self.images = self.node.create_publisher(Image, "image", qos_profile_sensor_data)
             self.node.create_subscription(PointStamped, "spot", self.spots.append, 10)
-            while self.images.get_subscription_count() == 0 or self.node.count_publishers("spot") == 0:
-                time.sleep(0.01)
-            time.sleep(0.5)  # each side hears of the other by itself
         pixels = bytearray(height * width)
         for line in range(row - 4, row + 5):
             pixels[line * width + col - 4 : line * width + col + 5] = b"\xff" * 9
@@ -107,36 +118,58 @@ class Peer:
         message.header.stamp.sec = stamp
         message.data = array.array("B", bytes(pixels))
         self.spots.clear()
-        self.images.publish(message)
-        end_s = time.perf_counter() + WAIT_S
-        while not self.spots and time.perf_counter() < end_s:
-            time.sleep(0.0005)
-        spot = self.spots[-1]
-        return [spot.point.y, spot.point.x, spot.header.stamp.sec]
+        listened_to(self.images)
+        for _ in range(TRIES):  # the first ones may be lost: each side hears of the other by itself
+            self.images.publish(message)
+            if waited_for(lambda: self.spots, WAIT_S / TRIES):
+                spot = self.spots[-1]
+                return [spot.point.y, spot.point.x, spot.header.stamp.sec]
+        raise TimeoutError("no spot")
 
-    def topic(self, goal: dict[str, Any]) -> dict[str, Any]:
+    def topic(self, goal: dict[str, Any], wait_s: float = WAIT_S) -> dict[str, Any]:
         """Ask by topic, and wait for the plan."""
-        before, sent_s = len(self.plans), time.perf_counter()
+        self.plans.clear()
+        sent_s = time.perf_counter()
         self.goal_poses.publish(stamped(goal))
-        while len(self.plans) == before and time.perf_counter() - sent_s < goal.get("wait_s", WAIT_S):
-            time.sleep(0.0005)
-        if len(self.plans) == before:
+        if not waited_for(lambda: self.plans, wait_s):
             return {"poses": None}
-        got_s, path = self.plans[-1]
-        return {"poses": rows(path), "seconds": got_s - sent_s, "frame": path.header.frame_id}
+        return self.last() | {"seconds": self.plans[-1][0] - sent_s}
+
+    def last(self) -> dict[str, Any]:
+        """The newest plan."""
+        _, path = self.plans[-1]
+        return {"poses": rows(path), "frame": path.header.frame_id}
+
+
+def waited_for(come: Callable[[], Any], seconds: float) -> bool:
+    """Whether it came in time."""
+    end_s = time.perf_counter() + seconds
+    while not come() and time.perf_counter() < end_s:
+        time.sleep(0.0005)
+    return bool(come())
+
+
+def listened_to(publisher: Any) -> None:
+    assert waited_for(publisher.get_subscription_count, WAIT_S), f"nobody listens to {publisher.topic_name}"
 
 
 class Actions:
     """The client of the action."""
 
-    def __init__(self, node: Any) -> None:
+    def __init__(self, node: Any, name: str) -> None:
         from nav2_msgs.action import ComputePathToPose
         from rclpy.action import ActionClient
 
         self.type = ComputePathToPose
-        self.client = ActionClient(node, ComputePathToPose, "compute_path_to_pose")
+        self.client = ActionClient(
+            node,
+            ComputePathToPose,
+            name,
+            goal_service_qos_profile=ANSWERS,
+            result_service_qos_profile=ANSWERS,
+        )
         if not self.client.wait_for_server(timeout_sec=60.0):
-            raise TimeoutError("no action server compute_path_to_pose")
+            raise TimeoutError(f"no action server {name}")
 
     def ask(
         self, goals: list[dict[str, Any]], each_s: float = 0.0, cancel_s: float | None = None
@@ -235,32 +268,33 @@ def rows(path: Path) -> list[list[float]]:
     ]
 
 
-def spin(executor: SingleThreadedExecutor) -> None:
-    with contextlib.suppress(ExternalShutdownException):
-        executor.spin()
-
-
 def main() -> None:
-    rclpy.init()
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it ends with its commands, and says goodbye on DDS
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     peer = Peer()
     executor = SingleThreadedExecutor()
     executor.add_node(peer.node)
-    threading.Thread(target=spin, args=(executor,), daemon=True).start()
+    spinning = threading.Thread(target=executor.spin)
+    spinning.start()
     actions = None
     for line in sys.stdin:
         command = json.loads(line)
         name = command.pop("do")
         if name == "ask":
-            actions = actions or Actions(peer.node)
+            actions = actions or Actions(peer.node, sys.argv[1])
             answer: Any = actions.ask(**command)
         elif name == "facts":
+            waited_for(lambda: "site" in peer.facts, WAIT_S)
             answer = peer.facts
         elif name == "plans":
+            waited_for(lambda: peer.plans, WAIT_S)
             answer = len(peer.plans)
         else:
             answer = getattr(peer, name)(**command)
         print(json.dumps(answer), flush=True)
-    executor.shutdown(0)
+    executor.shutdown()
+    spinning.join()
+    rclpy.shutdown()
 
 
 if __name__ == "__main__":

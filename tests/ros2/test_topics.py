@@ -1,4 +1,4 @@
-"""What the robot publishes changes the plans: pose, scan, map updates, costs; and goals by topic."""
+"""What the robot publishes changes the plans: pose, scan, map updates and costs."""
 
 import time
 from collections.abc import Callable
@@ -14,9 +14,10 @@ pytestmark = [pytest.mark.ros2, pytest.mark.timeout(120)]
 
 Make = Callable[..., Process]
 
-SETTLE_S = 0.7  # latched messages are on their way
 FREE = GridMap(np.zeros((60, 60), np.int8), 0.1)
 GOAL = {"x": 5.0, "y": 3.0, "yaw": 0.0}
+STRAIGHT_M = 0.11  # so far a straight path may be from the line: one cell
+TRIES = 40
 
 
 def width_of(answer: dict[str, Any]) -> float:
@@ -25,75 +26,57 @@ def width_of(answer: dict[str, Any]) -> float:
     return max(abs(y - 3.0) for _, y, _ in answer["poses"])
 
 
+def asked_until(wide: Callable[[float], bool], ask: Callable[[], dict[str, Any]]) -> None:
+    """Ask until the width of the path is right: a message may be lost before each side knows the other."""
+    widths = []
+    for _ in range(TRIES):
+        widths.append(width_of(ask()))
+        if wide(widths[-1]):
+            return
+    pytest.fail(f"widths {widths}")
+
+
 @pytest.mark.parametrize("release", RELEASES)
 def test_pose_scan_and_updates_change_the_plan(release: str, node: Make, peer: Make) -> None:
-    """The path starts at the robot, and goes round what scan and updates show."""
-    process, client = node(release, robot_radius=0.2), peer(release, FREE)
+    """The path starts at the robot, and goes round what scan and updates show; an old scan is forgotten."""
+    node(release, robot_radius=0.2)
+    client = peer(release, FREE)
     client.do("pose", x=1.0, y=3.0)
-    client.do("ask", goals=[GOAL | {"start": {"x": 1.0, "y": 3.0}}])  # the action is there
-    time.sleep(SETTLE_S)
-    (straight,) = client.do("ask", goals=[GOAL])
+    client.do("arrive")
+
+    def ask() -> dict[str, Any]:
+        (result,) = client.do("ask", goals=[GOAL])
+        assert result["status"] == "succeeded", result
+        return dict(result)
+
+    def ask_with_scan() -> dict[str, Any]:
+        client.do("scan", ranges=[1.5 if beam < 10 or beam > 350 else 20.0 for beam in range(360)])
+        return ask()
+
+    def ask_with_update() -> dict[str, Any]:
+        client.do("update", x=30, y=20, width=2, height=20, value=100)
+        return ask()
+
+    straight = ask()
     assert straight["poses"][0][:2] == pytest.approx([1.0, 3.0])
-    assert width_of(straight) < 0.11
-    client.do("scan", ranges=[1.5 if beam < 10 or beam > 350 else 20.0 for beam in range(360)])
-    time.sleep(0.2)
-    (around,) = client.do("ask", goals=[GOAL])
-    assert width_of(around) > 0.3, process.log()
-    time.sleep(1.2)  # the scan is old by then
-    (again,) = client.do("ask", goals=[GOAL])
-    assert width_of(again) < 0.11
-    client.do("update", x=30, y=20, width=2, height=20, value=100)
-    time.sleep(SETTLE_S)
-    (blocked,) = client.do("ask", goals=[GOAL])
-    assert width_of(blocked) > 1.0, process.log()
+    assert width_of(straight) < STRAIGHT_M
+    asked_until(lambda width: width > 0.3, ask_with_scan)
+    time.sleep(1.2)  # a scan counts for a second
+    assert width_of(ask()) < STRAIGHT_M
+    asked_until(lambda width: width > 1.0, ask_with_update)
     facts = client.do("facts")
     assert facts["site"] == "onboard"
     assert float(facts["true_ms"]) > 0
-    assert client.do("plans") >= 4
+    assert client.do("plans") >= 1
 
 
 @pytest.mark.parametrize("release", RELEASES)
 def test_costs_of_a_costmap_weigh_the_plan(release: str, node: Make, peer: Make) -> None:
-    """With nav2's costmap, a dear strip is avoided although it is not occupied."""
+    """Next to nav2's own server, with its costmap: a dear strip is avoided although it is not occupied."""
     cells = np.zeros((60, 60), np.int8)
     cells[20:40, 28:32] = 90
-    node(release, costmap=True)
-    client = peer(release, GridMap(cells, 0.1))
-    start = {"start": {"x": 1.0, "y": 3.0}}
-    client.do("ask", goals=[GOAL | start])
-    time.sleep(SETTLE_S)
-    (result,) = client.do("ask", goals=[GOAL | start])
+    node(release, costmap=True, action_name="offboard/compute_path_to_pose")
+    client = peer(release, GridMap(cells, 0.1), action="offboard/compute_path_to_pose")
+    client.do("arrive")
+    (result,) = client.do("ask", goals=[GOAL | {"start": {"x": 1.0, "y": 3.0}}])
     assert width_of(result) > 0.9
-
-
-@pytest.mark.parametrize("release", RELEASES)
-def test_without_nav2_msgs_goals_come_by_topic(release: str, start: Make, peer: Make) -> None:
-    """`goal_pose` in, `plan` out, and no plan for a goal that cannot be reached."""
-    hidden = "import sys; sys.modules['nav2_msgs'] = None; from offboard.robot_client.__main__ import main; "
-    start(release, "-c", f"{hidden}main(['ros2'])")
-    client = peer(release, FREE)
-    client.do("pose", x=1.0, y=3.0)
-    while client.do("topic", goal=GOAL | {"wait_s": 1.0})["poses"] is None:
-        pass
-    answer = client.do("topic", goal=GOAL)
-    assert answer["frame"] == "map"
-    assert width_of(answer) < 0.11
-    assert client.do("topic", goal=GOAL | {"x": 99.0, "wait_s": 1.0})["poses"] is None
-    assert client.do("facts")["site"] == "onboard"
-
-
-@pytest.mark.parametrize("release", RELEASES)
-def test_the_bridge_without_ros_serves_topics(release: str, bridge: Make, peer: Make) -> None:
-    """A process with cyclonedds and no ROS answers goals of a real rclpy peer."""
-    process, client = bridge(robot_radius=0.2), peer(release, FREE)
-    client.do("pose", x=1.0, y=3.0)
-    for _ in range(20):
-        if client.do("topic", goal=GOAL | {"wait_s": 1.0})["poses"] is not None:
-            break
-    answer = client.do("topic", goal=GOAL)
-    assert answer["poses"], process.log()
-    assert width_of(answer) < 0.11
-    client.do("scan", ranges=[1.5 if beam < 10 or beam > 350 else 20.0 for beam in range(360)])
-    time.sleep(0.2)
-    assert width_of(client.do("topic", goal=GOAL)) > 0.3
-    assert client.do("facts")["site"] == "onboard"

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.timeout(60)  # it starts Python
+
 ROOT = Path(__file__).parents[2]
 WITHOUT = "import sys; sys.modules['rclpy'] = None\n"
 
@@ -24,6 +26,18 @@ def test_without_rclpy_one_line_says_what_to_do() -> None:
     assert "rclpy cannot be imported" in done.stderr
     assert "source the setup.bash" in done.stderr
     assert "ros-kilted-rclpy[fastrtps]" in done.stderr
+
+
+def test_without_cyclonedds_one_line_names_the_extra() -> None:
+    """Exit code 2, and one line that says which extra the bridge needs."""
+    done = run(
+        "sys.modules['cyclonedds'] = None\n"
+        "import offboard.robot_client.__main__ as main; sys.exit(main.main(['ros2', '--bridge']))"
+    )
+    assert done.returncode == 2
+    assert done.stderr == (
+        "robot-client ros2: a bridge without ROS needs the extra 'dds': pip install 'offboard[dds]'\n"
+    )
 
 
 @pytest.mark.parametrize(

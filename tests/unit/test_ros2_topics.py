@@ -21,6 +21,9 @@ from offboard.ros2.planner_server import Outcome
 from offboard.ros2.stop import connect
 from offboard.ros2.topics import SameFrames, Topics
 
+pytestmark = pytest.mark.timeout(60)  # the first plan compiles the planner
+
+WAIT_S = 50.0
 PLAIN = ros.Library(lambda name: SimpleNamespace, lambda values: values)  # noqa: ARG005 - one class for all
 MAP = ros.Header("map")
 
@@ -68,7 +71,7 @@ def goal(x: float, y: float, frame: str = "map") -> Any:
 def ask(made: Topics, *poses: Any) -> Outcome:
     outcomes: Queue[Outcome] = Queue()
     made.accept(poses[0], poses[1] if len(poses) > 1 else None, "", outcomes.put)
-    return outcomes.get(timeout=5.0)
+    return outcomes.get(timeout=WAIT_S)
 
 
 def test_goals_in_other_frames_are_moved_into_the_map(offload: Offloader, facts: Diagnostics) -> None:
