@@ -32,8 +32,8 @@ from cyclonedds.topic import Topic  # isort: skip
 from cyclonedds.util import duration  # isort: skip
 
 # The type information of Fast DDS differs from ours although the types are the same; 1.15 is its vendor id.
-# Where ROS is limited to its computer (ROS_AUTOMATIC_DISCOVERY_RANGE), it listens to no multicast, so the bridge
-# also calls at the ports of the first participants there.
+# Where ROS is limited to its computer (ROS_AUTOMATIC_DISCOVERY_RANGE), it listens to no multicast, so the
+# bridge also calls at the ports of the first participants there.
 SETTINGS = """
 <CycloneDDS><Domain id="any">
   <Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>

@@ -132,7 +132,7 @@ def start(tmp_path: Path, reach: str) -> Iterator[Callable[..., Process]]:
 
 @pytest.fixture
 def node(start: Callable[..., Process]) -> Callable[..., Process]:
-    """Factory: a planner node of a release, or for DDS a bridge; flags of Offboard, and parameters by name."""
+    """Factory: a planner node, or a bridge for DDS; with flags of Offboard, and parameters by name."""
 
     def factory(where: str, *flags: str, **parameters: Any) -> Process:
         chosen = ("--bridge",) if where == DDS else ()

@@ -1,7 +1,7 @@
 """A peer without ROS, in a process of its own: publishes a map and a pose, and asks for paths by topic.
 
-It has the commands of `peer.py` that need no action. Its messages are those of the bridge, whose types the tests
-with rclpy peers check.
+It has the commands of `peer.py` that need no action. Its messages are those of the bridge, whose types the
+tests with rclpy peers check.
 """
 
 import json

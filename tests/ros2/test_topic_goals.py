@@ -42,7 +42,7 @@ def test_goals_by_topic_get_the_paths_of_the_planner(
     testbed: Callable[..., LocalTestbed],
     tmp_path: Path,
 ) -> None:
-    """From a cloud 30 ms away, in an outage and with a killed server, every goal gets the right path in time."""
+    """From a cloud 30 ms away, in an outage, with a killed server: every goal gets its path in time."""
     bed = testbed(PLANNER, delay_ms=15.0)
     flags = ("--cloud", bed.endpoint, "--policy", "cloud", "--timeout", str(TIMEOUT_S))
     process, asking = topic_node(server, *flags, **PLANS), peer(client)
