@@ -41,8 +41,8 @@ class DdsPeer:
         goal = self.on("geometry_msgs/msg/PoseStamped", "goal_pose")
         self.goals = DataWriter(self.participant, goal, EACH)
         self.plans = DataReader(self.participant, self.on("nav_msgs/msg/Path", "plan"), EACH)
-        facts = self.on("diagnostic_msgs/msg/DiagnosticArray", "diagnostics")
-        self.told = DataReader(self.participant, facts, EACH)
+        status = self.on("diagnostic_msgs/msg/DiagnosticArray", "diagnostics")
+        self.diagnostics = DataReader(self.participant, status, EACH)
         self.latched: set[Any] = set()
 
     def on(self, kind: str, name: str) -> Any:
@@ -89,9 +89,9 @@ class DdsPeer:
         path = self.plans.take(N=1000)[-1]
         return {"poses": ros.path_poses(path).tolist(), "frame": path.header.frame_id}
 
-    def facts(self) -> dict[str, str]:
-        """The newest diagnostics."""
-        last = self.told.take(N=1000)[-1]
+    def told(self) -> dict[str, str]:
+        """The newest diagnostics of a decision."""
+        last = self.diagnostics.take(N=1000)[-1]
         return {one.key: one.value for one in last.status[0].values}
 
 

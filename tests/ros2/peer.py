@@ -135,6 +135,11 @@ class Peer:
             return {"poses": None}
         return self.last() | {"seconds": self.plans[-1][0] - sent_s}
 
+    def told(self) -> dict[str, Any]:
+        """The newest diagnostics of a decision."""
+        waited_for(lambda: "site" in self.facts, WAIT_S)
+        return self.facts
+
     def last(self) -> dict[str, Any]:
         """The newest plan."""
         _, path = self.plans[-1]
@@ -154,12 +159,13 @@ def listened_to(publisher: Any) -> None:
 
 
 class Actions:
-    """The client of the action."""
+    """The client of the action. The executor makes all its calls: a client of rclpy is of one thread."""
 
-    def __init__(self, node: Any, name: str) -> None:
+    def __init__(self, node: Any, executor: SingleThreadedExecutor, name: str) -> None:
         from nav2_msgs.action import ComputePathToPose
         from rclpy.action import ActionClient
 
+        self.executor = executor
         self.type = ComputePathToPose
         self.client = ActionClient(
             node,
@@ -201,9 +207,13 @@ class Asked:
         self._codes = {value: name for name, value in vars_of(actions.type.Result)}
         self._done = threading.Event()
         self._accepted = threading.Event()
+        self.sent_s = self.accepted_s = self.ended_s = self.canceled_s = math.nan
+        self._actions = actions
+        actions.executor.create_task(self._send, request)
+
+    def _send(self, request: Any) -> None:
         self.sent_s = time.perf_counter()
-        self.accepted_s = self.ended_s = self.canceled_s = math.nan
-        actions.client.send_goal_async(request).add_done_callback(self._accept)
+        self._actions.client.send_goal_async(request).add_done_callback(self._accept)
 
     def _accept(self, future: Any) -> None:
         self.accepted_s = time.perf_counter()
@@ -219,6 +229,9 @@ class Asked:
     def cancel(self, after_s: float) -> None:
         assert self._accepted.wait(WAIT_S)
         time.sleep(max(0.0, self.accepted_s + after_s - time.perf_counter()))
+        self._actions.executor.create_task(self._cancel)
+
+    def _cancel(self) -> None:
         self.canceled_s = time.perf_counter()
         self.handle.cancel_goal_async()
 
@@ -276,25 +289,26 @@ def main() -> None:
     executor.add_node(peer.node)
     spinning = threading.Thread(target=executor.spin)
     spinning.start()
+    try:
+        obey(peer, executor)
+    finally:
+        executor.shutdown()
+        spinning.join()
+        rclpy.shutdown()
+
+
+def obey(peer: Peer, executor: SingleThreadedExecutor) -> None:
+    """Do what stdin says, until it ends."""
     actions = None
     for line in sys.stdin:
         command = json.loads(line)
         name = command.pop("do")
         if name == "ask":
-            actions = actions or Actions(peer.node, sys.argv[1])
-            answer: Any = actions.ask(**command)
-        elif name == "facts":
-            waited_for(lambda: "site" in peer.facts, WAIT_S)
-            answer = peer.facts
-        elif name == "plans":
-            waited_for(lambda: peer.plans, WAIT_S)
-            answer = len(peer.plans)
+            actions = actions or Actions(peer.node, executor, sys.argv[1])
+            answer = actions.ask(**command)
         else:
             answer = getattr(peer, name)(**command)
         print(json.dumps(answer), flush=True)
-    executor.shutdown()
-    spinning.join()
-    rclpy.shutdown()
 
 
 if __name__ == "__main__":

@@ -57,7 +57,7 @@ def test_goals_by_topic_get_the_paths_of_the_planner(
             times_s.append(result["seconds"])
     print(f"\n{server} for {client}: {quantiles_ms(times_s)}, at most {max(times_s) * 1e3:.0f} ms")
     assert TIMEOUT_S <= max(times_s) <= TIMEOUT_S + ONBOARD_S, process.log()
-    assert "reason" in asking.do("facts")
+    assert "reason" in asking.do("told")
     check_other_goals(asking, depot, start)
 
 
