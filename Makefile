@@ -73,7 +73,8 @@ examples: $(EXAMPLES_READY) ## measure the five applications with one seed, FULL
 	$(EXAMPLES_BIN)/python -m benchmarks.applications $(if $(FULL),--seeds 3)
 
 ros2: $(DEV_READY) $(ROS2_READY) ## test with real rclpy of two releases of ROS; needs python3.11, python3.12 and a C++ compiler
-	tests/ros2/alone.sh $(BIN)/pytest -s tests/ros2
+	tests/ros2/alone.sh $(BIN)/pytest -s tests/ros2/test_goals.py
+	tests/ros2/alone.sh $(BIN)/pytest --numprocesses 2 --ignore tests/ros2/test_goals.py tests/ros2
 
 browser: $(DEV_READY) ## run the tests in a real browser; needs Chromium
 	$(BIN)/pytest tests/browser

@@ -36,6 +36,7 @@ except ImportError as error:
 
 DIAGNOSTICS_EVERY_S = 1.0
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+RESULTS_KEPT_S = 10  # for a client that asks late; Jazzy would keep the paths of 15 minutes
 REQUESTS = QoSProfile(depth=100)  # of goals at once; services keep 10 by default, and lose the others
 
 log = logging.getLogger(__name__)
@@ -85,6 +86,7 @@ class PlannerNode:
                 goal_service_qos_profile=REQUESTS,
                 result_service_qos_profile=REQUESTS,
                 cancel_service_qos_profile=REQUESTS,
+                result_timeout=RESULTS_KEPT_S,
             )
             log.info("ready: action %s", name)
         else:

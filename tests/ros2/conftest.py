@@ -26,6 +26,7 @@ DDS = "cyclonedds"  # a peer without ROS
 PLANNER = {"tasks": "offboard.common.planning.planner", "workers": 1}
 ANSWER_S = 120.0
 END_S = 10.0
+WORKER, WORKERS_MAX = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:]), 10
 ACTION = "compute_path_to_pose"
 # Where DDS looks for others: everywhere in a network of its own, else only on this computer.
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
@@ -113,7 +114,8 @@ def start(tmp_path: Path, reach: str) -> Iterator[Callable[..., Process]]:
     A test has a DDS domain of its own, so that tests do not hear each other.
     """
     made: list[Process] = []
-    domain = {"ROS_DOMAIN_ID": str(1 + secrets.randbelow(100)), RANGE: reach}
+    number = 1 + WORKER + WORKERS_MAX * secrets.randbelow(10)
+    domain = {"ROS_DOMAIN_ID": str(number), RANGE: reach}
 
     def factory(where: str, *arguments: str) -> Process:
         python, environ = Path(sys.executable), domain

@@ -1,6 +1,7 @@
 """Goals on a map, the paths that they must get, and figures of the times that they took."""
 
 import statistics
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ Goal = dict[str, Any]
 Result = dict[str, Any]
 
 
+@cache
 def goals_on(grid: GridMap, count: int, seed: int = 1) -> list[Goal]:
     """Random goals with starts, between which there is a path."""
     rng = np.random.default_rng(seed)
@@ -31,27 +33,33 @@ def goals_on(grid: GridMap, count: int, seed: int = 1) -> list[Goal]:
     ]
 
 
-def planned(grid: GridMap, goal: Goal) -> Plan:
-    start = Pose(goal["start"]["x"], goal["start"]["y"])
-    return plan_path(grid, None, start, Point(goal["x"], goal["y"]), RADIUS_M)
-
-
-def goals_from(grid: GridMap, start: Goal, count: int) -> list[Goal]:
-    """Random goals that can be reached from one start."""
-    found = [goal | {"start": start} for goal in goals_on(grid, 2 * count)]
+@cache
+def goals_from_one_start(grid: GridMap, count: int) -> list[Goal]:
+    """Random goals that can be reached from the same start."""
+    (first,) = goals_on(grid, 1, seed=2)
+    found = [goal | {"start": first["start"]} for goal in goals_on(grid, 2 * count)]
     return [goal for goal in found if planned(grid, goal).status == "NONE"][:count]
 
 
-def place(client: Process, grid: GridMap, folder: Path) -> Goal:
-    """Let a peer publish a map and a pose on it, and wait until its goals are heard; returns the pose."""
-    start: Goal = goals_on(grid, 1, seed=2)[0]["start"]
+def planned(grid: GridMap, goal: Goal) -> Plan:
+    start, end = Pose(goal["start"]["x"], goal["start"]["y"]), Point(goal["x"], goal["y"])
+    return _planned(grid, start, end)
+
+
+@cache
+def _planned(grid: GridMap, start: Pose, end: Point) -> Plan:
+    return plan_path(grid, None, start, end, RADIUS_M)
+
+
+def place(client: Process, grid: GridMap, folder: Path) -> None:
+    """Let a peer publish a map, and the pose of `goals_from_one_start`; wait until its goals are heard."""
+    (first,) = goals_from_one_start(grid, 1)
     publish_map(client, grid, folder)
-    client.do("pose", x=start["x"], y=start["y"])
+    client.do("pose", **first["start"])
     client.do("arrive")
-    (first,) = goals_from(grid, start, 1)
     for _ in range(TRIES):
         if client.do("topic", goal=first, wait_s=1.0)["poses"] is not None:
-            return start
+            return
     pytest.fail("no plan")
 
 

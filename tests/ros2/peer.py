@@ -5,12 +5,14 @@ JSON command a line from stdin, and answers each with one line. Its argument is 
 """
 
 import array
+import gc
 import json
 import math
 import signal
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -39,7 +41,7 @@ class Peer:
 
     def __init__(self) -> None:
         self.node = rclpy.create_node("peer")
-        self.plans: list[tuple[float, Path]] = []
+        self.plans: deque[tuple[float, Path]] = deque(maxlen=1)  # with the times at which they came
         self.latched: set[Any] = set()  # publishers that have published
         self.facts: dict[str, Any] = {}
         self.maps = self.node.create_publisher(OccupancyGrid, "map", LATCHED)
@@ -282,6 +284,7 @@ def rows(path: Path) -> list[list[float]]:
 
 
 def main() -> None:
+    gc.disable()  # its pauses would count as time of the node
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it ends with its commands, and says goodbye on DDS
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     peer = Peer()

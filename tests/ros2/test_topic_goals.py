@@ -9,7 +9,7 @@ import pytest
 from offboard.common.planning.maps import GridMap
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from tests.ros2.conftest import DDS, PLANNER, Process
-from tests.ros2.goals import ONBOARD_S, PLANS, Goal, check_path, goals_from, place, quantiles_ms
+from tests.ros2.goals import ONBOARD_S, PLANS, check_path, goals_from_one_start, place, quantiles_ms
 
 pytestmark = [pytest.mark.ros2, pytest.mark.timeout(300)]
 
@@ -48,8 +48,8 @@ def test_goals_by_topic_get_the_paths_of_the_planner(
     process, asking = topic_node(server, *flags, **PLANS), peer(client)
     times_s = []
     for grid in (willow, depot):
-        start = place(asking, grid, tmp_path)
-        for number, goal in enumerate(goals_from(grid, start, GOALS)):
+        place(asking, grid, tmp_path)
+        for number, goal in enumerate(goals_from_one_start(grid, GOALS)):
             disturb(bed, number)
             result = asking.do("topic", goal=goal)
             assert result["poses"] is not None, process.log()
@@ -58,7 +58,7 @@ def test_goals_by_topic_get_the_paths_of_the_planner(
     print(f"\n{server} for {client}: {quantiles_ms(times_s)}, at most {max(times_s) * 1e3:.0f} ms")
     assert TIMEOUT_S <= max(times_s) <= TIMEOUT_S + ONBOARD_S, process.log()
     assert "reason" in asking.do("told")
-    check_other_goals(asking, depot, start)
+    check_other_goals(asking, depot)
 
 
 def disturb(bed: LocalTestbed, number: int) -> None:
@@ -71,10 +71,10 @@ def disturb(bed: LocalTestbed, number: int) -> None:
         bed.start("cloud")
 
 
-def check_other_goals(asking: Process, grid: GridMap, start: Goal) -> None:
+def check_other_goals(asking: Process, grid: GridMap) -> None:
     """A goal outside the map gets no plan; of 50 goals at once, the last one gets its plan."""
     assert asking.do("topic", goal={"x": 1e4, "y": 0.0, "yaw": 0.0}, wait_s=0.5)["poses"] is None
-    goals = goals_from(grid, start, 50)
+    goals = goals_from_one_start(grid, 50)
     for goal in goals:
         asking.do("topic", goal=goal, wait_s=0.0)
     time.sleep(1.0)
