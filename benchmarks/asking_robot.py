@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import asdict
-from itertools import islice
+from itertools import chain, count, islice
 from pathlib import Path
 from random import Random
 from typing import Any, TextIO
@@ -46,7 +46,7 @@ def main() -> int:
     flags = parser.parse_args()
     kind = find_kind(flags.application)
     module = sys.modules[kind.function.__module__]
-    calls = islice(module.inputs(flags.seed), flags.tasks)
+    calls = islice(chain.from_iterable(map(module.inputs, count(flags.seed))), flags.tasks)
     play = {ASK: ask, OBSERVE: observe}[flags.doing]
     with Path(flags.lines).open("w", buffering=1) as file:
         play(kind.function, calls, flags.cloud, timeout_s=flags.timeout, seed=flags.seed, file=file)

@@ -9,7 +9,7 @@ import warnings
 import weakref
 from collections.abc import Callable, Collection
 from concurrent.futures import Future
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from offboard.common.errors import OffloadError
 from offboard.robot_client.execution.call_threads import CallThreads
@@ -56,6 +56,10 @@ class Lifetime:
     def call_beside(self, call: Callable[[], T]) -> "Future[T]":
         """Make a call whose caller may leave at a deadline. That caller may be a call of `submit`."""
         return self._start(self._late_calls, call)
+
+    def leave(self, call: "Future[Any]") -> None:
+        """Nobody waits for this call of `call_beside` any more; it still runs if there is a thread for it."""
+        self._late_calls.drop(call)
 
     def close_when_dropped(self, offloader: object) -> None:
         """Close, with a ResourceWarning, when nothing refers to the offloader any more."""

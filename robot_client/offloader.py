@@ -285,7 +285,7 @@ class Offloader:
         self._clock.wait([call], max(0.0, until_s - self._clock.now_s()))
         if call.done() and self._clock.now_s() <= until_s:
             return call.result()[0]
-        call.cancel()  # it may wait for a thread: nobody would read its answer
+        self._life.leave(call)
         raise missed(task.kind.name, deadline_s, pending.forecast, pending.absent)
 
     def _begin(

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import settings
 
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.loadgen.testbed.testbed import Setup
@@ -17,6 +18,9 @@ ROOT = Path(__file__).parents[1]
 os.environ.setdefault("NUMBA_CACHE_DIR", str(ROOT / ".cache" / "numba"))
 # A shell's background job ignores Ctrl-C, and so would every process that a test starts and interrupts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+# How long an example takes depends on the machine. The limit of a test ends one that hangs.
+settings.register_profile("offboard", deadline=None)
+settings.load_profile("offboard")
 
 PROBES = {"tasks": "tests.probes", "workers": 1}
 

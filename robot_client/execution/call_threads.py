@@ -3,6 +3,7 @@
 What a call does is left to those who start it.
 """
 
+import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import copy_context
@@ -20,15 +21,30 @@ class CallThreads:
 
     def __init__(self, width: int, name: str) -> None:
         self._pool = ThreadPoolExecutor(width, thread_name_prefix=name)
+        self._width = width
+        self._lock = threading.Lock()
+        self._unended = 0
 
     def start(self, function: Callable[..., T], *args: Any) -> "Future[T]":
         call: Future[T] = Future()
+        with self._lock:
+            self._unended += 1
+        call.add_done_callback(self._end)
         todo: list[Callable[[], T]] = [partial(copy_context().run, function, *args)]
         try:
             self._pool.submit(_make, todo, call)
         except RuntimeError:  # the pool may still run what it could not start a thread for
             _make(todo, call)
         return call
+
+    def drop(self, call: "Future[Any]") -> None:
+        """Cancel a call that waits for a thread, but not one whose own thread has not begun yet."""
+        if self._unended > self._width:
+            call.cancel()
+
+    def _end(self, _: "Future[Any]") -> None:
+        with self._lock:
+            self._unended -= 1
 
     def close(self, *, wait: bool) -> None:
         """End the threads once they have made the calls that were started."""

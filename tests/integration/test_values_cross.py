@@ -22,7 +22,7 @@ MIB = 1 << 20
 LEVELS = 32
 DATACLASSES = 10  # one in the other: each takes three levels
 
-many = settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck))
+many = settings(max_examples=200, suppress_health_check=list(HealthCheck))
 few = settings(many, max_examples=40)
 wheres = st.sampled_from([CLOUD, CLOUD, ONBOARD, "both", None])
 

@@ -29,7 +29,6 @@ pytestmark = [pytest.mark.integration, pytest.mark.timeout(SECONDS + SHRINK_S)]
 search = settings(
     max_examples=RUNS,
     stateful_step_count=STEPS,
-    deadline=None,
     database=None,
     phases=(Phase.generate, Phase.shrink),
     report_multiple_bugs=False,

@@ -54,7 +54,7 @@ def streams(draw: st.DrawFn) -> list[Row]:
 
 
 @given(streams(), st.integers(2, 60), st.booleans())
-@settings(max_examples=70, deadline=None)
+@settings(max_examples=70)
 def test_predictions_equal_weighted_least_squares(rows: list[Row], window: int, fades: bool) -> None:
     """Every prediction equals exact arithmetic to 1e-9, with the default forgetting and without."""
     predictor = RecursiveLeastSquares(window, forgetting=None if fades else 1.0)
@@ -80,7 +80,7 @@ def test_without_forgetting_100_000_executions_count_equally() -> None:
 
 
 @given(st.floats(0, 1e15), st.floats(0.5, 1), st.integers(0, 2**32))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_constant_times_are_predicted_exactly(seconds: float, forgetting: float, seed: int) -> None:
     """Times that never change are predicted exactly, with spread 0, for any sizes."""
     rng = random.Random(seed)

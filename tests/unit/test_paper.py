@@ -103,7 +103,7 @@ def row_streams(draw: st.DrawFn) -> list[Row]:
 
 
 @given(row_streams(), st.integers(2, 25))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_decisions_and_queues_equal_the_transcription(rows: list[Row], n: int) -> None:
     """After every task, the decision and both queues are those of Algorithm 1."""
     wanted, got = transcription(rows, n), offloaded(rows, n)

@@ -57,7 +57,7 @@ def lstsq(rows: Rows, size: Array) -> float:
 
 
 @given(windows(determined=True), st.integers(0, 2**32))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_a_determined_plane_equals_lstsq_everywhere(rows: Rows, seed: int) -> None:
     """With independent numbers and enough rows, every prediction is that of lstsq, also far outside."""
     predictor, rng = taught(rows), np.random.default_rng(seed)
@@ -66,7 +66,7 @@ def test_a_determined_plane_equals_lstsq_everywhere(rows: Rows, seed: int) -> No
 
 
 @given(windows())
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_what_the_window_determines_equals_lstsq(rows: Rows) -> None:
     """For its sizes and for those between them, dependent or few as they may be, predictions are its own."""
     predictor, sizes = taught(rows), rows[0]
@@ -75,7 +75,7 @@ def test_what_the_window_determines_equals_lstsq(rows: Rows) -> None:
 
 
 @given(windows(), st.integers(0, 2**32))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_the_rest_has_the_smallest_slopes(rows: Rows, seed: int) -> None:
     """Elsewhere, slopes have the minimum norm, in units of the range of each number; a constant has none."""
     sizes, seconds = rows
@@ -90,7 +90,7 @@ def test_the_rest_has_the_smallest_slopes(rows: Rows, seed: int) -> None:
 
 
 @given(windows(determined=True), st.integers(2, 30))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_only_the_window_counts(rows: Rows, window: int) -> None:
     """Older rows are forgotten, and the warm-up is over when the window is full."""
     predictor, last = taught(rows, window), (rows[0][-window:], rows[1][-window:])
@@ -100,7 +100,7 @@ def test_only_the_window_counts(rows: Rows, window: int) -> None:
 
 
 @given(windows(determined=True))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_the_spread_is_that_of_the_residuals(rows: Rows) -> None:
     """Its square is the sum of squared residuals over n - k - 1, as the n - 2 of a line."""
     size = tuple(rows[0][0].tolist())

@@ -61,7 +61,7 @@ def windows(draw: st.DrawFn, shortest: int = 2) -> tuple[Column, Column]:
 
 
 @given(windows())
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_theil_sen_equals_scipy(window: tuple[Column, Column]) -> None:
     """Line and spread equal scipy's `theilslopes` and `median_abs_deviation` within 1e-12."""
     from scipy.stats import median_abs_deviation, theilslopes
@@ -131,7 +131,7 @@ def test_huber_equals_scikit_learn(sizes: int) -> None:
 
 
 @given(windows(shortest=3))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_huber_minimises_its_objective(window: tuple[Column, Column]) -> None:
     """The gradient is 0, or if there is none, no nearby line costs less."""
     assert_minimum(*(standard(column) for column in window))
@@ -249,7 +249,7 @@ values = st.floats(0, 1e15) | st.sampled_from([0.0, 5e-324, 1e-300, 1e-100, 1.0,
 
 @pytest.mark.parametrize("name", [*ROBUST, "recursive-least-squares"])
 @given(st.lists(st.tuples(values, values), min_size=1, max_size=12), values)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_any_data_give_a_finite_prediction(name: str, rows: list[Row], size: float) -> None:
     """Predictions are finite, and nothing warns, for any sizes and seconds up to 1e15."""
     predictor = make(name, 12)

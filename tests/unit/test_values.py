@@ -62,7 +62,7 @@ def test_values_of_version_1_have_these_bytes() -> None:
     assert list(body.blobs) == [bytes.fromhex(digest)]
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.too_slow])
 @given(trees)
 def test_decoding_reverses_encoding(value: Any) -> None:
     """Every allowed value comes back equal, arrays with the same dtype and shape."""

@@ -55,12 +55,13 @@ def sizes_stream(kind: str, rng: random.Random, count: int) -> list[float]:
 STREAMS = ("wide", "offset", "jumps", "runs", "outliers", "equal")
 
 
+@pytest.mark.timeout(60)
 @given(
     st.sampled_from(STREAMS),
     st.integers(2, 40) | st.sampled_from([100, 250]),
     st.integers(0, 2**32),
 )
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=120)
 def test_predictions_equal_exact_arithmetic(stream: str, length: int, seed: int) -> None:
     """Every prediction equals exact arithmetic within 1e-9. Equal sizes give the mean."""
     rng = random.Random(seed)
