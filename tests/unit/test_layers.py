@@ -13,7 +13,8 @@ PACKAGES: dict[str, set[str]] = {
     "common": set(),
     "robot_client": {"common"},
     "cloud_server": {"common"},
-    "loadgen": {"common", "robot_client"},
+    "loadgen": {"common", "robot_client", "offboard"},  # of offboard only the converters of offboard/ros2
+    "offboard": {"common", "robot_client"},
 }
 # Folders by what they may import from their own package. `__main__`, which
 # builds everything, may import all.
@@ -52,6 +53,7 @@ FOLDERS: dict[str, set[str]] = {
     "loadgen/testbed": {"loadgen/relay", "loadgen/relay/link"},
     "loadgen/rivals": set(),
     "loadgen/table": {"loadgen", "loadgen/rivals"},
+    "loadgen/export": {"loadgen", "loadgen/play", "loadgen/robot", "loadgen/table"},
     "loadgen/scenario": {
         "loadgen",
         "loadgen/relay/link",
@@ -83,6 +85,7 @@ FOLDERS: dict[str, set[str]] = {
         "loadgen/table",
     },
     "loadgen/report": {"loadgen/play", "loadgen/rivals", "loadgen/table"},
+    "offboard/ros2": set(),
 }
 # Heavy or optional libraries, and the files that may import them.
 OWNERS = {
@@ -116,13 +119,15 @@ OWNERS = {
     "threadpoolctl": {"loadgen/rivals/arima.py"},
     "torch": {"loadgen/rivals/lstm.py"},
     "river": {"loadgen/rivals/river_model.py"},
+    "mcap": {"loadgen/export/mcap_file.py"},
+    "rosbags": {"loadgen/export/mcap_file.py"},
 }
 
 
 def modules() -> dict[str, Path]:
     """Every module of ours by its full name."""
     found = {}
-    for package in ("offboard", *PACKAGES):
+    for package in PACKAGES:
         for path in (ROOT / package).rglob("*.py"):
             name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
             found[name if package == "offboard" else f"offboard.{name}"] = path

@@ -34,7 +34,7 @@ def test_no_limit_is_broken(offenders: Callable[[list[structure.Module]], list[s
 
 
 def test_folders_hold_few_files() -> None:
-    """No folder of the four packages holds more files than a reader can take in."""
+    """No folder of the packages holds more files than a reader can take in."""
     for folder, count in structure.files_by_folder(MODULES).items():
         assert count <= FOLDER_FILES_MAX.get(folder, FILES_MAX), folder
 
