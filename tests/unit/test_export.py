@@ -1,5 +1,6 @@
 """`loadgen export --mcap`: the messages of a run, and mistakes of the user."""
 
+import re
 import resource
 import subprocess
 import sys
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.rosbag2 import Reader
 
 from offboard.common.errors import ConfigError
 from offboard.loadgen.__main__ import main
@@ -80,6 +82,18 @@ def test_decisions_and_times_are_those_of_the_trace(tmp_path: Path) -> None:
     assert waited == [task.decided.waited_ms for task in tasks]
     true = [message.data for _, message in of(said, "/offboard/true_ms/onboard")]
     assert true == list(chain(*(task.decided.true_ms.values() for task in tasks)))
+
+
+def test_the_topics_are_those_of_the_docs(tmp_path: Path) -> None:
+    """docs/formats.md lists every topic with its type, and no other."""
+    drive(tmp_path)
+    assert export(tmp_path, "--mcap", tmp_path / "run.mcap") == 0
+    listed = re.findall(
+        r"^\| `(/\S+)` \| (\w+)/(\w+) \|", (ROOT / "docs/formats.md").read_text(), re.MULTILINE
+    )
+    expected = {topic.replace("SITE", "onboard"): f"{package}/msg/{name}" for topic, package, name in listed}
+    with Reader(tmp_path / "run.mcap") as reader:
+        assert {one.topic: one.msgtype for one in reader.connections} == expected
 
 
 def test_messages_of_tasks_at_the_same_time_are_in_the_order_of_time(tmp_path: Path) -> None:
