@@ -41,7 +41,7 @@ type: $(DEV_READY) ## check types with mypy, strict, on the unpacked wheel
 	cd $(CACHE)/typed && $(BIN_ABS)/python -m zipfile -e offboard-*.whl . && $(BIN_ABS)/mypy --config-file $(CURDIR)/pyproject.toml --cache-dir $(CACHE)/mypy -p offboard
 
 # Tests that may run in parallel with others.
-CROWDED := tests/unit tests/integration/executors tests/integration/keys tests/integration/toxiproxy $(addprefix tests/integration/test_,$(addsuffix .py,alone attacks blobs channel check compare cpu_time crashes dataset demo fuzz own_task local_testbed robot_workload values_cross wheel))
+CROWDED := tests/unit tests/integration/executors tests/integration/keys tests/integration/toxiproxy $(addprefix tests/integration/test_,$(addsuffix .py,alone attacks blobs channel check compare cpu_time crashes dataset demo export fuzz own_task local_testbed robot_workload values_cross wheel))
 test: $(DEV_READY) ## run every test that this machine can run; skipped tests say why
 	$(BIN)/pytest --numprocesses 2 $(CROWDED)
 	$(BIN)/pytest --ignore tests/ros2 $(addprefix --ignore ,$(CROWDED))

@@ -150,9 +150,14 @@ def _dataset(argv: Sequence[str]) -> int:
 
 
 def _export(argv: Sequence[str]) -> int:
-    from offboard.loadgen.table.export_dataset import ExportConfig, run_export
+    from offboard.loadgen.export.export import ExportConfig, run_export
 
-    return run_export(*_file_and_config("export", ExportConfig, argv))
+    parser = _parser("export", "RUN")
+    help = "folder of a run, or its trace.jsonl; of further robots, trace-2.jsonl and so on"
+    parser.add_argument("run", type=Path, metavar="RUN", help=help)
+    add_flags(parser, ExportConfig, PREFIX)
+    flags = parser.parse_args(argv)
+    return run_export(flags.run, resolve(ExportConfig, flags, environ=os.environ, prefix=PREFIX))
 
 
 def _drive(argv: Sequence[str]) -> int:
@@ -231,7 +236,7 @@ COMMANDS = {
     "dataset": Command(
         "measure the plans of a scenario on both sites, and write them as a CSV file", _dataset
     ),
-    "export": Command("write the tasks of a trace that ran on both sites as a CSV file", _export),
+    "export": Command("write a run as a CSV file, or as an MCAP file with messages of ROS 2", _export),
     "drive": Command("drive a simulated robot on a map, and plan its paths onboard or in the cloud", _drive),
     "call": Command("call a task of yours with numbers or inputs, one after the other or at a rate", _call),
     "wan": Command("relay between robot and cloud, with delay, jitter, loss, outages and other faults", _wan),

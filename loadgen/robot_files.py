@@ -62,6 +62,11 @@ def reference_path(path: Path) -> Path:
     return path.with_name(f"{path.stem}.reference.jsonl")
 
 
+def drive_path(path: Path) -> Path:
+    """The drive record of a run on a map, next to the trace of the run."""
+    return path.with_name(f"{path.stem}.drive.jsonl")
+
+
 def _parse(where: str, line: bytes, names: Sequence[str]) -> dict[str, Any]:
     try:
         fields = json.loads(line)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from offboard.common.errors import ConfigError
+from offboard.common.errors import ConfigError, DataError
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.testbed.testbed import ROBOT
 
@@ -55,6 +55,17 @@ class LineCounter:
             self._count += new.count(b"\n")
             self._read += len(new)
         return self._count
+
+
+def find_source(path: Path) -> Path:
+    """The trace in the folder of a run, or the file itself."""
+    if path.is_dir():
+        if not (path / TRACE).is_file():
+            raise DataError(f"{path}: this folder has no {TRACE}; `loadgen run` and `loadgen demo` write one")
+        return path / TRACE
+    if not path.exists():
+        raise DataError(f"{path}: no such file or folder; give the folder of a run, a trace, or a CSV file")
+    return path
 
 
 def clear_folder(out: Path) -> None:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from offboard.common.config import check, setting
-from offboard.common.errors import ConfigError, DataError
+from offboard.common.errors import ConfigError
 from offboard.common.security.plain_files import replace_file
 from offboard.loadgen import rivals
-from offboard.loadgen.play.run_files import TRACE
+from offboard.loadgen.play.run_files import find_source
 from offboard.loadgen.report.captions import all_charts
 from offboard.loadgen.report.findings import Findings
 from offboard.loadgen.report.html_page import Panel, page
@@ -105,19 +105,6 @@ def run_report(path: Path, config: ReportConfig) -> int:
     write_whole(out / PAGE, text)
     print(out / PAGE)
     return 0
-
-
-def find_source(path: Path) -> Path:
-    """The trace in the folder of a run, or the file itself."""
-    if path.is_dir():
-        if not (path / TRACE).is_file():
-            raise DataError(f"{path}: this folder has no {TRACE}; `loadgen run` and `loadgen demo` write one")
-        return path / TRACE
-    if not path.exists():
-        raise DataError(
-            f"{path}: no such file or folder; a report needs the folder of a run, a trace, or a CSV file"
-        )
-    return path
 
 
 def about(findings: Findings) -> str:

@@ -10,14 +10,14 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
 
-from offboard.common.config import as_dict
+from offboard.common.config import as_dict, flag_of, settings_of
 from offboard.common.errors import ConfigError, OffloadError
 from offboard.common.task_states import TaskStates
 from offboard.loadgen.robot.answers import Answers
-from offboard.loadgen.robot.config import DriveConfig, RobotConfig
+from offboard.loadgen.robot.config import DriveConfig, MapSettings, RobotConfig
 from offboard.loadgen.robot.references import References, measure_alone
 from offboard.loadgen.robot.run import OwnRecord, Run
-from offboard.loadgen.robot.work import Work, make_work
+from offboard.loadgen.robot.work import Plans, Work, make_work
 from offboard.loadgen.robot_files import alone_path, reference_path
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.records.lines import Lines
@@ -45,6 +45,8 @@ def run_robot(config: RobotConfig) -> int:
     try:
         observers: list[Observer] = [*([trace.write] if trace else []), *_metrics(config, trace)]
         work, states = make_work(config), TaskStates(workers=1)  # shared, so that each setup runs once
+        if isinstance(config, DriveConfig) and isinstance(work, Plans):
+            write_drive_record(config, work)
         _run_tasks(config, work, states, answers, observers=observers, files=files)
         if alone:
             # With its own offloader: what the run learns, records and counts is about the run only.
@@ -59,6 +61,17 @@ def run_robot(config: RobotConfig) -> int:
         if file.lost:
             raise OffloadError(f"{file.lost} tasks could not be written to {file.path}")
     return 0
+
+
+def write_drive_record(config: DriveConfig, work: Plans) -> None:
+    """Write the drive record, if the run has a trace and answers with which it can be used."""
+    from offboard.loadgen.drive_record import DriveRecord  # it loads the planner, which a call does not need
+
+    if config.trace is None or config.answers is None:
+        return
+    names = {flag_of(field) for field in settings_of(MapSettings)} | {"seed"}
+    settings = {name: value for name, value in as_dict(config).items() if name in names and value is not None}
+    DriveRecord(config.answers, settings, work.robot.prior).write(config.trace)
 
 
 def _run_tasks(

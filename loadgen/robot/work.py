@@ -85,12 +85,17 @@ def make_work(config: RobotConfig) -> Work:
     """The work that the settings ask for; a ConfigError or DataError if it cannot be made."""
     if isinstance(config, CallConfig):
         return make_calls(config)
+    assert isinstance(config, DriveConfig)
+    return make_plans(config, read_prior(config.map, config.resolution))
+
+
+def make_plans(config: DriveConfig, prior: "GridMap") -> Plans:
+    """The plans of a robot that was given the map `prior`."""
     from offboard.loadgen.robot.robot import SimulatedRobot
 
-    assert isinstance(config, DriveConfig)
     wanted = sizes(parse_sizes(config.sizes), config.seed) if config.sizes else None
     robot = SimulatedRobot(
-        read_prior(config.map, config.resolution),
+        prior,
         seed=config.seed,
         obstacles=config.obstacles,
         radius_m=config.radius_m,

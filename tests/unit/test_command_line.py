@@ -14,11 +14,11 @@ from offboard.common.errors import ConfigError, DataError, OffloadError
 from offboard.common.security.keys import KeysConfig
 from offboard.loadgen.__main__ import DemoConfig, RunConfig
 from offboard.loadgen.compare.compare_settings import CompareConfig
+from offboard.loadgen.export.export import ExportConfig
 from offboard.loadgen.play.measure_dataset import DatasetConfig
 from offboard.loadgen.relay.wan import WanConfig
 from offboard.loadgen.report.report import ReportConfig
 from offboard.loadgen.robot.config import CallConfig, DriveConfig
-from offboard.loadgen.table.export_dataset import ExportConfig
 from offboard.loadgen.table.replay import ReplayConfig
 from offboard.loadgen.table.table_settings import TableConfig
 

@@ -13,7 +13,7 @@ PACKAGES: dict[str, set[str]] = {
     "common": set(),
     "robot_client": {"common"},
     "cloud_server": {"common"},
-    "loadgen": {"common", "robot_client"},
+    "loadgen": {"common", "robot_client", "offboard"},  # of offboard only the converters of offboard/ros2
     "offboard": {"common", "robot_client"},
 }
 # This command is an application of the library, and is imported only when it is chosen.
@@ -55,6 +55,7 @@ FOLDERS: dict[str, set[str]] = {
     "loadgen/testbed": {"loadgen/relay", "loadgen/relay/link"},
     "loadgen/rivals": set(),
     "loadgen/table": {"loadgen", "loadgen/rivals"},
+    "loadgen/export": {"loadgen", "loadgen/play", "loadgen/robot", "loadgen/table"},
     "loadgen/scenario": {
         "loadgen",
         "loadgen/relay/link",
@@ -122,6 +123,8 @@ OWNERS = {
     "river": {"loadgen/rivals/river_model.py"},
     "rclpy": {"offboard/ros2/node.py"},
     "cyclonedds": {"offboard/ros2/bridge.py", "offboard/ros2/dds_types.py"},
+    "mcap": {"loadgen/export/mcap_file.py"},
+    "rosbags": {"loadgen/export/mcap_file.py"},
 }
 
 

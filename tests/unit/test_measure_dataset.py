@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from offboard.common.errors import ConfigError, DataError
+from offboard.loadgen.export.export import ExportConfig, run_export
 from offboard.loadgen.play.measure_dataset import DatasetConfig, run_dataset
 from offboard.loadgen.play.play_scenario import play
 from offboard.loadgen.scenario.scenario_file import read_scenario
-from offboard.loadgen.table.export_dataset import ExportConfig, run_export
 from offboard.loadgen.table.measured_rows import read
 from offboard.loadgen.table.measurement_notes import notes
 from offboard.loadgen.table.table_settings import TableConfig

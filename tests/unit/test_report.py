@@ -12,8 +12,9 @@ import pytest
 
 from offboard.common.errors import ConfigError, DataError
 from offboard.loadgen.__main__ import main
+from offboard.loadgen.play.run_files import find_source
 from offboard.loadgen.report.inline_svg import inline
-from offboard.loadgen.report.report import ReportConfig, find_source, run_report
+from offboard.loadgen.report.report import ReportConfig, run_report
 from offboard.loadgen.table import published_table_two as paper
 from offboard.loadgen.table.table_formats import render
 from tests.reports import CHARTS, write_rows
@@ -156,7 +157,7 @@ def test_a_path_that_is_not_a_run_is_named(tmp_path: Path, capsys: pytest.Captur
     (tmp_path / "empty" / "trace.jsonl").touch()
     (tmp_path / "other").mkdir()
     for name, said in (
-        ("none", "none: no such file or folder; a report needs the folder of a run, a trace, or a CSV file"),
+        ("none", "none: no such file or folder; give the folder of a run, a trace, or a CSV file"),
         ("other", "other: this folder has no trace.jsonl; `loadgen run` and `loadgen demo` write one"),
         ("empty", "no task was answered by both sites"),
     ):
