@@ -132,4 +132,4 @@ $(EXAMPLES_READY): requirements/examples.txt pyproject.toml
 # Nothing else may live in these environments: the wheels of ROS restart Python, and bring an old OpenSSL.
 .cache/ros2-%/.ready: requirements/ros2-%.txt tests/ros2/build.py $(wildcard tests/ros2/interfaces/*/*/*)
 	$(PYTHON) tests/ros2/build.py $* .cache/ros2-$*
-	touch $@
+	test ! -d .cache/ros2-$* || touch $@

@@ -50,10 +50,11 @@ class Diagnostics:
             "site": last.used or "none",
             "reason": last.decision.reason,
             "policy": last.decision.policy,
-            "true_ms": f"{last.waited_s * 1e3:.3f}",
+            "waited_ms": f"{last.waited_s * 1e3:.3f}",
         }
         for site, outlook in last.sites.items():
             found |= _of_site(site, outlook)
+        found |= {f"{run.site}.true_ms": f"{run.seconds * 1e3:.3f}" for run in last.executions if run.ok}
         total = used.total()
         return found | {f"{site}.share": f"{used[site] / total:.2f}" for site in last.sites}
 

@@ -37,24 +37,27 @@ PACKAGES = (
 
 
 def main(release: str, folder: Path) -> None:
-    python = folder / "bin" / "python"
-    requirements = HERE.parents[1] / "requirements" / f"ros2-{release}.txt"
+    base, python = python_of(release), folder / "bin" / "python"
     shutil.rmtree(folder, ignore_errors=True)
-    run([python_of(release), "-m", "venv", folder])
+    if base is None:
+        print(f"{release} is left out: there is no python{PYTHONS[release]} on the PATH")
+        return
+    requirements = HERE.parents[1] / "requirements" / f"ros2-{release}.txt"
+    run([base, "-m", "venv", folder])
     run([python, "-m", "pip", "install", "--quiet", "--require-hashes", "-r", requirements])
     correct_paths(folder)
     for package in PACKAGES:
         generate(package, folder)
 
 
-def python_of(release: str) -> str:
+def python_of(release: str) -> str | None:
     """A Python of the version that the release needs: on the PATH, or of pyenv, which may hide it there."""
     version = PYTHONS[release]
     of_pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
     for found in (shutil.which(f"python{version}"), *of_pyenv.glob(f"{version}.*/bin/python")):
         if found and subprocess.run([found, "--version"], capture_output=True, check=False).returncode == 0:
             return str(found)
-    sys.exit(f"build.py: {release} needs python{version} on the PATH")
+    return None
 
 
 def generate(package: Package, folder: Path) -> None:
