@@ -18,8 +18,8 @@ from offboard.common.config import as_dict
 from offboard.common.errors import ConfigError
 
 DESCRIPTION = (
-    "Run tasks for robots. Robots connect over ZMQ; HTTP serves /health, /ready, /metrics, /config, /tasks "
-    "and /docs. `cloud-server keys` makes the keys of the server."
+    "Run tasks for robots. Robots connect over ZMQ; HTTP serves /live (a page), /health, /ready, /metrics, "
+    "/config, /tasks and /docs. `cloud-server keys` makes the keys of the server."
 )
 
 EMPTY_TASK_MODULE = "offboard.common.empty_task"
@@ -89,7 +89,7 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
         keys=keys,
         robots=config.robots_folder,
     )
-    web = make_http(config, server.status, metrics.registry, token=token)
+    web = make_http(config, metrics, server, token=token)
     web.start()
     if config.open_ways:
         warn_each_minute(config.open_ways)

@@ -42,6 +42,9 @@ class Access(Protocol):
     def robot_of(self, peer: bytes) -> bytes:
         """The robot of this connection. A robot may have several connections."""
 
+    def name_of(self, robot: bytes) -> str:
+        """The name of a robot, for people."""
+
     def shut_out(self, peer: bytes, seconds: float) -> str:
         """Refuse new connections of this robot for a while; returns its name."""
 
@@ -57,6 +60,9 @@ class Everyone:
 
     def robot_of(self, peer: bytes) -> bytes:
         return peer
+
+    def name_of(self, robot: bytes) -> str:
+        return f"connection {robot.hex()[-8:]}" if robot else "all others"
 
     def shut_out(self, peer: bytes, seconds: float) -> str:  # noqa: ARG002 - it cannot be recognised
         return "robot without a key"
@@ -116,6 +122,9 @@ class Authorisation:
     def robot_of(self, peer: bytes) -> bytes:
         connection = self._connections.get(peer)
         return peer if connection is None else connection.user.encode()
+
+    def name_of(self, robot: bytes) -> str:
+        return self._known.get(robot.decode(errors="replace"), "all others")
 
     def shut_out(self, peer: bytes, seconds: float) -> str:
         connection = self._connections.get(peer)

@@ -3,10 +3,17 @@
 `http_api` shows them.
 """
 
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Generator
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 
+from offboard.common.live.look import Look
+
+ROBOTS_MAX = 256  # robots that the page /live tells apart; further ones are counted together
+OTHERS = b""  # the name of the further ones
 SECONDS_BUCKETS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30)
 
 
@@ -23,10 +30,43 @@ class Status:
     last_task_age_s: float | None
 
 
+@dataclass(slots=True)
+class RobotUse:
+    """What one robot asked of this server since somebody looks at the page /live."""
+
+    tasks: int = 0
+    queue_s: float = 0.0
+    run_s: float = 0.0
+    refused: int = 0
+
+
+class RobotUses:
+    """What each robot asks of this server, counted only while somebody looks at the page /live."""
+
+    def __init__(self) -> None:
+        self.viewers = 0
+        self._uses: dict[bytes, RobotUse] = {}
+
+    def look(self, change: int) -> None:
+        """A viewer has come (1) or left (-1)."""
+        self.viewers += change
+        if not self.viewers:
+            self._uses = {}
+
+    def of(self, robot: bytes) -> RobotUse:
+        if robot not in self._uses and len(self._uses) >= ROBOTS_MAX:
+            robot = OTHERS
+        return self._uses.setdefault(robot, RobotUse())
+
+    def counted(self) -> dict[bytes, dict[str, Any]]:
+        return {robot: asdict(use) for robot, use in self._uses.items()}
+
+
 class Metrics:
     """The Prometheus metrics of one server, in a registry of their own."""
 
     def __init__(self) -> None:
+        self.robots = RobotUses()
         r = self.registry = CollectorRegistry()
         self.requests = Counter("offboard_requests", "Requests by outcome", ["kind", "status"], registry=r)
         self.queue_depth = Gauge("offboard_queue_depth", "Requests waiting for a worker", registry=r)
@@ -56,3 +96,38 @@ class Metrics:
         self.restarts = Counter(
             "offboard_executor_restarts", "Workers that died and were replaced", ["reason"], registry=r
         )
+
+
+class ServerLive:
+    """The source of the server's page /live. `robots`: what each robot asks of the server."""
+
+    def __init__(
+        self,
+        metrics: Metrics,
+        status: Callable[[], Status],
+        robots: Callable[[], list[dict[str, Any]]],
+        workers: int,
+    ) -> None:
+        self._metrics = metrics
+        self._status = status
+        self._robots = robots
+        self._workers = workers
+
+    def looks(self) -> Generator[Look]:
+        """The robots are counted from the first look of the first viewer on."""
+        self._metrics.robots.look(1)
+        try:
+            while True:
+                state = {"workers": self._workers, "robots": self._robots(), "samples": self._samples()}
+                yield Look("server", time.time(), server={**asdict(self._status()), **state})
+        finally:
+            self._metrics.robots.look(-1)
+
+    def _samples(self) -> list[tuple[str, dict[str, str], float]]:
+        """Every metric but the buckets of histograms: name, labels, value."""
+        return [
+            (sample.name, dict(sample.labels), sample.value)
+            for family in self._metrics.registry.collect()
+            for sample in family.samples
+            if not sample.name.endswith(("_bucket", "_created"))
+        ]

@@ -6,7 +6,7 @@ the lock of the channel.
 
 import logging
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from dataclasses import dataclass, replace
 
 from offboard.cloud_server.authorisation import Access
@@ -83,6 +83,9 @@ class Scheduler:
     @property
     def running(self) -> int:
         return len(self._running)
+
+    def waiting_by_robot(self) -> Counter[bytes]:
+        return Counter(work.robot for work in self._queue)
 
     def request(self, peer: bytes, request: Request) -> None:
         """Put a request into the queue, or answer why not."""
@@ -194,6 +197,11 @@ class Scheduler:
         self._count(request, outcome.status if work.wanted else "cancelled")
         self._metrics.queue_s.labels(request.kind).observe(work.queue_s)
         self._metrics.run_s.labels(request.kind).observe(outcome.run_s)
+        if self._metrics.robots.viewers:
+            use = self._metrics.robots.of(work.robot)
+            use.tasks += 1
+            use.queue_s += work.queue_s
+            use.run_s += outcome.run_s
 
     def give_up(self) -> int:
         """Answer the waiting requests with `busy`; returns how many requests were waiting or running.
@@ -209,6 +217,8 @@ class Scheduler:
     def refuse(self, peer: bytes, request: Request, why: Refusal) -> None:
         """Answer a request that does not run."""
         self._count(request, why.status)
+        if self._metrics.robots.viewers and why.status != "need_blob":  # the robot sends that one again
+            self._metrics.robots.of(self._access.robot_of(peer)).refused += 1
         reply = Reply(
             request.id, why.status, why.error,
             queue_s=why.queue_s, queue_depth=len(self._queue), missing=why.missing,

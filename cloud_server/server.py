@@ -7,15 +7,16 @@ import logging
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import zmq
 
 from offboard.cloud_server.authorisation import Access, Authorisation, Everyone
 from offboard.cloud_server.executors import Executor
 from offboard.cloud_server.fair_queue import Work
-from offboard.cloud_server.metrics import Metrics, Status
+from offboard.cloud_server.metrics import Metrics, RobotUse, Status
 from offboard.cloud_server.rate_limit import CUT_OFF_S, RateLimit, Verdict
 from offboard.cloud_server.reader_threads import ReaderThreads
 from offboard.cloud_server.robot_socket import ReplySender, bind_router
@@ -152,6 +153,16 @@ class Server:
             last_turn_age_s=now - self._last_turn,
             last_task_age_s=None if last_task is None else now - last_task,
         )
+
+    def robots(self) -> list[dict[str, Any]]:
+        """What each robot asked of this server since somebody looks, and how many of its tasks wait now."""
+        with self._channel.lock:
+            uses, waiting = self.metrics.robots.counted(), self._scheduler.waiting_by_robot()
+        nothing = asdict(RobotUse())
+        return [
+            {"robot": self._access.name_of(robot), **uses.get(robot, nothing), "waiting": waiting[robot]}
+            for robot in dict.fromkeys([*uses, *waiting])
+        ]
 
     def _turn(self) -> list[Work]:
         """Wait for messages and read them; returns the work to start."""
