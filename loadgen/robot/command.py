@@ -8,7 +8,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from offboard.common.config import as_dict
 from offboard.common.errors import ConfigError, OffloadError
@@ -24,6 +24,9 @@ from offboard.robot_client.records.lines import Lines
 from offboard.robot_client.records.trace import Record, Trace
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
+
+if TYPE_CHECKING:
+    from offboard.robot_client.records.metrics import Metrics
 
 log = logging.getLogger(__name__)
 
@@ -43,9 +46,10 @@ def run_robot(config: RobotConfig) -> int:
     alone = Trace(alone_path(config.trace)) if config.trace and config.alone else None
     files: list[Answers | Lines] = [file for file in (answers, trace) if file]
     try:
-        observers: list[Observer] = [*([trace.write] if trace else []), *_metrics(config, trace)]
+        metrics = _metrics(config, trace)
+        observers: list[Observer] = [*([trace.write] if trace else []), *([metrics] if metrics else [])]
         work, states = make_work(config), TaskStates(workers=1)  # shared, so that each setup runs once
-        _run_tasks(config, work, states, answers, observers=observers, files=files)
+        _run_tasks(config, work, states, answers, observers=observers, files=files, metrics=metrics)
         if alone:
             # With its own offloader: what the run learns, records and counts is about the run only.
             with _connect(config, states=states, observers=[alone.write]) as offload:
@@ -69,6 +73,7 @@ def _run_tasks(
     *,
     observers: Sequence[Observer],
     files: list[Answers | Lines],
+    metrics: "Metrics | None",
 ) -> None:
     """Run the tasks of `work`, then close `files`, to which the file of --reference is added."""
     own, sites = OwnRecord(), config.sites()
@@ -83,6 +88,8 @@ def _run_tasks(
                 observers=[own, *observers],
             )
         )
+        if metrics:
+            offload.show_on(metrics.live)
         again, references = None, None
         if config.trace and config.reference:
             again = stack.enter_context(_connect(config, states=states, sites=sites))
@@ -129,13 +136,13 @@ def _warn_of_absent(doing: str, absent: Mapping[str, str]) -> None:
         log.warning("%s without %s: %s; %s", doing, site, why, instead)
 
 
-def _metrics(config: RobotConfig, trace: Trace | None) -> list[Observer]:
+def _metrics(config: RobotConfig, trace: Trace | None) -> "Metrics | None":
     """The observer that serves metrics until the process ends, if an address is given for it."""
     if config.metrics is None:
-        return []
+        return None
     from offboard.robot_client.records.metrics import serve_metrics  # its library takes long to load
 
     metrics = serve_metrics(config.metrics, "--metrics")
     if trace:
         metrics.watch(trace)
-    return [metrics]
+    return metrics

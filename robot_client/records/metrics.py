@@ -5,16 +5,15 @@ The records are made in `offloader`.
 
 import logging
 from collections.abc import Iterator
-from threading import Thread
-from wsgiref.simple_server import WSGIServer
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, start_http_server
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from prometheus_client.core import CounterMetricFamily
 from prometheus_client.registry import Collector
 
-from offboard.common.errors import ConfigError
-from offboard.robot_client.records.trace import Record, Trace
-from offboard.robot_client.sites.runner import PORT_MAX, Execution
+from offboard.common.live.live_port import LivePort
+from offboard.common.live.robot_live import RobotLive
+from offboard.robot_client.records.trace import Record, Trace, as_dict
+from offboard.robot_client.sites.runner import Execution
 
 SECONDS_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
 
@@ -32,8 +31,8 @@ class Metrics:
 
     def __init__(self, registry: CollectorRegistry) -> None:
         self._registry = registry
-        self._server: WSGIServer | None = None
-        self._thread: Thread | None = None
+        self._port: LivePort | None = None
+        self.live = RobotLive(as_dict)
         self._tasks = Counter(
             "robot_tasks", "Tasks, by the site whose answer was used", ["kind", "site"], registry=registry
         )
@@ -77,6 +76,7 @@ class Metrics:
         }
 
     def __call__(self, record: Record) -> None:
+        self.live.keep(record)
         self._tasks.labels(record.kind, record.used or "none").inc()
         self._waited.labels(record.kind).observe(record.waited_s)
         self._decisions.labels(record.kind, record.decision.site, record.decision.policy).inc()
@@ -106,17 +106,15 @@ class Metrics:
         """Also serve how many records `trace` has lost."""
         self._registry.register(_Lost(trace))
 
-    def serve(self, host: str, port: int) -> None:
-        """Answer GET /metrics in a background thread until `close`."""
-        self._server, self._thread = start_http_server(port, host, registry=self._registry)
-        log.info("metrics: http://%s:%d/metrics", host, self._server.server_port)
+    def serve(self, address: str, where: str) -> None:
+        """Answer GET /metrics and /live in background threads until `close`."""
+        self._port = LivePort(address, where, source=self.live, registry=self._registry)
+        log.info("metrics: %s/metrics; live page: %s/live", self._port.url, self._port.url)
 
     def close(self) -> None:
         """Stop serving."""
-        if self._server is not None and self._thread is not None:
-            self._server.shutdown()
-            self._server.server_close()
-            self._thread.join()
+        if self._port is not None:
+            self._port.close()
 
 
 class _Lost(Collector):
@@ -133,12 +131,6 @@ class _Lost(Collector):
 
 def serve_metrics(address: str, where: str) -> Metrics:
     """Metrics that are served at HOST:PORT. A ConfigError, which begins with `where`, if that fails."""
-    host, _, port = address.rpartition(":")
-    if not host or not port.isdecimal() or int(port) > PORT_MAX:
-        raise ConfigError(f"{where}: {address!r} is not HOST:PORT with a port 0 to {PORT_MAX}")
     metrics = Metrics(CollectorRegistry())
-    try:
-        metrics.serve(host, int(port))
-    except (OSError, UnicodeError) as error:
-        raise ConfigError(f"{where}: {address} cannot be served: {error}") from error
+    metrics.serve(address, where)
     return metrics

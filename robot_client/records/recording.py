@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from offboard.common.errors import is_interrupt
+from offboard.common.live.robot_live import RobotLive
 from offboard.robot_client.learning.learner import PendingTask
 from offboard.robot_client.learning.regret import Regret
 from offboard.robot_client.learning.savings import Savings
@@ -30,6 +31,7 @@ class Recording:
 
     def __init__(self, *, trace: Path | str | None, metrics: str | None) -> None:
         self.observers: tuple[Observer, ...] = ()
+        self.live: RobotLive[Record] | None = None
         with ExitStack() as opened:
             file = self._trace = None if trace is None else Trace(Path(trace))
             if file is not None:
@@ -43,6 +45,7 @@ class Recording:
                 if file is not None:
                     served.watch(file)
                 self.observers += (served,)
+                self.live = served.live
             self._opened = opened.pop_all()
 
     def leave_to_parent(self) -> None:
