@@ -5,6 +5,7 @@
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,6 +19,7 @@ from offboard.loadgen.play.player import Player
 from offboard.loadgen.play.run_digest import digests
 from offboard.loadgen.play.run_files import EVENTS, READINGS, SUMMARY, TABLE, TRACE, RobotFiles, clear_folder
 from offboard.loadgen.play.stolen_cpu_time import NOTED_PERCENT, StolenCpuTime
+from offboard.loadgen.play.watch import Page, watching
 from offboard.loadgen.robot_files import alone_path, reference_path
 from offboard.loadgen.scenario.outage_recovery import read_outage
 from offboard.loadgen.scenario.outcome import Answered, Outcome
@@ -78,16 +80,22 @@ class Played:
             raise OffloadError(f"{len(failed)} of {len(self.verdicts)} checks of {self.scenario.name} failed")
 
 
-def play(scenario: Scenario, out: Path, testbed: str = "local", *, quiet: bool = False) -> Played:
+def play(
+    scenario: Scenario, out: Path, testbed: str = "local", *, quiet: bool = False, page: Page = Page.NONE
+) -> Played:
     """Play a scenario to its end. Its files in `out` (docs/formats.md) replace those of an older run.
 
-    Unless `quiet`, progress lines and the output of the first robot go to stdout.
+    Unless `quiet`, progress lines and the output of the first robot go to stdout. `page`: the page that shows
+    the run while it goes on.
     """
     say = _say_nothing if quiet else _say
     started_at, workload = datetime.now(UTC), scenario.workload
     played_from = digests(scenario)  # taken now, because the parts load the software now
-    with TESTBEDS[testbed](out, setups(scenario, out, shown=not quiet)) as bed:
+    with ExitStack() as opened:
+        bed = opened.enter_context(TESTBEDS[testbed](out, setups(scenario, out, shown=not quiet)))
         clear_folder(out)
+        if page is not Page.NONE:
+            opened.enter_context(watching(out, say, page=page))
         say(f"starting the cloud server and the relay (logs in {out / 'logs'})")
         bed.start()
         many = "the robot" if workload.robots == 1 else f"{workload.robots} robots"
@@ -113,7 +121,7 @@ def play(scenario: Scenario, out: Path, testbed: str = "local", *, quiet: bool =
 
 def play_demo(out: Path) -> int:
     """Play the shipped demo scenario, then print Table II of the plans that were measured on both sites."""
-    play(read_scenario(find_scenario("demo")), out).check_robots()
+    play(read_scenario(find_scenario("demo")), out, page=Page.SERVED).check_robots()
     text = table_text(out / TRACE, TableConfig(windows=DEMO_WINDOWS, feedback="both"))
     (out / TABLE).write_text(text)
     print(f"\n{text}\nwritten: {out / TABLE}; charts: loadgen report {out}")
