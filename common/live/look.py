@@ -28,6 +28,7 @@ class Look:
     sites: by name, how each site is now: the fields of its condition, and why it is `absent`, or null.
     budget: what may still be spent; None if it is unknown.
     server: the state of a server; None for the others.
+    left_out: tasks since the last look that are not among `tasks`, because there were too many.
     over: nothing will be added any more.
     """
 
@@ -38,6 +39,7 @@ class Look:
     sites: Mapping[str, Mapping[str, Any]] | None = None
     budget: Mapping[str, float | None] | None = None
     server: Mapping[str, Any] | None = None
+    left_out: int = 0
     over: bool = False
 
 

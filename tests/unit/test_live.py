@@ -9,7 +9,7 @@ import pytest
 from offboard.common.errors import MissingExtra
 from offboard.common.live.live_files import PATHS, page_file
 from offboard.common.live.look import KEPT_MAX, VIEWERS_MAX, Look, Viewers, encode
-from offboard.common.live.robot_live import RobotLive
+from offboard.common.live.robot_live import TASKS_MAX, RobotLive
 from offboard.loadgen.play.run_files import EVENTS, SUMMARY
 from offboard.loadgen.play.watch import GrowingFile, RunLive
 
@@ -46,14 +46,25 @@ def test_a_viewer_gets_each_record_once() -> None:
 
 
 def test_a_robot_keeps_a_limited_number_of_records() -> None:
-    """Beyond KEPT_MAX the oldest ones go, also under the eyes of a slow viewer."""
+    """Beyond KEPT_MAX the oldest ones go; a slow viewer, whose last record is gone, goes on all the same."""
+    live = RobotLive[dict[str, Any]](dict)
+    records(live, *range(2 * KEPT_MAX))
+    looks = live.looks()
+    assert [task["i"] for task in next(looks).tasks] == list(range(KEPT_MAX, 2 * KEPT_MAX))
+    records(live, *range(2 * KEPT_MAX))
+    assert len(next(looks).tasks) == TASKS_MAX
+
+
+def test_a_busy_robot_sends_few_tasks() -> None:
+    """After the first look, a look has the newest TASKS_MAX tasks and tells how many are left out."""
     live = RobotLive[dict[str, Any]](dict)
     records(live, 0)
     looks = live.looks()
     next(looks)
-    records(live, *range(1, 2 * KEPT_MAX))
-    seen = [task["i"] for task in next(looks).tasks]
-    assert seen == list(range(KEPT_MAX, 2 * KEPT_MAX))
+    records(live, *range(1, TASKS_MAX + 4))
+    look = next(looks)
+    assert [task["i"] for task in look.tasks] == list(range(4, TASKS_MAX + 4))
+    assert look.left_out == 3
 
 
 def test_records_are_read_only_for_viewers() -> None:

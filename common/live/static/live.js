@@ -109,6 +109,8 @@ function showDecisions(tasks) {
     const outlook = task.sites[task.decision.site];
     return [clock(task.at), task.i, shortly(amount(task)), placeOf(task), task.decision.reason, outlook ? ms(outlook.predicted_s) : "unknown", ms(task.waited_s), task.used || "none"];
   }), 4);
+  const few = memory.leftOut ? ` (the robot is busy: ${memory.leftOut} tasks were left out)` : "";
+  say("decisions-title", `Decisions, the latest first${few}`);
   by("decisions").hidden = false;
 }
 

@@ -15,12 +15,14 @@ export class Memory {
     this.samples = []; // looks without their tasks
     this.events = [];
     this.over = false;
+    this.leftOut = 0; // tasks of a busy robot that were not sent
     this.latest = null; // the key of the kind of the last task
   }
 
   add(look) {
     this.source = look.source;
     this.over = look.over;
+    this.leftOut += look.left_out;
     for (const task of look.tasks) this.#addTask(task);
     this.events.push(...look.events);
     this.events.splice(0, this.events.length - EVENTS);
