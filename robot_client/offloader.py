@@ -41,7 +41,7 @@ from offboard.robot_client.settings import Settings, check_types
 from offboard.robot_client.sites.absence import Absent, absent_sites, wait_for_sites
 from offboard.robot_client.sites.clock import Clock, SystemClock
 from offboard.robot_client.sites.outgoing import new_task
-from offboard.robot_client.sites.runner import ONBOARD, TIMEOUT_S, Execution, Runner, checked_timeout
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, TIMEOUT_S, Execution, Runner, checked_timeout
 from offboard.robot_client.task_runs import TaskRuns
 
 R = TypeVar("R")
@@ -135,7 +135,8 @@ class Offloader:
         rare = settings or Settings()
         chosen, memories = rare.make_policy(policy), rare.make_memories(policy)
         with ExitStack() as opened:
-            recording = Recording(trace=trace, metrics=metrics)
+            servers = [*([CLOUD] if endpoint else []), *(sites or {})]
+            recording = Recording(trace=trace, metrics=metrics, sites=servers)
             opened.callback(recording.close)
             runners = make_runners(endpoint, sites or {}, keys=keys, policy=policy, settings=rare)
             for runner in runners:

@@ -135,7 +135,8 @@ def _metrics(config: RobotConfig, trace: Trace | None) -> list[Observer]:
         return []
     from offboard.robot_client.records.metrics import serve_metrics  # its library takes long to load
 
-    metrics = serve_metrics(config.metrics, "--metrics")
+    servers = [*([CLOUD] if config.cloud else []), *config.sites()]
+    metrics = serve_metrics(config.metrics, "--metrics", servers)
     if trace:
         metrics.watch(trace)
     return [metrics]

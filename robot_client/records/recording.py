@@ -26,9 +26,10 @@ class Recording:
 
     trace: the file that records are appended to.
     metrics: HOST:PORT where Prometheus reads `/metrics`.
+    sites: the servers that the metrics show.
     """
 
-    def __init__(self, *, trace: Path | str | None, metrics: str | None) -> None:
+    def __init__(self, *, trace: Path | str | None, metrics: str | None, sites: Iterable[str] = ()) -> None:
         self.observers: tuple[Observer, ...] = ()
         with ExitStack() as opened:
             file = self._trace = None if trace is None else Trace(Path(trace))
@@ -38,7 +39,7 @@ class Recording:
             if metrics is not None:
                 from offboard.robot_client.records.metrics import serve_metrics  # only where it is wanted
 
-                served = serve_metrics(metrics, "metrics")
+                served = serve_metrics(metrics, "metrics", sites)
                 opened.callback(served.close)
                 if file is not None:
                     served.watch(file)

@@ -82,7 +82,7 @@ class Running:
 
     def counted(self, name: str, **labels: str) -> float:
         """The value of a metric."""
-        return self.metrics.registry.get_sample_value(f"offboard_{name}", labels) or 0.0
+        return self.metrics.registry.get_sample_value(f"offboard_server_{name}", labels) or 0.0
 
     def close(self) -> None:
         self.server.drain()
