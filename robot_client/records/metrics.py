@@ -19,12 +19,6 @@ from offboard.robot_client.sites.runner import PORT_MAX, Execution
 
 SECONDS_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
 
-REGRET = {
-    "": "Mean seconds per task that the better site would have saved, estimated from probes",
-    "_low": "Lower end of the 90 % interval of offboard_robot_regret_seconds",
-    "_high": "Upper end of the 90 % interval of offboard_robot_regret_seconds",
-}
-
 log = logging.getLogger(__name__)
 
 
@@ -127,9 +121,12 @@ class _LatestRegret(Collector):
     latest: Regret | None = None
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
+        name = "offboard_robot_regret{}_seconds"
         if (found := self.latest) is not None:
-            for end, value in (("", found.mean_s), ("_low", found.low_s), ("_high", found.high_s)):
-                yield GaugeMetricFamily(f"offboard_robot_regret{end}_seconds", REGRET[end], value)
+            what = "Mean seconds per task that the better site would have saved, estimated from probes"
+            yield GaugeMetricFamily(name.format(""), what, found.mean_s)
+            for end, value in (("low", found.low_s), ("high", found.high_s)):
+                yield GaugeMetricFamily(name.format(f"_{end}"), f"The {end} end of its 90 % interval", value)
 
 
 def serve_metrics(address: str, where: str, sites: Iterable[str] = ()) -> Metrics:

@@ -102,7 +102,7 @@ def test_a_stalled_disk_stops_no_task(
     assert trace.lost == 3 * WAITING_MAX - in_pipe
     assert errors(caplog) == [
         f"trace {trace.path}: a line is lost: {WAITING_MAX} records wait for the disk; "
-        "others are only counted"
+        "others are only counted; remedy: free the disk"
     ]
 
 
