@@ -154,8 +154,8 @@ class Store:
             return {}
         except (OSError, Unreadable) as error:
             reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
-            text = "memory %s: %s; starting cold, %s; remedy: none, the tasks are learnt again"
-            log.warning(text, self.path, reason, self._set_aside())
+            said = "memory %s: %s; starting cold, %s; remedy: none, the tasks are learnt again"
+            log.warning(said, self.path, reason, self._set_aside())
             return {}
 
     def _set_aside(self) -> str:

