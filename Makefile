@@ -14,7 +14,7 @@ PEERS_READY := $(VENV)/.peers-ready
 EXAMPLES_BIN := .cache/examples/bin
 EXAMPLES_READY := .cache/examples/.ready
 
-.PHONY: help demo install format lint type test unit pythons integration compose chaos state bench examples browser torch up down table lock wheel clean
+.PHONY: help demo install format lint type test unit pythons integration compose chaos state bench examples browser prometheus torch up down table lock wheel clean
 
 help: ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -73,6 +73,14 @@ examples: $(EXAMPLES_READY) ## measure the five applications with one seed, FULL
 browser: $(DEV_READY) ## run the tests in a real browser; needs Chromium
 	$(BIN)/pytest tests/browser
 
+# Unpacked and not installed: that needs no root, and starts no service.
+PROMETHEUS := $(CACHE)/prometheus
+prometheus: ## unpack Debian's Prometheus into .cache for the tests of deploy/prometheus, if apt has it
+	@if command -v prometheus >/dev/null || test -x $(PROMETHEUS)/usr/bin/prometheus; then :; \
+	elif mkdir -p $(PROMETHEUS) && cd $(PROMETHEUS) && apt-get download -qq -o APT::Sandbox::User=root prometheus; then \
+	  dpkg-deb -x prometheus_*.deb . && rm prometheus_*.deb; \
+	else echo "apt has no package prometheus: the tests of deploy/prometheus will be skipped"; fi
+
 # On x86-64 the default PyTorch wheel brings gigabytes of CUDA, so it is installed only if pip finds a CPU build.
 TORCH := torch==2.13.0
 torch: $(DEV_READY) ## install PyTorch for the LSTM, if pip finds a CPU-only build
@@ -85,7 +93,7 @@ up: ## start the three containers and print the robot's table; the server stays 
 	docker compose up --build
 
 down: ## remove the containers and their volumes
-	docker compose down --volumes
+	docker compose --profile observe down --volumes
 
 table: $(BENCH_READY) ## print Table II of the last demo
 	$(BIN)/loadgen table out/demo/trace.jsonl --windows 5,10,20,30,40,50

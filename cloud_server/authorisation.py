@@ -101,7 +101,8 @@ class Authorisation:
         for problem in self._reload():
             raise ConfigError(f"--robots: {problem}")
         if not self._known:
-            log.warning("--robots: %s holds no public key (*%s) yet: no robot can connect", folder, PUBLIC)
+            text = "--robots: %s holds no public key (*%s) yet: no robot can connect; remedy: copy keys there"
+            log.warning(text, folder, PUBLIC)
         self._socket = context.socket(zmq.REP)
         self._socket.bind(ZAP)
         threading.Thread(target=self._run, name="robots", daemon=True).start()
@@ -158,7 +159,7 @@ class Authorisation:
         problems = self._reload()
         for problem in problems:
             if problem not in self._problems:
-                log.warning("--robots: %s", problem)
+                log.warning("--robots: %s; remedy: correct or remove it", problem)
         self._problems = problems
         for peer, connection in list(self._connections.items()):
             if connection.user not in self._known:
@@ -220,7 +221,8 @@ class Authorisation:
             self._last_warning = now
             where = asked[3].decode(errors="replace") if well_formed else "?"
             why = "was cut off a moment ago" if user in self._known else f"is not in {self._folder}"
-            log.warning("refused a robot at %s: its key %s %s", where, user, why)
+            text = "refused a robot at %s: its key %s %s; remedy: if it is yours, copy its robot.key there"
+            log.warning(text, where, user, why)
         return [ZAP_VERSION, request_id, b"400", b"unknown robot", b"", b""]
 
     def _cut_off(self, peer: bytes, connection: _Connection) -> None:
@@ -230,7 +232,10 @@ class Authorisation:
         self._cut[peer] = None
         while len(self._cut) > CUT_KEPT:
             del self._cut[next(iter(self._cut))]
-        log.warning("cut off robot %s: its key is no longer in %s", connection.name, self._folder)
+        text = (
+            "cut off robot %s: its key is no longer in %s; remedy: if it is yours, copy its key there again"
+        )
+        log.warning(text, connection.name, self._folder)
         end(connection.file, connection.other_end)
 
 

@@ -68,33 +68,46 @@ class Metrics:
     def __init__(self) -> None:
         self.robots = RobotUses()
         r = self.registry = CollectorRegistry()
-        self.requests = Counter("offboard_requests", "Requests by outcome", ["kind", "status"], registry=r)
-        self.queue_depth = Gauge("offboard_queue_depth", "Requests waiting for a worker", registry=r)
-        self.running = Gauge("offboard_running", "Tasks running", registry=r)
+        self.requests = Counter(
+            "offboard_server_requests", "Requests by outcome", ["kind", "status"], registry=r
+        )
+        self.queue_depth = Gauge(
+            "offboard_server_waiting_requests", "Requests waiting for a worker", registry=r
+        )
+        self.running = Gauge("offboard_server_running_tasks", "Tasks running", registry=r)
         self.queue_s = Histogram(
-            "offboard_queue_seconds",
+            "offboard_server_queue_seconds",
             "Time from arrival to start",
             ["kind"],
             buckets=SECONDS_BUCKETS,
             registry=r,
         )
         self.run_s = Histogram(
-            "offboard_run_seconds", "Time in the worker", ["kind"], buckets=SECONDS_BUCKETS, registry=r
+            "offboard_server_run_seconds", "Time in the worker", ["kind"], buckets=SECONDS_BUCKETS, registry=r
         )
-        self.bytes_in = Counter("offboard_bytes_in", "Bytes of messages received", registry=r)
-        self.bytes_out = Counter("offboard_bytes_out", "Bytes of messages sent", registry=r)
-        self.blob_bytes = Gauge("offboard_blob_bytes", "Bytes of stored large arguments", registry=r)
-        self.load = Gauge("offboard_load", "Share of the CPU that other programs take", registry=r)
-        self.capacity = Gauge("offboard_capacity", "Share of one CPU that a task may use", registry=r)
+        self.bytes_in = Counter("offboard_server_received_bytes", "Bytes of messages received", registry=r)
+        self.bytes_out = Counter("offboard_server_sent_bytes", "Bytes of messages sent", registry=r)
+        self.blob_bytes = Gauge("offboard_server_blob_bytes", "Bytes of stored large arguments", registry=r)
+        self.load = Gauge(
+            "offboard_server_other_load_ratio", "Share of the CPU that other programs take", registry=r
+        )
+        self.capacity = Gauge(
+            "offboard_server_task_cpu_ratio", "Share of one CPU that a task may use", registry=r
+        )
         self.dropped = Counter(
-            "offboard_dropped", "Messages and replies that were dropped", ["reason"], registry=r
+            "offboard_server_dropped_messages",
+            "Messages and replies that were dropped",
+            ["reason"],
+            registry=r,
         )
-        self.refused = Counter("offboard_refused", "Handshakes with an unknown key", registry=r)
+        self.refused = Counter(
+            "offboard_server_refused_handshakes", "Handshakes with an unknown key", registry=r
+        )
         self.cut_off = Counter(
-            "offboard_cut_off", "Connections closed because they sent too much", registry=r
+            "offboard_server_cut_off_connections", "Connections closed because they sent too much", registry=r
         )
         self.restarts = Counter(
-            "offboard_executor_restarts", "Workers that died and were replaced", ["reason"], registry=r
+            "offboard_server_worker_restarts", "Workers that died and were replaced", ["reason"], registry=r
         )
 
 

@@ -194,7 +194,7 @@ class Scheduler:
                 traceback=outcome.traceback,
             )  # fmt: skip
             self._sender.send(work.peer, reply)
-        self._count(request, outcome.status if work.wanted else "cancelled")
+        self._count(request, outcome.status if work.wanted else "cancelled", work.queue_s, outcome.run_s)
         self._metrics.queue_s.labels(request.kind).observe(work.queue_s)
         self._metrics.run_s.labels(request.kind).observe(outcome.run_s)
         if self._metrics.robots.viewers:
@@ -216,7 +216,7 @@ class Scheduler:
 
     def refuse(self, peer: bytes, request: Request, why: Refusal) -> None:
         """Answer a request that does not run."""
-        self._count(request, why.status)
+        self._count(request, why.status, why.queue_s)
         if self._metrics.robots.viewers and why.status != "need_blob":  # the robot sends that one again
             self._metrics.robots.of(self._access.robot_of(peer)).refused += 1
         reply = Reply(
@@ -225,10 +225,14 @@ class Scheduler:
         )  # fmt: skip
         self._sender.send(peer, reply)
 
-    def _count(self, request: Request, status: str) -> None:
+    def _count(self, request: Request, status: str, queue_s: float = 0.0, run_s: float = 0.0) -> None:
         # A robot can send any name. A label for each of them would take memory without limit.
         kind = "unknown" if status == "unknown_task" else request.kind
         self._metrics.requests.labels(kind, status).inc()
+        if log.isEnabledFor(logging.DEBUG):
+            text = "task %d of kind %s: %s after %.6f s of waiting and %.6f s of running"
+            fields = {"id": request.id, "kind": kind, "status": status, "queue_s": queue_s, "run_s": run_s}
+            log.debug(text, request.id, kind, status, queue_s, run_s, extra={"task": fields})
 
 
 class CrashCount:
@@ -261,7 +265,7 @@ class FailureLog:
             return
         self._logged.add(failure)
         log.warning(
-            "task %s failed; its next failures with %s are not logged\n%s",
+            "task %s failed; its next failures with %s are not logged; remedy: correct the task\n%s",
             *failure,
             outcome.traceback.rstrip(),
         )

@@ -185,7 +185,8 @@ class Server:
             error = self._warming.exception()
             if error is not None:
                 if isinstance(error, TaskFailed):
-                    log.error("the server cannot start\n%s", error.traceback.rstrip())
+                    text = "the server cannot start; remedy: correct the setup of that task\n%s"
+                    log.error(text, error.traceback.rstrip())
                 raise OffloadError(
                     str(error) if isinstance(error, OffloadError) else describe(error)
                 ) from error
@@ -235,7 +236,11 @@ class Server:
         self.metrics.cut_off.inc()
         name, address = self._access.shut_out(peer, CUT_OFF_S), other_end(file)
         log.warning(
-            "cut off %s at %s for %g s: it sends far more than --robot-mib-s allows", name, address, CUT_OFF_S
+            "cut off %s at %s for %g s: it sends far more than --robot-mib-s allows; "
+            "remedy: if it is yours, raise --robot-mib-s",
+            name,
+            address,
+            CUT_OFF_S,
         )
         end(file, address)
 
@@ -295,7 +300,8 @@ class Server:
         self.metrics.dropped.labels(reason).inc()
         if self._last_turn - self._last_warning >= LOG_PAUSE_S:
             self._last_warning = self._last_turn
-            log.warning("dropped a message: %s (others within %g s are not logged)", error, LOG_PAUSE_S)
+            text = "dropped a message: %s (others within %g s are not logged); remedy: find out who sends it"
+            log.warning(text, error, LOG_PAUSE_S)
 
     def _over(self) -> bool:
         """True if the server may stop: it is drained, or the time for that is over."""

@@ -35,12 +35,12 @@ class RobotLive(Generic[R]):
         self._line = line
         self._records: deque[R] = deque(maxlen=KEPT_MAX)
         self.keep = self._records.append
-        self._sites: Mapping[str, Site] = {}
+        self.sites: Mapping[str, Site] = {}
         self._allowance: object = None
 
     def show(self, sites: Mapping[str, Site], allowance: object) -> None:
         """Also show these sites, and what may be spent. They are read without a lock, for people."""
-        self._sites, self._allowance = sites, allowance
+        self.sites, self._allowance = sites, allowance
 
     def looks(self) -> Generator[Look]:
         last, kind, most = None, None, KEPT_MAX
@@ -72,7 +72,7 @@ class RobotLive(Generic[R]):
         asked = next((one for one in kinds() if one.name == kind), None)
         return {
             name: {**site.condition()._asdict(), "absent": asked and site.unavailable(asked)}
-            for name, site in self._sites.items()
+            for name, site in self.sites.items()
         }
 
     def _budget(self) -> dict[str, float] | None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from offboard.common.config import as_dict
 from offboard.common.errors import ConfigError, OffloadError
+from offboard.common.host.logs import start_log
 from offboard.common.task_states import TaskStates
 from offboard.loadgen.robot.answers import Answers
 from offboard.loadgen.robot.config import DriveConfig, RobotConfig
@@ -35,7 +36,7 @@ Observer = Callable[[Record], None]
 
 def run_robot(config: RobotConfig) -> int:
     """Run the tasks, then measure those of --alone."""
-    logging.basicConfig(level=config.log.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    start_log(config.log, config.log_format)
     log.info("settings: %s", as_dict(config))
     answers = Answers(config.answers) if config.answers else None
     if answers and answers.done and isinstance(config, DriveConfig) and not config.jump:
@@ -133,7 +134,8 @@ def _connect(
 def _warn_of_absent(doing: str, absent: Mapping[str, str]) -> None:
     for site, why in absent.items():
         instead = "tasks run elsewhere" if site == ONBOARD else f"tasks run {ONBOARD}"
-        log.warning("%s without %s: %s; %s", doing, site, why, instead)
+        remedy = "correct the setup of the task" if site == ONBOARD else "robot-client check"
+        log.warning("%s without %s: %s; %s; remedy: %s", doing, site, why, instead, remedy)
 
 
 def _metrics(config: RobotConfig, trace: Trace | None) -> "Metrics | None":

@@ -70,7 +70,7 @@ def test_metrics_and_foreign_pages(testbed: Callable[..., Any], connect: Callabl
     offload = connect(testbed(), metrics=address)
     offload(echo, "one", where="onboard")
     text = httpx.get(f"http://{address}/metrics").text
-    assert 'robot_tasks_total{kind="echo",site="onboard"} 1.0' in text
+    assert 'offboard_robot_tasks_total{kind="echo",site="onboard"} 1.0' in text
     assert httpx.get(f"http://{address}/live").status_code == 200
     for path in ("/live", LOOKS, "/metrics"):
         for headers in ({"Origin": "http://evil.example"}, {"Host": "evil.example"}):

@@ -187,7 +187,7 @@ export function drawServer(samples) {
   const totals = samples.map(one => {
     const found = new Map();
     for (const [name, labels, value] of one.server.samples) {
-      if (name === "offboard_requests_total") found.set(labels.status, (found.get(labels.status) || 0) + value);
+      if (name === "offboard_server_requests_total") found.set(labels.status, (found.get(labels.status) || 0) + value);
     }
     return found;
   });

@@ -143,15 +143,15 @@ function showServer() {
   by("robots").hidden = by("answer-load-box").hidden = false;
   for (const id of ["answer-why", "answer-predictions", "answer-budget"]) by(id).parentElement.hidden = true;
   say("answer-load", all ? `${robots[0].robot}: ${percent(robots[0].run_s / all)} of the worker time since this page is open.` : "No task since this page is open.");
-  const queue = total(server, "offboard_queue_seconds_sum"), run = total(server, "offboard_run_seconds_sum"), count = total(server, "offboard_run_seconds_count");
+  const queue = total(server, "offboard_server_queue_seconds_sum"), run = total(server, "offboard_server_run_seconds_sum"), count = total(server, "offboard_server_run_seconds_count");
   say("answer-part", count ? `${server.running} of ${server.workers} workers are busy, and ${server.queue_depth} tasks wait. Over ${count} tasks the mean wait is ${ms(queue / count)}, and the mean run ${ms(run / count)}.` : "No task yet.");
   const state = server.draining ? "stopping" : server.ready ? "ready" : "warming up";
   const facts = [`State: ${state}, up for ${Math.round(server.uptime_s)} s`,
-    `Load by other programs: ${percent(total(server, "offboard_load"))}`,
-    `Refused handshakes: ${total(server, "offboard_refused_total")}`,
-    `Dropped messages: ${total(server, "offboard_dropped_total")}`,
-    `Robots cut off: ${total(server, "offboard_cut_off_total")}`,
-    `Workers replaced: ${total(server, "offboard_executor_restarts_total")}`];
+    `Load by other programs: ${percent(total(server, "offboard_server_other_load_ratio"))}`,
+    `Refused handshakes: ${total(server, "offboard_server_refused_handshakes_total")}`,
+    `Dropped messages: ${total(server, "offboard_server_dropped_messages_total")}`,
+    `Robots cut off: ${total(server, "offboard_server_cut_off_connections_total")}`,
+    `Workers replaced: ${total(server, "offboard_server_worker_restarts_total")}`];
   by("figures").replaceChildren(...facts.map(text => Object.assign(document.createElement("p"), { textContent: text })));
   by("figures").hidden = false;
   drawServer(samples);

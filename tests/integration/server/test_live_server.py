@@ -82,7 +82,7 @@ def test_robots_are_counted_while_somebody_looks(web: tuple[Running, str], join:
     (robot,) = second["server"]["robots"]
     assert (robot["tasks"], robot["refused"], robot["waiting"]) == (1, 1, 0)
     assert robot["run_s"] > 0
-    assert ["offboard_queue_depth", {}, 0.0] in second["server"]["samples"]
+    assert ["offboard_server_waiting_requests", {}, 0.0] in second["server"]["samples"]
     until(lambda: running.metrics.robots.viewers == 0)
     assert running.metrics.robots.counted() == {}
 
