@@ -11,18 +11,19 @@ from statistics import median
 
 from offboard.common.errors import ConfigError
 from offboard.loadgen.compare.compare_settings import CompareConfig, split_strategy
-from offboard.loadgen.compare.comparison_table import comparison_table
+from offboard.loadgen.compare.comparison_table import HEADINGS, comparison_table
 from offboard.loadgen.compare.resume import play_once
 from offboard.loadgen.compare.simulated_tables import simulated
 from offboard.loadgen.play.stolen_cpu_time import NOTED_PERCENT
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import check_calls, find_scenario, read_scenario
-from offboard.loadgen.table.table_formats import Table, render
+from offboard.loadgen.table.table_formats import Table
 
 
 def run_compare(names: Sequence[str], config: CompareConfig) -> int:
     """Play all scenarios, then print one table for each to stdout. Progress lines go to stderr."""
+    config.check_columns(HEADINGS, config.format)
     paths = [find_scenario(name) for name in names]
     scenarios = [
         read_scenario(path).changed(
@@ -38,7 +39,7 @@ def run_compare(names: Sequence[str], config: CompareConfig) -> int:
     if config.simulate:
         sys.stdout.write(simulated(scenarios, config))
     else:
-        sys.stdout.write(render([compare(scenario, config) for scenario in scenarios], config.format))
+        sys.stdout.write(config.text([compare(scenario, config) for scenario in scenarios], config.format))
     return 0
 
 

@@ -80,6 +80,10 @@ HEADINGS: dict[str, Heading] = {
     "time_over_oracle": Heading("time / oracle", "time / oracle", 3),
     "regret_ms": Heading("regret ms", "regret ms", 1),
 }
+FIRST = (  # the most important columns
+    *("tasks", "lost", "mean_ms", "over_first", "p95_ms", "p99_ms"),
+    *("late_percent", "cloud_percent", "time_over_oracle", "recovery"),
+)
 
 
 def comparison_table(
@@ -103,7 +107,7 @@ def comparison_table(
         " Below each policy are the bounds of its 95 % intervals, from blocks of neighbouring tasks."
     )
     about = {"scenario": scenario.name, "testbed": config.where, "seeds": config.seeds}
-    return Table(caption=caption, about=about, headings=HEADINGS, lines=lines)
+    return Table(caption=caption, about=about, headings=HEADINGS, lines=lines, first=FIRST)
 
 
 def _runs_and_seeds(first: int, count: int) -> str:

@@ -28,7 +28,8 @@ from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.table.measured_rows import write_whole
 from offboard.loadgen.table.table_settings import TableConfig
-from offboard.loadgen.table.table_two import table_text
+from offboard.loadgen.table.table_formats import render
+from offboard.loadgen.table.table_two import read_tables
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.loadgen.testbed.testbed import Setup, Testbed
 
@@ -114,9 +115,10 @@ def play(scenario: Scenario, out: Path, testbed: str = "local", *, quiet: bool =
 def play_demo(out: Path) -> int:
     """Play the shipped demo scenario, then print Table II of the plans that were measured on both sites."""
     play(read_scenario(find_scenario("demo")), out).check_robots()
-    text = table_text(out / TRACE, TableConfig(windows=DEMO_WINDOWS, feedback="both"))
-    (out / TABLE).write_text(text)
-    print(f"\n{text}\nwritten: {out / TABLE}; charts: loadgen report {out}")
+    config = TableConfig(windows=DEMO_WINDOWS, feedback="both")
+    tables = read_tables(out / TRACE, config)
+    (out / TABLE).write_text(render(tables, config.format))
+    print(f"\n{config.text(tables, config.format)}\nwritten: {out / TABLE}; charts: loadgen report {out}")
     return 0
 
 

@@ -19,7 +19,7 @@ from offboard.loadgen import rivals
 from offboard.loadgen.table import confidence_intervals, table_two_figures
 from offboard.loadgen.table.measured_rows import Column, Rows, read_lived
 from offboard.loadgen.table.measurement_notes import read_noted
-from offboard.loadgen.table.table_formats import Heading, Table, render
+from offboard.loadgen.table.table_formats import Heading, Table
 from offboard.loadgen.table.table_settings import BOTH, FULL, MeasuredTimesConfig
 from offboard.loadgen.table.table_two_figures import Scored, Sides
 from offboard.robot_client import policies
@@ -105,6 +105,7 @@ HEADINGS: dict[str, Heading] = {
     "cloud_percent": Heading("cloud %", r"cloud \%", 2),
     "both_percent": Heading("on both sites %", r"on both sites \%", 2),
 }
+FIRST = ("scored", "mean_s", "p95_s", "time_over_oracle", "accuracy_percent", "cloud_percent")
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +118,8 @@ class Replayed:
 
 def run_replay(path: Path, config: ReplayConfig) -> int:
     """Print the tables of `path` to stdout."""
-    sys.stdout.write(render(tables(path, config), config.format))
+    config.check_columns(HEADINGS, config.format)
+    sys.stdout.write(config.text(tables(path, config), config.format))
     return 0
 
 
@@ -248,6 +250,7 @@ def _table(
         headings={name: of for name, of in HEADINGS.items() if name != "bound" or config.bootstrap},
         lines=lines,
         notes=rows.notes,
+        first=FIRST,
     )
 
 

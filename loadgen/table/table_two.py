@@ -11,18 +11,24 @@ from offboard.loadgen.table.measurement_notes import read_noted
 from offboard.loadgen.table.predictor_evaluation import Evaluation
 from offboard.loadgen.table.table_formats import Table, render
 from offboard.loadgen.table.table_settings import TableConfig
-from offboard.loadgen.table.table_two_figures import HEADINGS
+from offboard.loadgen.table.table_two_figures import FIRST, HEADINGS
 
 
 def run_table(path: Path, config: TableConfig) -> int:
     """Print the tables of `path` to stdout."""
-    sys.stdout.write(table_text(path, config))
+    config.check_columns(HEADINGS, config.format)
+    sys.stdout.write(config.text(read_tables(path, config), config.format))
     return 0
 
 
 def table_text(path: Path, config: TableConfig) -> str:
-    """The tables of a trace or a CSV dataset, in the chosen format."""
-    return render(tables(path, read_noted(path, config.kind), config), config.format)
+    """The tables of a trace or a CSV dataset with all columns, in the chosen format."""
+    return render(read_tables(path, config), config.format)
+
+
+def read_tables(path: Path, config: TableConfig) -> list[Table]:
+    """The tables of a trace or a CSV dataset."""
+    return tables(path, read_noted(path, config.kind), config)
 
 
 def tables(path: Path, rows: Rows, config: TableConfig) -> list[Table]:
@@ -42,4 +48,5 @@ def _table(path: Path, rows: Rows, config: TableConfig, evaluation: Evaluation, 
         headings={name: heading for name, heading in HEADINGS.items() if not hidden.get(name)},
         lines=list(evaluation.scores(feedback)),
         notes=rows.notes,
+        first=FIRST,
     )
