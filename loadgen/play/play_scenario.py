@@ -4,6 +4,7 @@
 """
 
 import json
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -18,6 +19,7 @@ from offboard.loadgen.play.player import Player
 from offboard.loadgen.play.run_digest import digests
 from offboard.loadgen.play.run_files import EVENTS, READINGS, SUMMARY, TABLE, TRACE, RobotFiles, clear_folder
 from offboard.loadgen.play.stolen_cpu_time import NOTED_PERCENT, StolenCpuTime
+from offboard.loadgen.progress import progress
 from offboard.loadgen.robot_files import alone_path, reference_path
 from offboard.loadgen.scenario.outage_recovery import read_outage
 from offboard.loadgen.scenario.outcome import Answered, Outcome
@@ -90,12 +92,14 @@ def play(scenario: Scenario, out: Path, testbed: str = "local", *, quiet: bool =
     with TESTBEDS[testbed](out, setups(scenario, out, shown=not quiet)) as bed:
         clear_folder(out)
         say(f"starting the cloud server and the relay (logs in {out / 'logs'})")
-        bed.start()
+        with progress("compiling the planner" if workload.map else "starting", to=sys.stdout):
+            bed.start()
         many = "the robot" if workload.robots == 1 else f"{workload.robots} robots"
         tasks = f"{workload.tasks} {'plans' if workload.map else 'tasks'}"
         say(f"starting {many} with a quota of {scenario.robot.cpus:g} CPU: {tasks}")
         stolen = StolenCpuTime()
-        exit_codes = Player(scenario, bed, say).play()
+        with progress("starting the robots", to=sys.stdout) as shown:
+            exit_codes = Player(scenario, bed, say, shown).play()
         stolen_percent = stolen.percent()
     played = replace(judge(scenario, out, exit_codes), stolen_percent=stolen_percent)
     about = {"testbed": testbed, "started_at": started_at.isoformat(timespec="seconds"), **played_from}

@@ -12,6 +12,7 @@ from offboard.common.errors import ConfigError, DataError
 from offboard.common.security.plain_files import replace_file
 from offboard.loadgen import rivals
 from offboard.loadgen.play.run_files import TRACE
+from offboard.loadgen.progress import progress
 from offboard.loadgen.report.captions import all_charts
 from offboard.loadgen.report.findings import Findings
 from offboard.loadgen.report.html_page import Panel, page
@@ -90,11 +91,13 @@ def run_report(path: Path, config: ReportConfig) -> int:
     from offboard.loadgen.report import charts  # only now, because matplotlib takes long to import
 
     shown = all_charts(findings)
-    drawings = [None if chart.shown is None else charts.draw(chart.name, chart.shown) for chart in shown]
     panels = []
-    for chart, drawing in zip(shown, drawings, strict=True):
-        _write_png(out / f"{chart.name}.png", drawing.png if drawing else None)
-        panels.append(Panel(chart.name, chart.title, chart.caption, drawing.svg if drawing else None))
+    with progress("charts", len(shown)) as drawn:
+        for chart in shown:
+            drawing = None if chart.shown is None else charts.draw(chart.name, chart.shown)
+            _write_png(out / f"{chart.name}.png", drawing.png if drawing else None)
+            panels.append(Panel(chart.name, chart.title, chart.caption, drawing.svg if drawing else None))
+            drawn.step()
     text = page(
         f"Report on {source}",
         about=[about(findings), *findings.rows.notes],

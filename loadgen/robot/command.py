@@ -5,6 +5,7 @@ The settings are read in `__main__`; the tasks are asked for in `run`.
 
 import gc
 import logging
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -13,6 +14,7 @@ from typing import Any
 from offboard.common.config import as_dict
 from offboard.common.errors import ConfigError, OffloadError
 from offboard.common.task_states import TaskStates
+from offboard.loadgen.progress import progress
 from offboard.loadgen.robot.answers import Answers
 from offboard.loadgen.robot.config import DriveConfig, RobotConfig
 from offboard.loadgen.robot.references import References, measure_alone
@@ -102,8 +104,9 @@ def _run_tasks(
             stack.callback(file.close)
         run = Run(config, work, offload, own=own, say=print, answers=answers, references=references)
         with _connect(config, states=states, sites=sites) as unseen:
-            absent = unseen.wait_for_sites(work.function, config.connect_s)
-            run.warm(unseen)
+            with progress("connecting, and compiling what the first task needs", to=sys.stdout):
+                absent = unseen.wait_for_sites(work.function, config.connect_s)
+                run.warm(unseen)
         absent = absent or offload.wait_for_sites(work.function, config.connect_s)
         if again:
             absent = absent or again.wait_for_sites(work.function, config.connect_s)

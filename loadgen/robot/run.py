@@ -5,6 +5,7 @@ The tasks come from `work`; where they run is decided by the offloader.
 
 import contextlib
 import itertools
+import sys
 import threading
 import time
 from collections import deque
@@ -17,11 +18,12 @@ from offboard.common import errors
 from offboard.common.errors import ConfigError, TaskError
 from offboard.common.host import cpu_time
 from offboard.common.tasks import kind_of
+from offboard.loadgen.progress import Progress, progress
 from offboard.loadgen.robot.answers import Answered, Answers
 from offboard.loadgen.robot.calls import InputsEnded
 from offboard.loadgen.robot.config import RobotConfig
 from offboard.loadgen.robot.references import References
-from offboard.loadgen.robot.summary import Summary, describe, end_progress, show_progress
+from offboard.loadgen.robot.summary import PROGRESS_EVERY, Summary, describe
 from offboard.loadgen.robot.work import Work
 from offboard.loadgen.robot.workload import CLOSED, due_instants
 from offboard.robot_client.offloader import Offloader
@@ -78,6 +80,7 @@ class Run:
         self._left = sum(number not in self._done for number in range(config.tasks_max))
         self._summary = Summary(found=work.found, due=config.arrivals != CLOSED)
         self._noted = 0
+        self._progress: Progress
         self._inputs: int | None = None  # how many there were, if they have ended
         self._lock = threading.Lock()  # of the summary
         self._stopped = False
@@ -102,10 +105,11 @@ class Run:
             count = self._config.tasks_max
             self._say(f"{count - self._left} of {count} tasks had their answer before")
         try:
-            if self._config.arrivals == CLOSED:
-                self._run_closed()
-            else:
-                self._run_open()
+            with progress(self._work.noun, self._left, to=sys.stdout, every=PROGRESS_EVERY) as self._progress:
+                if self._config.arrivals == CLOSED:
+                    self._run_closed()
+                else:
+                    self._run_open()
         except BaseException:  # after Ctrl-C, too, the user sees what was done; nothing is swallowed
             if self._noted:
                 self._say_summary()
@@ -115,8 +119,6 @@ class Run:
     def _say_summary(self) -> None:
         with self._lock:
             lines = self._summary.lines()
-        if self._noted and self._noted != self._left:
-            end_progress()
         if self._inputs is not None:
             self._say(f"the inputs ended after {self._inputs} of {self._config.tasks_max} tasks")
         for line in lines:
@@ -248,9 +250,7 @@ class Run:
             else:
                 self._summary.add(record, got=self._work.got(answer), late_s=late_s)
             self._noted += 1
-            show_progress(
-                self._noted, self._left, partial(describe, record) if record else partial(str, error)
-            )
+            self._progress.step(partial(describe, record) if record else partial(str, error))
 
 
 def made_ahead(tasks: Iterator[T], most: int = MADE_MAX) -> Generator[T]:

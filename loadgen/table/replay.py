@@ -16,6 +16,7 @@ from offboard.common.config import check, setting
 from offboard.common.errors import DataError
 from offboard.common.tasks import Kind, Task, task
 from offboard.loadgen import rivals
+from offboard.loadgen.progress import progress
 from offboard.loadgen.table import confidence_intervals, table_two_figures
 from offboard.loadgen.table.measured_rows import Column, Rows, read_lived
 from offboard.loadgen.table.measurement_notes import read_noted
@@ -129,7 +130,11 @@ def tables(path: Path, config: ReplayConfig) -> list[Table]:
     if not len(rows) + rows.left_out:
         raise DataError(f"{path}: there is no {config.kind or 'task'} in this trace")
     recorded = [_recorded(lived.waited_s, lived.to_cloud)] if len(lived.waited_s) else []
-    return [_table(path, rows, config, feedback=mode, recorded=recorded) for mode in config.modes()]
+    with progress("policies", len(config.modes()) * (len(config.policies) + 1)) as shown:
+        lines = {
+            mode: [*recorded, *_mode_lines(rows, config, mode, shown.step)] for mode in config.modes()
+        }
+    return [_table(path, rows, config, lines[mode], feedback=mode) for mode in config.modes()]
 
 
 def replay(
@@ -229,11 +234,8 @@ def _replayed(size: float, row: int) -> None:  # noqa: ARG001
 
 
 def _table(
-    path: Path, rows: Rows, config: ReplayConfig, *, feedback: str, recorded: list[PolicyScore]
+    path: Path, rows: Rows, config: ReplayConfig, lines: list[PolicyScore], *, feedback: str
 ) -> Table:
-    lines = [*recorded]
-    for name in (*config.policies, ORACLE):
-        lines.extend(_lines(rows, name, config, feedback))
     left_out = f" ({rows.left_out} tasks without both times left out)" if rows.left_out else ""
     predictor = config.predictor or "each policy's own"
     about = f"predictor {predictor}, window {config.window}, feedback {feedback}"
@@ -252,6 +254,15 @@ def _table(
         notes=rows.notes,
         first=FIRST,
     )
+
+
+def _mode_lines(
+    rows: Rows, config: ReplayConfig, feedback: str, step: Callable[[], object]
+) -> Iterator[PolicyScore]:
+    """The lines of one feedback mode; `step` is called after each policy."""
+    for name in (*config.policies, ORACLE):
+        yield from _lines(rows, name, config, feedback)
+        step()
 
 
 def _lines(rows: Rows, policy: str, config: ReplayConfig, feedback: str) -> Iterator[PolicyScore]:

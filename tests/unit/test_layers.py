@@ -49,7 +49,7 @@ FOLDERS: dict[str, set[str]] = {
     "loadgen/relay/tcp": {"loadgen/relay/link"},
     "loadgen/relay/toxiproxy": {"loadgen/relay/link", "loadgen/relay/tcp"},
     "loadgen/relay": {"loadgen/relay/link", "loadgen/relay/tcp", "loadgen/relay/toxiproxy"},
-    "loadgen/testbed": {"loadgen/relay", "loadgen/relay/link"},
+    "loadgen/testbed": {"loadgen", "loadgen/relay", "loadgen/relay/link"},
     "loadgen/rivals": set(),
     "loadgen/table": {"loadgen", "loadgen/rivals"},
     "loadgen/scenario": {
@@ -68,6 +68,7 @@ FOLDERS: dict[str, set[str]] = {
         "loadgen/testbed",
     },
     "loadgen/simulation": {
+        "loadgen",
         "loadgen/play",
         "loadgen/relay/link",
         "loadgen/robot",
@@ -76,13 +77,14 @@ FOLDERS: dict[str, set[str]] = {
         "loadgen/testbed",
     },
     "loadgen/compare": {
+        "loadgen",
         "loadgen/play",
         "loadgen/rivals",
         "loadgen/scenario",
         "loadgen/simulation",
         "loadgen/table",
     },
-    "loadgen/report": {"loadgen/play", "loadgen/rivals", "loadgen/table"},
+    "loadgen/report": {"loadgen", "loadgen/play", "loadgen/rivals", "loadgen/table"},
 }
 # Heavy or optional libraries, and the files that may import them.
 OWNERS = {
@@ -115,6 +117,7 @@ OWNERS = {
     "statsmodels": {"loadgen/rivals/arima.py"},
     "threadpoolctl": {"loadgen/rivals/arima.py"},
     "torch": {"loadgen/rivals/lstm.py"},
+    "rich": {"loadgen/progress.py"},
     "river": {"loadgen/rivals/river_model.py"},
 }
 
