@@ -17,7 +17,8 @@ from offboard.loadgen.play.answer_verification import verified
 from offboard.loadgen.play.part_setups import setups
 from offboard.loadgen.play.player import Player
 from offboard.loadgen.play.run_digest import digests
-from offboard.loadgen.play.run_files import EVENTS, READINGS, SUMMARY, TABLE, TRACE, RobotFiles, clear_folder
+from offboard.loadgen.play.run_files import EVENTS, PICTURE, READINGS, SUMMARY, TABLE, TRACE, RobotFiles, clear_folder
+from offboard.loadgen.play.run_table import run_table
 from offboard.loadgen.play.stolen_cpu_time import NOTED_PERCENT, StolenCpuTime
 from offboard.loadgen.progress import progress
 from offboard.loadgen.robot_files import alone_path, reference_path
@@ -104,13 +105,14 @@ def play(scenario: Scenario, out: Path, testbed: str = "local", *, quiet: bool =
     played = replace(judge(scenario, out, exit_codes), stolen_percent=stolen_percent)
     about = {"testbed": testbed, "started_at": started_at.isoformat(timespec="seconds"), **played_from}
     write_summary(out, played, about)
+    say(f"\n{run_table(scenario.name, played.outcome)}")
     for line in _findings(played.outcome):
         say(line)
     for verdict in played.verdicts:
         say(str(verdict))
     if stolen_percent is not None and stolen_percent >= NOTED_PERCENT:
         say(f"warning: the host of this virtual machine took {stolen_percent:.0f} % of its CPU time (steal)")
-    for path in (out / TRACE, alone_path(out / TRACE), out / SUMMARY):
+    for path in (out / TRACE, alone_path(out / TRACE), out / SUMMARY, out / PICTURE):
         if path.exists():
             say(f"written: {path}")
     return played

@@ -11,7 +11,7 @@ from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError, DataError
 from offboard.common.security.plain_files import replace_file
 from offboard.loadgen import rivals
-from offboard.loadgen.play.run_files import TRACE
+from offboard.loadgen.play.run_files import PICTURE, TRACE
 from offboard.loadgen.progress import progress
 from offboard.loadgen.report.captions import all_charts
 from offboard.loadgen.report.findings import Findings
@@ -25,6 +25,10 @@ from offboard.robot_client.predictors.window import WINDOW, WINDOW_MAX
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 PAGE = "report.html"
+PLAN = (
+    "The last plan of the run that found a path: where the robot asked for it, what its LiDAR saw there, and the "
+    "path to its goal."
+)
 
 
 @dataclass(frozen=True)
@@ -98,6 +102,8 @@ def run_report(path: Path, config: ReportConfig) -> int:
             _write_png(out / f"{chart.name}.png", drawing.png if drawing else None)
             panels.append(Panel(chart.name, chart.title, chart.caption, drawing.svg if drawing else None))
             drawn.step()
+    if (source.parent / PICTURE).is_file() and source.name == TRACE:
+        panels.append(Panel("plan", "A plan on the map", PLAN, None, (source.parent / PICTURE).read_bytes()))
     text = page(
         f"Report on {source}",
         about=[about(findings), *findings.rows.notes],

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from offboard.common.config import as_dict
 from offboard.common.errors import ConfigError, OffloadError
@@ -26,6 +26,9 @@ from offboard.robot_client.records.lines import Lines
 from offboard.robot_client.records.trace import Record, Trace
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
+
+if TYPE_CHECKING:
+    from offboard.loadgen.map_picture import LastPlan
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +50,8 @@ def run_robot(config: RobotConfig) -> int:
     try:
         observers: list[Observer] = [*([trace.write] if trace else []), *_metrics(config, trace)]
         work, states = make_work(config), TaskStates(workers=1)  # shared, so that each setup runs once
-        _run_tasks(config, work, states, answers, observers=observers, files=files)
+        last = _last_plan(config)
+        _run_tasks(config, work, states, answers, observers=observers, files=files, last=last)
         if alone:
             # With its own offloader: what the run learns, records and counts is about the run only.
             with _connect(config, states=states, observers=[alone.write]) as offload:
@@ -60,6 +64,8 @@ def run_robot(config: RobotConfig) -> int:
     for file in files:
         if file.lost:
             raise OffloadError(f"{file.lost} tasks could not be written to {file.path}")
+    if last:
+        print(last.write())
     return 0
 
 
@@ -71,6 +77,7 @@ def _run_tasks(
     *,
     observers: Sequence[Observer],
     files: list[Answers | Lines],
+    last: "LastPlan | None",
 ) -> None:
     """Run the tasks of `work`, then close `files`, to which the file of --reference is added."""
     own, sites = OwnRecord(), config.sites()
@@ -102,7 +109,16 @@ def _run_tasks(
         for file in files:
             # Before the sites are closed: tasks that are given up by then have no record.
             stack.callback(file.close)
-        run = Run(config, work, offload, own=own, say=print, answers=answers, references=references)
+        run = Run(
+            config,
+            work,
+            offload,
+            own=own,
+            say=print,
+            answers=answers,
+            references=references,
+            keep=last.keep if last else None,
+        )
         with _connect(config, states=states, sites=sites) as unseen:
             with progress("connecting, and compiling what the first task needs", to=sys.stdout):
                 absent = unseen.wait_for_sites(work.function, config.connect_s)
@@ -124,6 +140,15 @@ def _connect(
     return Offloader.connect(
         config.cloud, timeout_s=config.timeout_s, keys=config.keys, settings=own, **options
     )
+
+
+def _last_plan(config: RobotConfig) -> "LastPlan | None":
+    """What draws the picture of --picture."""
+    if not isinstance(config, DriveConfig) or config.picture is None:
+        return None
+    from offboard.loadgen.map_picture import LastPlan  # importing the planner compiles it
+
+    return LastPlan(config.picture)
 
 
 def _warn_of_absent(doing: str, absent: Mapping[str, str]) -> None:

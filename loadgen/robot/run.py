@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import partial
 from typing import Any, TypeVar
@@ -55,7 +55,8 @@ class Run:
     """Asks for `config.tasks_max` tasks of `work`, the first `config.measure` of them on both sites.
 
     `own` must be an observer of `offload`. With `answers`, each task leaves a line there, tasks that have a
-    line already are left out, and a failed task does not end the run.
+    line already are left out, and a failed task does not end the run. `keep` gets the arguments and the
+    answer of each task.
     """
 
     def __init__(
@@ -68,6 +69,7 @@ class Run:
         say: Callable[[str], None],
         answers: Answers | None = None,
         references: References | None = None,
+        keep: Callable[[Sequence[Any], Any], None] | None = None,
     ) -> None:
         self._config = config
         self._work = work
@@ -76,6 +78,7 @@ class Run:
         self._say = say
         self._answers = answers
         self._references = references
+        self._keep = keep
         self._done = answers.done if answers else frozenset()
         self._left = sum(number not in self._done for number in range(config.tasks_max))
         self._summary = Summary(found=work.found, due=config.arrivals != CLOSED)
@@ -236,6 +239,8 @@ class Run:
                 answer=described,
             )
             self._answers.write(answered)
+        if self._keep is not None:
+            self._keep(request, answer)
         self._note(record, answer, error, late_s=began_s - due_s)
         if self._references and self._references.due(number) and record is not None:
             self._references.measure(

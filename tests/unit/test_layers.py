@@ -110,7 +110,7 @@ OWNERS = {
     "docker": {"loadgen/testbed/docker_engine.py"},
     "websockets": {"robot_client/openpi/web_socket.py"},
     "numba": {"common/planning/compiled.py"},
-    "PIL": {"common/planning/map_files.py"},
+    "PIL": {"common/planning/map_files.py", "loadgen/map_picture.py"},
     "yaml": {"common/planning/map_files.py"},
     "matplotlib": {"loadgen/report/chart_parts.py"},
     "sklearn": {"loadgen/rivals/random_forest.py"},
