@@ -28,7 +28,12 @@ PATH_PIXELS, HIT_PIXELS = 4, 2
 
 Colour = tuple[int, int, int]
 WHITE, BLACK, GREY = (255, 255, 255), (40, 44, 52), (196, 200, 206)
-PATH, SCAN, ROBOT, GOAL = (0, 114, 178), (213, 94, 0), (0, 130, 90), (170, 60, 130)  # safe for colour-blind eyes
+PATH, SCAN, ROBOT, GOAL = (
+    (0, 114, 178),
+    (213, 94, 0),
+    (0, 130, 90),
+    (170, 60, 130),
+)  # safe for colour-blind eyes
 LEGEND: tuple[tuple[str, Colour], ...] = (
     ("robot", ROBOT),
     ("goal", GOAL),
@@ -110,9 +115,7 @@ def _colours(cells: NDArray[np.int8]) -> NDArray[np.uint8]:
     return found
 
 
-def _dots(
-    draw: "ImageDraw", places: Iterable[tuple[float, float]], radius: float, colour: Colour
-) -> None:
+def _dots(draw: "ImageDraw", places: Iterable[tuple[float, float]], radius: float, colour: Colour) -> None:
     for x, y in places:
         draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=colour)
 

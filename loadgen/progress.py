@@ -117,7 +117,9 @@ def _drawing(stream: TextIO) -> "RichProgress | None":
 
         def render(self, task: RichTask) -> Text:
             remaining = None if task.total is None else task.time_remaining
-            return Text(f"{_clock(task.elapsed)} so far" if remaining is None else f"{_clock(remaining)} left")
+            return Text(
+                f"{_clock(task.elapsed)} so far" if remaining is None else f"{_clock(remaining)} left"
+            )
 
     return Progress(
         TextColumn("{task.description}"),

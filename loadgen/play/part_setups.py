@@ -28,7 +28,10 @@ def setups(scenario: Scenario, out: Path, *, shown: bool = True) -> dict[str, Se
     for files in RobotFiles.of(scenario, out):
         first = files.robot == ROBOT
         parts[files.robot] = Setup(
-            {**_robot_flags(scenario, files, first=first), **_picture(scenario, out if shown and first else None)},
+            {
+                **_robot_flags(scenario, files, first=first),
+                **_picture(scenario, out if shown and first else None),
+            },
             scenario.robot.cpus,
             shown=shown and first,
             command="call" if workload.map is None else "drive",

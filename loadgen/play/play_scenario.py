@@ -17,7 +17,16 @@ from offboard.loadgen.play.answer_verification import verified
 from offboard.loadgen.play.part_setups import setups
 from offboard.loadgen.play.player import Player
 from offboard.loadgen.play.run_digest import digests
-from offboard.loadgen.play.run_files import EVENTS, PICTURE, READINGS, SUMMARY, TABLE, TRACE, RobotFiles, clear_folder
+from offboard.loadgen.play.run_files import (
+    EVENTS,
+    PICTURE,
+    READINGS,
+    SUMMARY,
+    TABLE,
+    TRACE,
+    RobotFiles,
+    clear_folder,
+)
 from offboard.loadgen.play.run_table import run_table
 from offboard.loadgen.play.stolen_cpu_time import NOTED_PERCENT, StolenCpuTime
 from offboard.loadgen.progress import progress
@@ -30,8 +39,8 @@ from offboard.loadgen.scenario.pass_fail_check import Verdict
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.table.measured_rows import write_whole
-from offboard.loadgen.table.table_settings import TableConfig
 from offboard.loadgen.table.table_formats import render
+from offboard.loadgen.table.table_settings import TableConfig
 from offboard.loadgen.table.table_two import read_tables
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.loadgen.testbed.testbed import Setup, Testbed

@@ -37,7 +37,8 @@ class ReportConfig:
 
     out: Path | None = setting(
         None,
-        "folder for report.html and the PNGs (default: the folder of the run, or out/NAME for a file)",
+        "folder for report.html and the PNGs (default: the folder of the run, out/NAME for a file, or "
+        "out/comparison for several runs)",
         metavar="DIR",
     )
     predictor: str = setting(

@@ -131,9 +131,7 @@ def tables(path: Path, config: ReplayConfig) -> list[Table]:
         raise DataError(f"{path}: there is no {config.kind or 'task'} in this trace")
     recorded = [_recorded(lived.waited_s, lived.to_cloud)] if len(lived.waited_s) else []
     with progress("policies", len(config.modes()) * (len(config.policies) + 1)) as shown:
-        lines = {
-            mode: [*recorded, *_mode_lines(rows, config, mode, shown.step)] for mode in config.modes()
-        }
+        lines = {mode: [*recorded, *_mode_lines(rows, config, mode, shown.step)] for mode in config.modes()}
     return [_table(path, rows, config, lines[mode], feedback=mode) for mode in config.modes()]
 
 
@@ -233,9 +231,7 @@ def _replayed(size: float, row: int) -> None:  # noqa: ARG001
     raise AssertionError("a replayed task is looked up, not run")
 
 
-def _table(
-    path: Path, rows: Rows, config: ReplayConfig, lines: list[PolicyScore], *, feedback: str
-) -> Table:
+def _table(path: Path, rows: Rows, config: ReplayConfig, lines: list[PolicyScore], *, feedback: str) -> Table:
     left_out = f" ({rows.left_out} tasks without both times left out)" if rows.left_out else ""
     predictor = config.predictor or "each policy's own"
     about = f"predictor {predictor}, window {config.window}, feedback {feedback}"
