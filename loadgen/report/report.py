@@ -26,8 +26,8 @@ from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 PAGE = "report.html"
 PLAN = (
-    "The last plan of the run that found a path: where the robot asked for it, what its LiDAR saw there, and the "
-    "path to its goal."
+    "The last plan of the run that found a path: where the robot asked for it, what its LiDAR saw there, and"
+    " the path to its goal."
 )
 
 

@@ -119,10 +119,12 @@ def _run_tasks(
             references=references,
             keep=last.keep if last else None,
         )
-        with _connect(config, states=states, sites=sites) as unseen:
-            with progress("connecting, and compiling what the first task needs", to=sys.stdout):
-                absent = unseen.wait_for_sites(work.function, config.connect_s)
-                run.warm(unseen)
+        with (
+            _connect(config, states=states, sites=sites) as unseen,
+            progress("connecting, and compiling what the first task needs", to=sys.stdout),
+        ):
+            absent = unseen.wait_for_sites(work.function, config.connect_s)
+            run.warm(unseen)
         absent = absent or offload.wait_for_sites(work.function, config.connect_s)
         if again:
             absent = absent or again.wait_for_sites(work.function, config.connect_s)

@@ -69,7 +69,7 @@ def test_the_map_is_drawn_with_higher_y_further_up() -> None:
 
 
 def test_robot_goal_path_and_scan_are_where_they_are() -> None:
-    """The robot is a disc with a line ahead; the LiDAR saw the lower side of the box; the path ends at the goal."""
+    """Robot, its direction, goal, path and the lower side of the box have their colours."""
     picture = drawn()
     assert at(picture, 1.0, 1.0) == ROBOT
     assert at(picture, 1.0, 1.25) == ROBOT
