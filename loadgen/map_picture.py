@@ -46,7 +46,7 @@ LEGEND: tuple[tuple[str, Colour], ...] = (
 
 
 class LastPlan:
-    """Keeps the last plan with a path, and what the robot knew when it asked for it; `path` is its picture."""
+    """Keeps the last plan with a path, and what the robot knew when it asked; `path` is its picture."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

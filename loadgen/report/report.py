@@ -104,7 +104,9 @@ def run_report(path: Path, config: ReportConfig) -> int:
             panels.append(Panel(chart.name, chart.title, chart.caption, drawing.svg if drawing else None))
             drawn.step()
     if (source.parent / PICTURE).is_file() and source.name == TRACE:
-        panels.append(Panel("plan", "A plan on the map", PLAN, None, (source.parent / PICTURE).read_bytes()))
+        panels.append(
+            Panel("plan", "A plan on the map", PLAN, svg=None, png=(source.parent / PICTURE).read_bytes())
+        )
     text = page(
         f"Report on {source}",
         about=[about(findings), *findings.rows.notes],

@@ -5,7 +5,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -112,13 +112,13 @@ def _read(path: Path, kind: str | None) -> Run:
     except ValueError as error:
         raise DataError(f"{summary}: not JSON: {error}") from None
     name = path.name if path.is_dir() else path.stem
-    return Run(path, name, lived.waited_s, lived.to_cloud, about)
+    return Run(path, name, waited_s=lived.waited_s, to_cloud=lived.to_cloud, summary=about)
 
 
 def _renamed(run: Run, runs: Sequence[Run]) -> Run:
     """A run with the name of its folder; with its whole path, if another folder has the same name."""
     alone = sum(other.name == run.name for other in runs) == 1
-    return Run(run.path, run.name if alone else str(run.path), run.waited_s, run.to_cloud, run.summary)
+    return run if alone else replace(run, name=str(run.path))
 
 
 def _table(runs: Sequence[Run]) -> Table:
@@ -162,6 +162,6 @@ def _plans(runs: Sequence[Run]) -> list[Panel]:
     """The last plan of each run on a map."""
     pictures = [(run, run.path / PICTURE) for run in runs if (run.path / PICTURE).is_file()]
     return [
-        Panel(f"plan-{number}", f"A plan on the map, {run.name}", PLAN, None, picture.read_bytes())
+        Panel(f"plan-{number}", f"A plan on the map, {run.name}", PLAN, svg=None, png=picture.read_bytes())
         for number, (run, picture) in enumerate(pictures, 1)
     ]
