@@ -121,7 +121,7 @@ def _drawing(stream: TextIO) -> "RichProgress | None":
                 f"{_clock(task.elapsed)} so far" if remaining is None else f"{_clock(remaining)} left"
             )
 
-    return Progress(
+    columns = (
         TextColumn("{task.description}"),
         BarColumn(BAR_COLUMNS),
         Count(),
@@ -131,6 +131,9 @@ def _drawing(stream: TextIO) -> "RichProgress | None":
             markup=False,
             table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1),
         ),
+    )
+    return Progress(
+        *columns,
         console=Console(file=stream),
         refresh_per_second=REFRESHES_A_SECOND,
         expand=True,

@@ -18,7 +18,7 @@ from offboard.loadgen.progress import progress
 from offboard.loadgen.robot.answers import Answers
 from offboard.loadgen.robot.config import DriveConfig, RobotConfig
 from offboard.loadgen.robot.references import References, measure_alone
-from offboard.loadgen.robot.run import OwnRecord, Run
+from offboard.loadgen.robot.run import Keep, OwnRecord, Run
 from offboard.loadgen.robot.work import Work, make_work
 from offboard.loadgen.robot_files import alone_path, reference_path
 from offboard.robot_client.offloader import Offloader
@@ -51,7 +51,9 @@ def run_robot(config: RobotConfig) -> int:
         observers: list[Observer] = [*([trace.write] if trace else []), *_metrics(config, trace)]
         work, states = make_work(config), TaskStates(workers=1)  # shared, so that each setup runs once
         last = _last_plan(config)
-        _run_tasks(config, work, states, answers, observers=observers, files=files, last=last)
+        _run_tasks(
+            config, work, states, answers, observers=observers, files=files, keep=last.keep if last else None
+        )
         if alone:
             # With its own offloader: what the run learns, records and counts is about the run only.
             with _connect(config, states=states, observers=[alone.write]) as offload:
@@ -77,7 +79,7 @@ def _run_tasks(
     *,
     observers: Sequence[Observer],
     files: list[Answers | Lines],
-    last: "LastPlan | None",
+    keep: Keep | None,
 ) -> None:
     """Run the tasks of `work`, then close `files`, to which the file of --reference is added."""
     own, sites = OwnRecord(), config.sites()
@@ -110,14 +112,7 @@ def _run_tasks(
             # Before the sites are closed: tasks that are given up by then have no record.
             stack.callback(file.close)
         run = Run(
-            config,
-            work,
-            offload,
-            own=own,
-            say=print,
-            answers=answers,
-            references=references,
-            keep=last.keep if last else None,
+            config, work, offload, own=own, say=print, answers=answers, references=references, keep=keep
         )
         with (
             _connect(config, states=states, sites=sites) as unseen,

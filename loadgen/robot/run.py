@@ -35,6 +35,7 @@ MADE_FIRST_MAX = 1000  # tasks that are made before the first one starts, if non
 LARGE_MADE_MAX = 4  # tasks that are made ahead if their arguments may be megabytes each
 
 T = TypeVar("T")
+Keep = Callable[[Sequence[Any], Any], None]  # gets the arguments of a task and its answer (None: it failed)
 
 
 class OwnRecord(threading.local):
@@ -55,8 +56,7 @@ class Run:
     """Asks for `config.tasks_max` tasks of `work`, the first `config.measure` of them on both sites.
 
     `own` must be an observer of `offload`. With `answers`, each task leaves a line there, tasks that have a
-    line already are left out, and a failed task does not end the run. `keep` gets the arguments and the
-    answer of each task.
+    line already are left out, and a failed task does not end the run. `keep` gets each task.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Run:
         say: Callable[[str], None],
         answers: Answers | None = None,
         references: References | None = None,
-        keep: Callable[[Sequence[Any], Any], None] | None = None,
+        keep: Keep | None = None,
     ) -> None:
         self._config = config
         self._work = work

@@ -94,11 +94,21 @@ def _notes_outside(table: Table) -> Table:
 
 
 def _wrapped(table: Table) -> Table:
-    notes = tuple(
-        textwrap.fill(note, WIDTH, initial_indent="  ", subsequent_indent="  ", **_WHOLE_WORDS).lstrip()
-        for note in table.notes
+    return replace(table, caption=_filled(table.caption), notes=tuple(map(_filled_note, table.notes)))
+
+
+def _filled_note(text: str) -> str:
+    """A note, with room for the dash of its list."""
+    return _filled(text, "  ").lstrip()
+
+
+def _filled(text: str, indent: str = "") -> str:
+    """The text in lines of at most WIDTH characters, without breaking words."""
+    return textwrap.fill(
+        text,
+        WIDTH,
+        initial_indent=indent,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
     )
-    return replace(table, caption=textwrap.fill(table.caption, WIDTH, **_WHOLE_WORDS), notes=notes)
-
-
-_WHOLE_WORDS = {"break_long_words": False, "break_on_hyphens": False}

@@ -2,6 +2,8 @@
 
 import io
 import math
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +32,10 @@ from offboard.loadgen.robot.lidar import cast_scan
 from offboard.loadgen.robot.robot import Request
 
 SIDE, RESOLUTION = 60, 0.1
-MAPS = Path(__file__).parents[2] / "maps"
+ROOT = Path(__file__).parents[2]
+MAPS = ROOT / "maps"
+
+pytestmark = pytest.mark.timeout(90)  # the first plan compiles the planner
 
 
 def a_plan() -> tuple[Request, Plan]:
@@ -100,7 +105,8 @@ def test_the_last_plan_with_a_path_is_drawn(tmp_path: Path) -> None:
     last.keep(request, none)
     last.keep(request, None)
     assert last.write() == f"picture of the last plan: {tmp_path / 'new' / 'plan.png'}"
-    assert Image.open(tmp_path / "new" / "plan.png").width == SIDE_PIXELS
+    with Image.open(tmp_path / "new" / "plan.png") as picture:
+        assert picture.width == SIDE_PIXELS
 
 
 def test_a_picture_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
@@ -112,13 +118,16 @@ def test_a_picture_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
         last.write()
 
 
-def test_a_robot_draws_its_last_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_robot_draws_its_last_plan(tmp_path: Path) -> None:
     """`loadgen drive --picture` needs no server; it says where the picture is."""
     path = tmp_path / "plan.png"
-    command = ["drive", "--map", str(MAPS / "depot.yaml"), "--tasks", "3", "--picture", str(path)]
-    assert main(command) == 0
-    assert f"picture of the last plan: {path}\n" in capsys.readouterr().out
-    colours = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3)
+    command = [sys.executable, "-m", "offboard.loadgen", "drive", "--tasks", "3", "--picture", str(path)]
+    command += ["--map", str(MAPS / "depot.yaml")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=ROOT, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith(f"picture of the last plan: {path}\n")
+    with Image.open(path) as picture:
+        colours = np.asarray(picture.convert("RGB")).reshape(-1, 3)
     for colour in (ROBOT, GOAL, PATH, SCAN, BLACK):
         assert (colours == colour).all(axis=1).any(), colour
 

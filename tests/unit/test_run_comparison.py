@@ -13,6 +13,8 @@ from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.unit.test_map_picture import a_plan
 from tests.unit.test_replay import trace_of
 
+pytestmark = pytest.mark.timeout(90)  # the first plan compiles the planner
+
 
 def run_in(folder: Path, policy: str, waited_s: float) -> Path:
     """The folder of a run of four tasks, three of which went to the cloud."""

@@ -31,7 +31,7 @@ def dataset(tmp_path: Path) -> Path:
         ["table", "d.csv"],
         ["table", "d.csv", "--predictors", "least-squares,theil-sen", "--bootstrap", "--windows", "20,999"],
         ["replay", "d.csv"],
-        ["compare", "calm", "outage", "--simulate", "--tasks", "30", "--seeds", "1", "--jobs", "1"],
+        ["compare", "nonlinear", "heavy-tail", "--simulate", "--tasks", "60", "--seeds", "1", "--jobs", "1"],
     ],
 )
 def test_a_printed_table_is_at_most_100_characters_wide(
