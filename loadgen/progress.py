@@ -3,6 +3,7 @@
 This is the only file that imports rich. Without rich, a terminal gets the plain lines, too.
 """
 
+import logging
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -54,7 +55,8 @@ def progress(
     if drawn is None:
         yield _Lines(what, total, stream, every)
         return
-    with drawn:
+    stderr = sys.stderr
+    with drawn, _logged_to(sys.stderr, instead_of=stderr):
         yield _Bar(drawn, what, total)
 
 
@@ -93,6 +95,20 @@ class _Bar:
 
     def step(self, about: About | None = None) -> None:
         self._drawn.update(self._task, advance=1, about=about() if about else "")
+
+
+@contextmanager
+def _logged_to(stream: TextIO, *, instead_of: TextIO) -> Iterator[None]:
+    """Let log lines go above the bar, too: a handler keeps the stream that it was made with."""
+    handlers = [one for one in logging.getLogger().handlers if isinstance(one, logging.StreamHandler)]
+    moved = [one for one in handlers if one.stream is instead_of]
+    for handler in moved:
+        handler.setStream(stream)
+    try:
+        yield
+    finally:
+        for handler in moved:
+            handler.setStream(instead_of)
 
 
 def _drawing(stream: TextIO) -> "RichProgress | None":

@@ -1,6 +1,7 @@
 """The progress of long work, on a real pseudo terminal and on a pipe."""
 
 import io
+import logging
 import re
 import sys
 import time
@@ -68,6 +69,18 @@ def test_text_goes_above_the_bar(open_terminal: Open) -> None:
     with progress("plans", STEPS, to=terminal.file):
         print("robot has begun its tasks")
     assert "robot has begun its tasks" in plain_lines(terminal.close())
+
+
+def test_a_log_line_goes_above_the_bar(open_terminal: Open, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A handler that was made before the bar writes a whole line, and has its own stream afterwards."""
+    terminal = open_terminal()
+    monkeypatch.setattr(sys, "stderr", terminal.file)
+    handler = logging.StreamHandler()
+    monkeypatch.setattr(logging.getLogger(), "handlers", [handler])
+    with progress("plans", STEPS, to=terminal.file):
+        logging.getLogger("robot").warning("the cloud is silent")
+    assert handler.stream is terminal.file
+    assert "the cloud is silent" in plain_lines(terminal.close())
 
 
 def test_an_inner_part_of_the_work_shows_no_second_bar(open_terminal: Open) -> None:
