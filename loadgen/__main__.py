@@ -144,12 +144,18 @@ def _replay(argv: Sequence[str]) -> int:
 def _report(argv: Sequence[str]) -> int:
     from offboard.loadgen.report.report import ReportConfig, run_report
 
-    parser = _parser("report", "DIR")
-    parser.add_argument("run", type=Path, metavar="DIR", help="folder of a run, or a trace or CSV file")
+    parser = _parser("report", "DIR ...")
+    help = "folder of a run, or a trace or CSV file; several folders or traces are compared"
+    parser.add_argument("runs", type=Path, metavar="DIR", nargs="+", help=help)
     add_flags(parser, ReportConfig, PREFIX)
     flags = parser.parse_args(argv)
     _find_modules_here()
-    return run_report(flags.run, resolve(ReportConfig, flags, environ=os.environ, prefix=PREFIX))
+    config = resolve(ReportConfig, flags, environ=os.environ, prefix=PREFIX)
+    if len(flags.runs) == 1:
+        return run_report(flags.runs[0], config)
+    from offboard.loadgen.report.run_comparison import run_comparison
+
+    return run_comparison(flags.runs, config)
 
 
 def _dataset(argv: Sequence[str]) -> int:
@@ -243,7 +249,9 @@ COMMANDS = {
     "compare": Command("play scenarios with several policies and seeds, and compare the policies", _compare),
     "table": Command("make Table II of the paper from a trace or CSV file", _table),
     "replay": Command("show what each policy would have done with the tasks of a trace or CSV file", _replay),
-    "report": Command("make an HTML page and PNG charts of a run", _report),
+    "report": Command(
+        "make an HTML page and PNG charts of a run, or a page that compares several runs", _report
+    ),
     "dataset": Command(
         "measure the plans of a scenario on both sites, and write them as a CSV file", _dataset
     ),

@@ -4,6 +4,7 @@
 """
 
 import json
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -17,9 +18,20 @@ from offboard.loadgen.play.answer_verification import verified
 from offboard.loadgen.play.part_setups import setups
 from offboard.loadgen.play.player import Player
 from offboard.loadgen.play.run_digest import digests
-from offboard.loadgen.play.run_files import EVENTS, READINGS, SUMMARY, TABLE, TRACE, RobotFiles, clear_folder
+from offboard.loadgen.play.run_files import (
+    EVENTS,
+    PICTURE,
+    READINGS,
+    SUMMARY,
+    TABLE,
+    TRACE,
+    RobotFiles,
+    clear_folder,
+)
+from offboard.loadgen.play.run_table import run_table
 from offboard.loadgen.play.stolen_cpu_time import NOTED_PERCENT, StolenCpuTime
 from offboard.loadgen.play.watch import Page, watching
+from offboard.loadgen.progress import progress
 from offboard.loadgen.robot_files import alone_path, reference_path
 from offboard.loadgen.scenario.outage_recovery import read_outage
 from offboard.loadgen.scenario.outcome import Answered, Outcome
@@ -29,8 +41,9 @@ from offboard.loadgen.scenario.pass_fail_check import Verdict
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.table.measured_rows import write_whole
+from offboard.loadgen.table.table_formats import render
 from offboard.loadgen.table.table_settings import TableConfig
-from offboard.loadgen.table.table_two import table_text
+from offboard.loadgen.table.table_two import read_tables
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.loadgen.testbed.testbed import Setup, Testbed
 
@@ -97,23 +110,26 @@ def play(
         if page is not Page.NONE:
             opened.enter_context(watching(out, say, page=page))
         say(f"starting the cloud server and the relay (logs in {out / 'logs'})")
-        bed.start()
+        with progress("compiling the planner" if workload.map else "starting", to=sys.stdout):
+            bed.start()
         many = "the robot" if workload.robots == 1 else f"{workload.robots} robots"
         tasks = f"{workload.tasks} {'plans' if workload.map else 'tasks'}"
         say(f"starting {many} with a quota of {scenario.robot.cpus:g} CPU: {tasks}")
         stolen = StolenCpuTime()
-        exit_codes = Player(scenario, bed, say).play()
+        with progress("starting the robots", to=sys.stdout) as shown:
+            exit_codes = Player(scenario, bed, say, shown).play()
         stolen_percent = stolen.percent()
     played = replace(judge(scenario, out, exit_codes), stolen_percent=stolen_percent)
     about = {"testbed": testbed, "started_at": started_at.isoformat(timespec="seconds"), **played_from}
     write_summary(out, played, about)
+    say(f"\n{run_table(scenario.name, played.outcome)}")
     for line in _findings(played.outcome):
         say(line)
     for verdict in played.verdicts:
         say(str(verdict))
     if stolen_percent is not None and stolen_percent >= NOTED_PERCENT:
         say(f"warning: the host of this virtual machine took {stolen_percent:.0f} % of its CPU time (steal)")
-    for path in (out / TRACE, alone_path(out / TRACE), out / SUMMARY):
+    for path in (out / TRACE, alone_path(out / TRACE), out / SUMMARY, out / PICTURE):
         if path.exists():
             say(f"written: {path}")
     return played
@@ -122,9 +138,10 @@ def play(
 def play_demo(out: Path) -> int:
     """Play the shipped demo scenario, then print Table II of the plans that were measured on both sites."""
     play(read_scenario(find_scenario("demo")), out, page=Page.SERVED).check_robots()
-    text = table_text(out / TRACE, TableConfig(windows=DEMO_WINDOWS, feedback="both"))
-    (out / TABLE).write_text(text)
-    print(f"\n{text}\nwritten: {out / TABLE}; charts: loadgen report {out}")
+    config = TableConfig(windows=DEMO_WINDOWS, feedback="both")
+    tables = read_tables(out / TRACE, config)
+    (out / TABLE).write_text(render(tables, config.format))
+    print(f"\n{config.text(tables, config.format)}\nwritten: {out / TABLE}; charts: loadgen report {out}")
     return 0
 
 

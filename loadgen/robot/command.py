@@ -5,6 +5,7 @@ The settings are read in `__main__`; the tasks are asked for in `run`.
 
 import gc
 import logging
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -14,10 +15,11 @@ from offboard.common.config import as_dict
 from offboard.common.errors import ConfigError, OffloadError
 from offboard.common.host.logs import start_log
 from offboard.common.task_states import TaskStates
+from offboard.loadgen.progress import progress
 from offboard.loadgen.robot.answers import Answers
 from offboard.loadgen.robot.config import DriveConfig, RobotConfig
 from offboard.loadgen.robot.references import References, measure_alone
-from offboard.loadgen.robot.run import OwnRecord, Run
+from offboard.loadgen.robot.run import Keep, OwnRecord, Run
 from offboard.loadgen.robot.work import Work, make_work
 from offboard.loadgen.robot_files import alone_path, reference_path
 from offboard.robot_client.offloader import Offloader
@@ -27,6 +29,7 @@ from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 if TYPE_CHECKING:
+    from offboard.loadgen.map_picture import LastPlan
     from offboard.robot_client.records.metrics import Metrics
 
 log = logging.getLogger(__name__)
@@ -50,7 +53,17 @@ def run_robot(config: RobotConfig) -> int:
         metrics = _metrics(config, trace)
         observers: list[Observer] = [*([trace.write] if trace else []), *([metrics] if metrics else [])]
         work, states = make_work(config), TaskStates(workers=1)  # shared, so that each setup runs once
-        _run_tasks(config, work, states, answers, observers=observers, files=files, metrics=metrics)
+        last = _last_plan(config)
+        _run_tasks(
+            config,
+            work,
+            states,
+            answers,
+            observers=observers,
+            files=files,
+            metrics=metrics,
+            keep=last.keep if last else None,
+        )
         if alone:
             # With its own offloader: what the run learns, records and counts is about the run only.
             with _connect(config, states=states, observers=[alone.write]) as offload:
@@ -63,6 +76,8 @@ def run_robot(config: RobotConfig) -> int:
     for file in files:
         if file.lost:
             raise OffloadError(f"{file.lost} tasks could not be written to {file.path}")
+    if last:
+        print(last.write())
     return 0
 
 
@@ -75,6 +90,7 @@ def _run_tasks(
     observers: Sequence[Observer],
     files: list[Answers | Lines],
     metrics: "Metrics | None",
+    keep: Keep | None,
 ) -> None:
     """Run the tasks of `work`, then close `files`, to which the file of --reference is added."""
     own, sites = OwnRecord(), config.sites()
@@ -108,8 +124,13 @@ def _run_tasks(
         for file in files:
             # Before the sites are closed: tasks that are given up by then have no record.
             stack.callback(file.close)
-        run = Run(config, work, offload, own=own, say=print, answers=answers, references=references)
-        with _connect(config, states=states, sites=sites) as unseen:
+        run = Run(
+            config, work, offload, own=own, say=print, answers=answers, references=references, keep=keep
+        )
+        with (
+            _connect(config, states=states, sites=sites) as unseen,
+            progress("connecting, and compiling what the first task needs", to=sys.stdout),
+        ):
             absent = unseen.wait_for_sites(work.function, config.connect_s)
             run.warm(unseen)
         absent = absent or offload.wait_for_sites(work.function, config.connect_s)
@@ -129,6 +150,15 @@ def _connect(
     return Offloader.connect(
         config.cloud, timeout_s=config.timeout_s, keys=config.keys, settings=own, **options
     )
+
+
+def _last_plan(config: RobotConfig) -> "LastPlan | None":
+    """What draws the picture of --picture."""
+    if not isinstance(config, DriveConfig) or config.picture is None:
+        return None
+    from offboard.loadgen.map_picture import LastPlan  # importing the planner compiles it
+
+    return LastPlan(config.picture)
 
 
 def _warn_of_absent(doing: str, absent: Mapping[str, str]) -> None:

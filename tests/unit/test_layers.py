@@ -50,7 +50,7 @@ FOLDERS: dict[str, set[str]] = {
     "loadgen/relay/tcp": {"loadgen/relay/link"},
     "loadgen/relay/toxiproxy": {"loadgen/relay/link", "loadgen/relay/tcp"},
     "loadgen/relay": {"loadgen/relay/link", "loadgen/relay/tcp", "loadgen/relay/toxiproxy"},
-    "loadgen/testbed": {"loadgen/relay", "loadgen/relay/link"},
+    "loadgen/testbed": {"loadgen", "loadgen/relay", "loadgen/relay/link"},
     "loadgen/rivals": set(),
     "loadgen/table": {"loadgen", "loadgen/rivals"},
     "loadgen/scenario": {
@@ -69,6 +69,7 @@ FOLDERS: dict[str, set[str]] = {
         "loadgen/testbed",
     },
     "loadgen/simulation": {
+        "loadgen",
         "loadgen/play",
         "loadgen/relay/link",
         "loadgen/robot",
@@ -77,13 +78,14 @@ FOLDERS: dict[str, set[str]] = {
         "loadgen/testbed",
     },
     "loadgen/compare": {
+        "loadgen",
         "loadgen/play",
         "loadgen/rivals",
         "loadgen/scenario",
         "loadgen/simulation",
         "loadgen/table",
     },
-    "loadgen/report": {"loadgen/play", "loadgen/rivals", "loadgen/table"},
+    "loadgen/report": {"loadgen", "loadgen/play", "loadgen/rivals", "loadgen/table"},
 }
 # Heavy or optional libraries, and the files that may import them.
 OWNERS = {
@@ -109,13 +111,14 @@ OWNERS = {
     "docker": {"loadgen/testbed/docker_engine.py"},
     "websockets": {"robot_client/openpi/web_socket.py"},
     "numba": {"common/planning/compiled.py"},
-    "PIL": {"common/planning/map_files.py"},
+    "PIL": {"common/planning/map_files.py", "loadgen/map_picture.py"},
     "yaml": {"common/planning/map_files.py"},
     "matplotlib": {"loadgen/report/chart_parts.py"},
     "sklearn": {"loadgen/rivals/random_forest.py"},
     "statsmodels": {"loadgen/rivals/arima.py"},
     "threadpoolctl": {"loadgen/rivals/arima.py"},
     "torch": {"loadgen/rivals/lstm.py"},
+    "rich": {"loadgen/progress.py"},
     "river": {"loadgen/rivals/river_model.py"},
 }
 
