@@ -12,6 +12,7 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 
 from offboard.common.live.look import Look
 
+COUNTED_S = 10.0  # after the last look
 ROBOTS_MAX = 256  # robots that the page /live tells apart; further ones are counted together
 OTHERS = b""  # the name of the further ones
 SECONDS_BUCKETS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30)
@@ -32,7 +33,7 @@ class Status:
 
 @dataclass(slots=True)
 class RobotUse:
-    """What one robot asked of this server since somebody looks at the page /live."""
+    """What one robot asked of this server since it is counted."""
 
     tasks: int = 0
     queue_s: float = 0.0
@@ -41,19 +42,26 @@ class RobotUse:
 
 
 class RobotUses:
-    """What each robot asks of this server, counted only while somebody looks at the page /live."""
+    """What each robot asks of this server, counted only while somebody looks at the page /live.
+
+    counting: whether a use must be noted.
+    """
 
     def __init__(self) -> None:
-        self.viewers = 0
+        self.counting = False
+        self._until_s = 0.0
         self._uses: dict[bytes, RobotUse] = {}
 
-    def look(self, change: int) -> None:
-        """A viewer has come (1) or left (-1)."""
-        self.viewers += change
-        if not self.viewers:
-            self._uses = {}
+    def look(self) -> None:
+        """Somebody looks. Counting ends COUNTED_S after the last look: a page asks for a new stream often."""
+        self._until_s = time.monotonic() + COUNTED_S
+        self.counting = True
 
     def of(self, robot: bytes) -> RobotUse:
+        if time.monotonic() > self._until_s:
+            self.counting = False
+            self._uses = {}
+            return RobotUse()  # for the last robot that is noted, and then forgotten
         if robot not in self._uses and len(self._uses) >= ROBOTS_MAX:
             robot = OTHERS
         return self._uses.setdefault(robot, RobotUse())
@@ -127,14 +135,10 @@ class ServerLive:
         self._workers = workers
 
     def looks(self) -> Generator[Look]:
-        """The robots are counted from the first look of the first viewer on."""
-        self._metrics.robots.look(1)
-        try:
-            while True:
-                state = {"workers": self._workers, "robots": self._robots(), "samples": self._samples()}
-                yield Look("server", time.time(), server={**asdict(self._status()), **state})
-        finally:
-            self._metrics.robots.look(-1)
+        while True:
+            self._metrics.robots.look()
+            state = {"workers": self._workers, "robots": self._robots(), "samples": self._samples()}
+            yield Look("server", time.time(), server={**asdict(self._status()), **state})
 
     def _samples(self) -> list[tuple[str, dict[str, str], float]]:
         """Every metric but the buckets of histograms: name, labels, value."""

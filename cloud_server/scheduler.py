@@ -197,7 +197,7 @@ class Scheduler:
         self._count(request, outcome.status if work.wanted else "cancelled", work.queue_s, outcome.run_s)
         self._metrics.queue_s.labels(request.kind).observe(work.queue_s)
         self._metrics.run_s.labels(request.kind).observe(outcome.run_s)
-        if self._metrics.robots.viewers:
+        if self._metrics.robots.counting:
             use = self._metrics.robots.of(work.robot)
             use.tasks += 1
             use.queue_s += work.queue_s
@@ -217,7 +217,7 @@ class Scheduler:
     def refuse(self, peer: bytes, request: Request, why: Refusal) -> None:
         """Answer a request that does not run."""
         self._count(request, why.status, why.queue_s)
-        if self._metrics.robots.viewers and why.status != "need_blob":  # the robot sends that one again
+        if self._metrics.robots.counting and why.status != "need_blob":  # the robot sends that one again
             self._metrics.robots.of(self._access.robot_of(peer)).refused += 1
         reply = Reply(
             request.id, why.status, why.error,

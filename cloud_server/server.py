@@ -155,7 +155,7 @@ class Server:
         )
 
     def robots(self) -> list[dict[str, Any]]:
-        """What each robot asked of this server since somebody looks, and how many of its tasks wait now."""
+        """What each robot asked of this server since it is counted, and how many of its tasks wait now."""
         with self._channel.lock:
             uses, waiting = self.metrics.robots.counted(), self._scheduler.waiting_by_robot()
         nothing = asdict(RobotUse())

@@ -19,6 +19,7 @@ _OURS = {
     "/live": ("live.html", "text/html; charset=utf-8"),
     "/live/live.css": ("live.css", "text/css; charset=utf-8"),
     "/live/live.js": ("live.js", "text/javascript; charset=utf-8"),
+    "/live/answers.js": ("answers.js", "text/javascript; charset=utf-8"),
     "/live/charts.js": ("charts.js", "text/javascript; charset=utf-8"),
     "/live/memory.js": ("memory.js", "text/javascript; charset=utf-8"),
     "/live/stream.js": ("stream.js", "text/javascript; charset=utf-8"),

@@ -122,16 +122,8 @@ def play(
     played = replace(judge(scenario, out, exit_codes), stolen_percent=stolen_percent)
     about = {"testbed": testbed, "started_at": started_at.isoformat(timespec="seconds"), **played_from}
     write_summary(out, played, about)
-    say(f"\n{run_table(scenario.name, played.outcome)}")
-    for line in _findings(played.outcome):
+    for line in _ending(played, out):
         say(line)
-    for verdict in played.verdicts:
-        say(str(verdict))
-    if stolen_percent is not None and stolen_percent >= NOTED_PERCENT:
-        say(f"warning: the host of this virtual machine took {stolen_percent:.0f} % of its CPU time (steal)")
-    for path in (out / TRACE, alone_path(out / TRACE), out / SUMMARY, out / PICTURE):
-        if path.exists():
-            say(f"written: {path}")
     return played
 
 
@@ -142,7 +134,23 @@ def play_demo(out: Path) -> int:
     tables = read_tables(out / TRACE, config)
     (out / TABLE).write_text(render(tables, config.format))
     print(f"\n{config.text(tables, config.format)}\nwritten: {out / TABLE}; charts: loadgen report {out}")
+    if (out / PICTURE).exists():
+        print(f"picture of the last plan: {out / PICTURE}")
+    print(f"the run on a page: loadgen watch {out}")
     return 0
+
+
+def _ending(played: Played, out: Path) -> Iterator[str]:
+    """What a run says at its end: figures, verdicts and the files that it wrote."""
+    yield f"\n{run_table(played.scenario.name, played.outcome)}"
+    yield from _findings(played.outcome)
+    yield from map(str, played.verdicts)
+    stolen_percent = played.stolen_percent
+    if stolen_percent is not None and stolen_percent >= NOTED_PERCENT:
+        yield f"warning: the host of this virtual machine took {stolen_percent:.0f} % of its CPU time (steal)"
+    for path in (out / TRACE, alone_path(out / TRACE), out / SUMMARY, out / PICTURE):
+        if path.exists():
+            yield f"written: {path}"
 
 
 def judge(scenario: Scenario, out: Path, exit_codes: Mapping[str, int]) -> Played:

@@ -6,7 +6,7 @@ The settings are read in `__main__`; the tasks are asked for in `run`.
 import gc
 import logging
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,7 @@ from offboard.loadgen.progress import progress
 from offboard.loadgen.robot.answers import Answers
 from offboard.loadgen.robot.config import DriveConfig, RobotConfig
 from offboard.loadgen.robot.references import References, measure_alone
-from offboard.loadgen.robot.run import Keep, OwnRecord, Run
+from offboard.loadgen.robot.run import OwnRecord, Run
 from offboard.loadgen.robot.work import Work, make_work
 from offboard.loadgen.robot_files import alone_path, reference_path
 from offboard.robot_client.offloader import Offloader
@@ -50,20 +50,9 @@ def run_robot(config: RobotConfig) -> int:
     alone = Trace(alone_path(config.trace)) if config.trace and config.alone else None
     files: list[Answers | Lines] = [file for file in (answers, trace) if file]
     try:
-        metrics = _metrics(config, trace)
-        observers: list[Observer] = [*([trace.write] if trace else []), *([metrics] if metrics else [])]
         work, states = make_work(config), TaskStates(workers=1)  # shared, so that each setup runs once
         last = _last_plan(config)
-        _run_tasks(
-            config,
-            work,
-            states,
-            answers,
-            observers=observers,
-            files=files,
-            metrics=metrics,
-            keep=last.keep if last else None,
-        )
+        _run_tasks(config, work, states, answers, trace=trace, files=files, last=last)
         if alone:
             # With its own offloader: what the run learns, records and counts is about the run only.
             with _connect(config, states=states, observers=[alone.write]) as offload:
@@ -87,26 +76,14 @@ def _run_tasks(
     states: TaskStates,
     answers: Answers | None,
     *,
-    observers: Sequence[Observer],
+    trace: Trace | None,
     files: list[Answers | Lines],
-    metrics: "Metrics | None",
-    keep: Keep | None,
+    last: "LastPlan | None",
 ) -> None:
     """Run the tasks of `work`, then close `files`, to which the file of --reference is added."""
     own, sites = OwnRecord(), config.sites()
     with ExitStack() as stack:
-        offload = stack.enter_context(
-            _connect(
-                config,
-                states=states,
-                sites=sites,
-                policy=config.policy,
-                settings=config.settings(config.seed),
-                observers=[own, *observers],
-            )
-        )
-        if metrics:
-            offload.show_on(metrics.live)
+        offload = stack.enter_context(_observed(config, states, own, trace))
         again, references = None, None
         if config.trace and config.reference:
             again = stack.enter_context(_connect(config, states=states, sites=sites))
@@ -124,6 +101,7 @@ def _run_tasks(
         for file in files:
             # Before the sites are closed: tasks that are given up by then have no record.
             stack.callback(file.close)
+        keep = last.keep if last else None
         run = Run(
             config, work, offload, own=own, say=print, answers=answers, references=references, keep=keep
         )
@@ -141,6 +119,19 @@ def _run_tasks(
         gc.collect()
         gc.freeze()  # so that collections during the run do not look at what exists now
         run.run()
+
+
+def _observed(config: RobotConfig, states: TaskStates, own: OwnRecord, trace: Trace | None) -> Offloader:
+    """The offloader whose tasks go into the trace, the metrics and the live page."""
+    metrics = _metrics(config, trace)
+    observers: list[Observer] = [own, *([trace.write] if trace else []), *([metrics] if metrics else [])]
+    settings = config.settings(config.seed)
+    offload = _connect(
+        config, states, settings, sites=config.sites(), policy=config.policy, observers=observers
+    )
+    if metrics:
+        offload.show_on(metrics.live)
+    return offload
 
 
 def _connect(

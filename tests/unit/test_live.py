@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from offboard.cloud_server.metrics import RobotUses
 from offboard.common.errors import MissingExtra
 from offboard.common.live.live_files import PATHS, page_file
 from offboard.common.live.look import KEPT_MAX, VIEWERS_MAX, Look, Viewers, encode
@@ -80,6 +81,22 @@ def test_records_are_read_only_for_viewers() -> None:
     assert made == []
     next(live.looks())
     assert made == list(range(10))
+
+
+def test_robots_are_counted_until_nobody_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each use counts while a look is recent; the first use after that forgets all of them."""
+    uses = RobotUses()
+    assert not uses.counting
+    uses.look()
+    for _ in range(2):
+        assert uses.counting
+        uses.of(b"robot").tasks += 1
+    assert uses.counted()[b"robot"]["tasks"] == 2
+    monkeypatch.setattr("offboard.cloud_server.metrics.COUNTED_S", -1.0)
+    uses.look()
+    uses.of(b"robot").tasks += 1
+    assert uses.counted() == {}
+    assert not uses.counting
 
 
 def test_viewers_are_limited() -> None:

@@ -72,7 +72,10 @@ def test_a_site_that_is_silent_or_absent_is_not_usable() -> None:
     """A site shows 1 while it answers, and 0 while it does not; also if it never has. Onboard shows 1."""
     registry = CollectorRegistry()
     observe = Metrics(registry)
-    observe.live.show({site: ScriptedRunner(site, lambda _: Execution(CLOUD, 0.1)) for site in (CLOUD, "edge")}, allowance=None)
+    observe.live.show(
+        {site: ScriptedRunner(site, lambda _: Execution(CLOUD, 0.1)) for site in (CLOUD, "edge")},
+        allowance=None,
+    )
 
     def usable() -> list[float | None]:
         name, kind = "offboard_robot_site_usable", {"kind": "plan_path"}

@@ -6,6 +6,7 @@ import { amount, answered } from "./memory.js";
 
 const SYMBOLS = ["circle", "diamond", "square", "triangle-up"];
 const BINS = 30;
+const time = { type: "date" };
 const OPTIONS = { displayModeBar: false, responsive: true };
 
 export const colour = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
@@ -54,7 +55,6 @@ export function remove(id) {
   if (figure !== null) { resized.unobserve(figure.querySelector(".plot")); Plotly.purge(figure.querySelector(".plot")); figure.remove(); }
 }
 
-const time = { type: "date" };
 const bands = spans => spans.map(([from, to, site]) => ({
   type: "rect", xref: "x", yref: "paper", x0: from, x1: to, y0: 0, y1: 1, line: { width: 0 }, layer: "below",
   fillcolor: faded(colour("--bad"), 0.22), name: site,
@@ -153,24 +153,25 @@ export function drawParts(tasks) {
 
 // Round trips and queues of the sites: from the heartbeats now, and from what each task was decided with.
 export function drawLink(samples, tasks, sites, spans) {
-  const remote = sites.filter(site => site !== "onboard"), traces = [];
+  const remote = sites.filter(site => site !== "onboard"), traces = [], queues = [];
   for (const site of remote) {
     const points = [
       ...tasks.map(task => [task.at, task.features[`${site}.round_trip_s`], task.features[`${site}.queue`]]),
       ...samples.filter(one => one.sites && one.sites[site])
         .map(one => [one.at, one.sites[site].round_trip_s, one.sites[site].queue]),
     ].filter(point => point[1] != null).sort((a, b) => a[0] - b[0]);
+    queues.push(...points.map(point => point[2] || 0));
     const common = { x: points.map(point => point[0]), mode: "lines+markers", marker: { size: 3 } };
     traces.push(
       { ...common, y: points.map(point => 1000 * point[1]), name: `${site}: round trip`, line: { color: siteColour(sites, site) } },
-      { ...common, y: points.map(point => point[2] || 0), name: `${site}: queue`, yaxis: "y2", line: { color: colour("--faint"), dash: "dot" } });
+      { ...common, y: points.map(point => point[2] || 0), name: `${site}: queue`, yaxis: "y2", line: { color: colour("--faint"), dash: "dot", shape: "hv" } });
   }
   if (!traces.some(trace => trace.x.length)) { remove("link"); return; }
   draw("link", "Link and queue, from heartbeats", traces, {
     xaxis: time, yaxis: { title: { text: "ms" } }, shapes: bands(spans),
     yaxis2: {
       overlaying: "y", side: "right", rangemode: "tozero", title: { text: "tasks" }, showgrid: false,
-      automargin: true, tickformat: "~g", nticks: 4,
+      automargin: true, tickformat: "d", nticks: 4, range: [0, Math.max(4, ...queues) * 1.05],
     },
   }, "Solid: round trip. Dotted: tasks that wait at the site.");
 }
@@ -178,7 +179,7 @@ export function drawLink(samples, tasks, sites, spans) {
 // The queue and the workers of a server.
 export function drawServer(samples) {
   const x = samples.map(one => one.at);
-  const line = (name, values, own, dash) => ({ x, y: values, mode: "lines", name, line: { color: colour(own), dash, shape: "hv" } });
+  const line = (name, values, own, dash, shape = "hv") => ({ x, y: values, mode: "lines", name, line: { color: colour(own), dash, shape } });
   draw("queue", "Queue and workers", [
     line("waiting", samples.map(one => one.server.queue_depth), "--site-1"),
     line("running", samples.map(one => one.server.running), "--site-0"),
@@ -196,7 +197,7 @@ export function drawServer(samples) {
   const rate = status => totals.map((found, i) => i === 0 ? null
     : ((found.get(status) || 0) - (totals[i - 1].get(status) || 0)) / Math.max(0.001, (x[i] - x[i - 1]) / 1000));
   draw("rates", "Requests a second, by outcome",
-    statuses.map((status, i) => line(status, rate(status), own[i % own.length], i < own.length ? "solid" : "dash")),
+    statuses.map((status, i) => line(status, rate(status), own[i % own.length], i < own.length ? "solid" : "dash", "vh")), // a rate is that of the second before
     { xaxis: time, yaxis: { title: { text: "a second" } } },
     statuses.length ? `Outcomes: ${statuses.join(", ")}.` : "No request yet.");
 }

@@ -1,21 +1,19 @@
 // The page: asks for looks, remembers them, and shows how things are now, or were at the time of the slider.
 
+import { moreBudget, predictionsGood, serverBusy, serverOrLink, whichRobot, whyThere } from "./answers.js";
 import { drawHistory, drawLink, drawParts, drawPlaces, drawServer, drawTimes, siteNumber } from "./charts.js";
-import { amount, judged, Memory, outages, parts, sum } from "./memory.js";
+import { amount, Memory, ms, outages, percent, sinceStart, sum, total } from "./memory.js";
 import { follow } from "./stream.js";
 
 const STEPS = 1000; // of the slider
 const ROWS = 30; // decisions in the table
-const BAND_MIN = 20; // answers, before the share inside the band is judged
 const NAMES = { robot: "robot", server: "server", run: "run" };
 
 const memory = new Memory();
 const by = id => document.getElementById(id);
 let chosen = null, followed = true, until = Infinity, due = false;
 
-const ms = seconds => seconds == null ? "unknown" : seconds >= 1 ? `${seconds.toFixed(2)} s` : `${(1000 * seconds).toFixed(seconds < 0.01 ? 2 : 0)} ms`;
-const percent = share => `${Math.round(100 * share)} %`;
-const clock = at => new Date(at).toLocaleTimeString();
+const clock = at => new Date(at).toLocaleTimeString([], { hourCycle: "h23" }); // as in the charts
 const say = (id, text) => { if (by(id).textContent !== text) by(id).textContent = text; };
 
 function sitesOf(tasks, sample) {
@@ -67,29 +65,10 @@ function showSites(conditions, sites) {
   by("sites").hidden = !cards.length;
 }
 
-function showAnswers(tasks, sample) {
-  const last = tasks[tasks.length - 1], quality = judged(tasks), where = parts(tasks), all = where.link + where.queue + where.run;
-  say("answer-why", last ? `Task ${last.i} went to ${placeOf(last)}. ${last.decision.reason}` : "no task yet");
-  say("answer-part", !where.count ? `unknown: none of the last ${tasks.length} tasks has a remote answer`
-    : `Of the time of ${where.count} remote answers, the link took ${percent(where.link / all)}, the server's queue ${percent(where.queue / all)}, and its workers ${percent(where.run / all)}.`);
-  const enough = quality.count >= BAND_MIN ? "" : " (too few to judge)";
-  say("answer-predictions", !quality.count ? "unknown: no prediction with a band has been tested yet"
-    : `${percent(quality.inside / quality.count)} of ${quality.count} answers were inside their 90 % band${enough}; the median error is ${percent(quality.error)}.`);
-  say("answer-budget", budgetText(tasks, sample));
+function answer(id, [verdict, figures]) {
+  say(`answer-${id}`, verdict);
+  say(`answer-${id}-figures`, figures);
 }
-
-function budgetText(tasks, sample) {
-  const last = tasks[tasks.length - 1], regret = last && last.regret, budget = followed && sample && sample.budget;
-  const second = tasks.filter(task => task.executions.length > 1).length;
-  const used = tasks.length ? `${percent(second / tasks.length)} of the last ${tasks.length} tasks had a second run. ` : "";
-  const left = budget ? `Left now: ${budget.duplicates.toFixed(1)} second runs${caps(budget)}. ` : "";
-  const lost = regret ? `Estimated regret: ${ms(regret.mean_s)} a task (90 %: ${ms(regret.low_s)} to ${ms(regret.high_s)}), which is the most that a better choice could save.`
-    : "Estimated regret: unknown until six probes have run.";
-  return left + used + lost;
-}
-
-const caps = budget => ["bytes", "joules"].filter(name => budget[`${name}_left`] != null)
-  .map(name => `, ${Math.round(budget[`${name}_left`])} ${name}`).join("");
 
 function fill(body, rows, long) {
   body.replaceChildren(...rows.map(values => {
@@ -119,8 +98,13 @@ function showTasks() {
   const sites = sitesOf(tasks, sample), events = memory.events.filter(one => one.at_s * 1000 <= until);
   const from = tasks.length ? tasks[0].at : 0, recent = samples.filter(one => one.at >= from);
   const spans = outages(recent, tasks);
-  showSites(conditions(tasks, sample, sites), sites);
-  showAnswers(tasks, sample);
+  const now = conditions(tasks, sample, sites);
+  showSites(now, sites);
+  const absent = Object.entries((followed && sample && sample.sites) || {}).map(([site, one]) => [site, one.absent]);
+  answer("why", whyThere(tasks, sites, spans, Object.fromEntries(absent)));
+  answer("part", serverOrLink(tasks));
+  answer("predictions", predictionsGood(tasks));
+  answer("budget", moreBudget(tasks, followed && sample ? sample.budget : null));
   showDecisions(tasks);
   drawTimes(tasks, sites);
   drawHistory(tasks, sites, spans, events.filter(one => one.at_s * 1000 >= from));
@@ -132,19 +116,17 @@ function showTasks() {
 const placeOf = task => task.decision.both ? "all sites" : task.decision.site;
 const shortly = number => number === 0 ? "0" : Number(number.toPrecision(3)).toLocaleString();
 
-const total = (server, name) => sum(server.samples.filter(one => one[0] === name).map(one => one[2]));
-
 function showServer() {
   const samples = memory.samplesUntil(until), server = samples[samples.length - 1].server;
-  const robots = [...server.robots].sort((a, b) => b.run_s - a.run_s), all = sum(robots.map(one => one.run_s));
+  const { robots, seconds } = sinceStart(samples), all = sum(robots.map(one => one.run_s));
   const mean = (one, field) => one.tasks ? ms(one[field] / one.tasks) : "none yet";
   fill(by("robot-rows"), robots.map(one => [one.robot, all ? percent(one.run_s / all) : "none yet", one.tasks, one.waiting,
     mean(one, "queue_s"), mean(one, "run_s"), one.refused]));
+  say("robots-title", `Robots, in the last ${Math.round(seconds)} s`);
   by("robots").hidden = by("answer-load-box").hidden = false;
   for (const id of ["answer-why", "answer-predictions", "answer-budget"]) by(id).parentElement.hidden = true;
-  say("answer-load", all ? `${robots[0].robot}: ${percent(robots[0].run_s / all)} of the worker time since this page is open.` : "No task since this page is open.");
-  const queue = total(server, "offboard_server_queue_seconds_sum"), run = total(server, "offboard_server_run_seconds_sum"), count = total(server, "offboard_server_run_seconds_count");
-  say("answer-part", count ? `${server.running} of ${server.workers} workers are busy, and ${server.queue_depth} tasks wait. Over ${count} tasks the mean wait is ${ms(queue / count)}, and the mean run ${ms(run / count)}.` : "No task yet.");
+  answer("load", whichRobot(samples));
+  answer("part", serverBusy(samples));
   const state = server.draining ? "stopping" : server.ready ? "ready" : "warming up";
   const facts = [`State: ${state}, up for ${Math.round(server.uptime_s)} s`,
     `Load by other programs: ${percent(total(server, "offboard_server_other_load_ratio"))}`,

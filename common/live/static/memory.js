@@ -74,23 +74,45 @@ export const sum = values => values.reduce((total, one) => total + one, 0);
 // What the predictors were asked with: the expected work, if sites learn times per work, else the size.
 export const amount = task => task.features.work ?? (Array.isArray(task.size) ? task.size[0] : task.size);
 
+export const ms = seconds => seconds == null ? "unknown" : seconds >= 1 ? `${seconds.toFixed(2)} s` : `${(1000 * seconds).toFixed(seconds < 0.01 ? 2 : 0)} ms`;
+export const percent = share => `${Math.round(100 * share)} %`;
+
 export const answered = (task, site) => task.executions.find(one => one.site === site && one.ok);
 
-// Share of answers inside the 90 % band of their prediction, and the relative error: {count, inside, error}.
+// The other sites that a task could have used, with their outlook: [[site, outlook], ...].
+export const others = (task, site) => Object.entries(task.sites)
+  .filter(([name]) => name !== site && !task.features[`${name}.silent`]);
+
+// How many answers were inside the 90 % band of their prediction, and the median of the relative errors:
+// {count, inside, error, sites}; `sites` has the same for each site.
 export function judged(tasks) {
-  let count = 0, inside = 0;
-  const errors = [];
-  for (const task of tasks) {
-    for (const one of task.executions) {
-      const outlook = task.sites[one.site];
-      if (!one.ok || !outlook || outlook.predicted_s === null) continue;
-      errors.push(Math.abs(one.seconds - outlook.predicted_s) / one.seconds);
-      if (outlook.low_s === null || outlook.high_s === null) continue;
-      count += 1;
-      inside += outlook.low_s <= one.seconds && one.seconds <= outlook.high_s;
-    }
-  }
-  return { count, inside, error: median(errors) };
+  const tested = tasks.flatMap(task => task.executions.map(one => [one, task.sites[one.site]]))
+    .filter(([one, outlook]) => one.ok && outlook && outlook.low_s !== null && outlook.high_s !== null);
+  const judge = some => ({
+    count: some.length,
+    inside: some.filter(([one, { low_s, high_s }]) => low_s <= one.seconds && one.seconds <= high_s).length,
+    error: median(some.map(([one, outlook]) => Math.abs(one.seconds - outlook.predicted_s) / one.seconds)),
+  });
+  const names = [...new Set(tested.map(([one]) => one.site))];
+  return { ...judge(tested), sites: Object.fromEntries(names.map(site => [site, judge(tested.filter(([one]) => one.site === site))])) };
+}
+
+// The sum of a metric of the server over all of its labels.
+export const total = (server, name) => sum(server.samples.filter(one => one[0] === name).map(one => one[2]));
+
+// What a server counted since the first look, or since it began to count again: {from, to, seconds, robots}.
+// The robots are sorted by the time of workers that they used.
+export function sinceStart(samples) {
+  const used = look => sum(look.server.robots.map(one => one.run_s));
+  const again = samples.findLastIndex((look, i) => i > 0
+    && (look.server.uptime_s < samples[i - 1].server.uptime_s || used(look) < used(samples[i - 1])));
+  const from = samples[Math.max(0, again)], to = samples[samples.length - 1];
+  const robots = to.server.robots.map(one => {
+    const before = from.server.robots.find(other => other.robot === one.robot);
+    const change = name => one[name] - (before ? before[name] : 0);
+    return { ...one, tasks: change("tasks"), queue_s: change("queue_s"), run_s: change("run_s"), refused: change("refused") };
+  });
+  return { from, to, seconds: (to.at - from.at) / 1000, robots: robots.sort((a, b) => b.run_s - a.run_s) };
 }
 
 // Where the time of the answers of other computers went: {link, queue, run}, in seconds.
@@ -111,10 +133,8 @@ export function outages(samples, tasks) {
   for (const { at, sites } of samples) {
     for (const [site, now] of Object.entries(sites || {})) note(site, at, now.silent || now.absent !== null);
   }
-  for (const task of tasks) {
-    for (const [name, value] of Object.entries(task.features)) {
-      if (name.endsWith(".silent")) note(name.slice(0, -".silent".length), task.at, Boolean(value));
-    }
+  for (const site of new Set(tasks.flatMap(task => Object.keys(task.sites)))) {
+    for (const task of tasks) note(site, task.at, !(site in task.sites) || Boolean(task.features[`${site}.silent`]));
   }
   const spans = [];
   for (const [site, states] of points) {

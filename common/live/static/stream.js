@@ -61,7 +61,7 @@ export async function follow(url, onLook, onState) {
       await read(answer.body, alive, onLook);
       if (performance.now() - begun > SHORT_MS) continue; // the server ends each stream after a while
     } catch (error) {
-      onState("lost", `no connection since ${new Date().toLocaleTimeString()}; trying again each second`);
+      onState("lost", `no connection since ${new Date().toLocaleTimeString([], { hourCycle: "h23" })}; trying again each second`);
     } finally {
       clearTimeout(timer);
     }
