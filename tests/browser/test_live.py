@@ -8,9 +8,11 @@ import os
 import re
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
@@ -63,6 +65,19 @@ class Demo:
         }
         self.bed = LocalTestbed(folder, setups)
 
+    @contextmanager
+    def second_robot(self) -> Iterator[str]:
+        """The address of the page of a further robot, which sends all tasks to the cloud."""
+        self.bed.start("robot-2")
+        page, end = f"http://{self.robots[1]}/live", time.monotonic() + START_MS / 1000
+        try:
+            while not answers(page):
+                assert time.monotonic() < end, "the second robot has no page"
+                time.sleep(0.2)
+            yield page
+        finally:
+            self.bed.kill("robot-2")
+
     @property
     def robot_page(self) -> str:
         return f"http://{self.robots[0]}/live"
@@ -70,6 +85,13 @@ class Demo:
     @property
     def server(self) -> str:
         return f"http://{self.bed.cloud_http}"
+
+
+def answers(page: str) -> bool:
+    try:
+        return httpx.get(page).status_code == httpx.codes.OK
+    except httpx.TransportError:
+        return False
 
 
 @pytest.fixture(scope="module")
@@ -187,21 +209,20 @@ def test_the_page_of_a_robot_answers_questions(demo: Demo, look: Look) -> None:
 
 def test_the_page_finds_the_bottleneck(demo: Demo, look: Look) -> None:
     """A narrow link is named as the bottleneck; on a fast link, so are slow workers of the server."""
-    demo.bed.start("robot-2")
-    page = look(f"http://{demo.robots[1]}/live", viewport=NARROW).page
-    part = page.locator("#answer-part")
-    try:
-        demo.bed.set_link(delay_ms=60.0)
-        expect(part).to_contain_text("The link: ", timeout=START_MS)
-        picture(page, "answer-link", "#answers", "#parts")
-        demo.bed.set_link(delay_ms=0.0)
-        demo.bed.set_cpus("cloud", 0.1)
-        expect(part).to_contain_text("The server: ", timeout=START_MS)
-        picture(page, "answer-server", "#answers", "#parts")
-    finally:
-        demo.bed.set_link(delay_ms=5.0)
-        demo.bed.set_cpus("cloud", 1.0)
-        demo.bed.kill("robot-2")
+    with demo.second_robot() as address:
+        page = look(address, viewport=NARROW).page
+        part = page.locator("#answer-part")
+        try:
+            demo.bed.set_link(delay_ms=60.0)
+            expect(part).to_contain_text("The link: ", timeout=START_MS)
+            picture(page, "answer-link", "#answers", "#parts")
+            demo.bed.set_link(delay_ms=0.0)
+            demo.bed.set_cpus("cloud", 0.1)
+            expect(part).to_contain_text("The server: ", timeout=START_MS)
+            picture(page, "answer-server", "#answers", "#parts")
+        finally:
+            demo.bed.set_link(delay_ms=5.0)
+            demo.bed.set_cpus("cloud", 1.0)
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -238,22 +259,21 @@ def test_the_page_is_used_by_keyboard(demo: Demo, look: Look) -> None:
 
 def test_the_page_of_a_server(demo: Demo, look: Look) -> None:
     """The token is entered once; then the page shows queue, workers and both robots, also after a reload."""
-    demo.bed.start("robot-2")
-    opened = look(f"{demo.server}/live", live=False, viewport=DESKTOP)
-    page = opened.page
-    enter_token(page)
-    expect(page.locator("#state")).to_have_text("live", timeout=SOON_MS)
-    loaded = re.compile(r"robot(-2)?: \d+ % of the time of the workers")
-    expect(page.locator("#answer-load")).to_contain_text(loaded, timeout=3 * SOON_MS)
-    expect(page.locator("#answer-part")).to_contain_text(
-        re.compile(r"(Not t|T)he server: its workers were busy")
-    )
-    expect(page.locator("#robot-rows tr")).to_have_count(2, timeout=START_MS)
-    page.wait_for_timeout(10_000)  # longer than a stream of looks: the counts go on in the next one
-    assert int(page.locator("#robot-rows tr:first-child td:nth-child(3)").inner_text()) > LOOKS_A_STREAM
-    picture(page, "live-server")
-    picture(page, "answer-robots", "#answers", "#robots")
-    demo.bed.kill("robot-2")
+    with demo.second_robot():
+        opened = look(f"{demo.server}/live", live=False, viewport=DESKTOP)
+        page = opened.page
+        enter_token(page)
+        expect(page.locator("#state")).to_have_text("live", timeout=SOON_MS)
+        loaded = re.compile(r"robot(-2)?: \d+ % of the time of the workers")
+        expect(page.locator("#answer-load")).to_contain_text(loaded, timeout=3 * SOON_MS)
+        expect(page.locator("#answer-part")).to_contain_text(
+            re.compile(r"(Not t|T)he server: its workers were busy")
+        )
+        expect(page.locator("#robot-rows tr")).to_have_count(2, timeout=START_MS)
+        page.wait_for_timeout(10_000)  # longer than a stream of looks: the counts go on in the next one
+        assert int(page.locator("#robot-rows tr:first-child td:nth-child(3)").inner_text()) > LOOKS_A_STREAM
+        picture(page, "live-server")
+        picture(page, "answer-robots", "#answers", "#robots")
     page.reload(wait_until="domcontentloaded")
     expect(page.locator("#state")).to_have_text("live", timeout=SOON_MS)
     assert {address.partition("/live")[0] for address in opened.requests} == {demo.server}
