@@ -1,5 +1,5 @@
-# Targets: robot (planning), cloud (planning, server), bench (relay, tables), examples (robot and cloud of an application).
-# They share one base; none contains a compiler.
+# Targets: robot (planning), cloud (planning, server), bench (relay, tables), examples (robot and cloud of an application),
+# prometheus. They share one base; none contains a compiler.
 FROM python:3.13-slim AS base
 ENV PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 PATH=/opt/offboard/bin:$PATH
 # The planner is compiled at the first start, for the CPU that it runs on. Keep the cache in a volume.
@@ -68,6 +68,14 @@ RUN /wheels/install
 COPY --chmod=755 examples /opt/applications/examples
 ENV PYTHONPATH=/opt/applications
 USER offboard
+
+FROM base AS prometheus
+RUN apt-get update -qq && apt-get install -qq --no-install-recommends prometheus > /dev/null && rm -rf /var/lib/apt/lists/* \
+ && install -d -o offboard -g offboard /prometheus
+COPY deploy/prometheus /etc/prometheus
+USER offboard
+EXPOSE 9090
+ENTRYPOINT ["prometheus", "--config.file=/etc/prometheus/prometheus.yml", "--storage.tsdb.path=/prometheus"]
 
 # Runs the unit tests with the Python of the image.
 FROM bench AS test

@@ -16,7 +16,7 @@ EXAMPLES_READY := .cache/examples/.ready
 
 ROS2_READY := .cache/ros2-kilted/.ready .cache/ros2-jazzy/.ready
 
-.PHONY: help demo install format lint type test unit pythons integration compose chaos state bench examples ros2 browser torch up down table lock wheel clean
+.PHONY: help demo install format lint type test unit pythons integration compose chaos state bench examples ros2 browser prometheus torch up down table lock wheel clean
 
 help: ## list the targets
 	@grep -E '^[a-z0-9]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -79,6 +79,14 @@ ros2: $(DEV_READY) $(ROS2_READY) ## test with real rclpy of two releases of ROS;
 browser: $(DEV_READY) ## run the tests in a real browser; needs Chromium
 	$(BIN)/pytest tests/browser
 
+# Unpacked and not installed: that needs no root, and starts no service.
+PROMETHEUS := $(CACHE)/prometheus
+prometheus: ## unpack Debian's Prometheus into .cache for the tests of deploy/prometheus, if apt has it
+	@if command -v prometheus >/dev/null || test -x $(PROMETHEUS)/usr/bin/prometheus; then :; \
+	elif mkdir -p $(PROMETHEUS) && cd $(PROMETHEUS) && apt-get download -qq -o APT::Sandbox::User=root prometheus; then \
+	  dpkg-deb -x prometheus_*.deb . && rm prometheus_*.deb; \
+	else echo "apt has no package prometheus: the tests of deploy/prometheus will be skipped"; fi
+
 # On x86-64 the default PyTorch wheel brings gigabytes of CUDA, so it is installed only if pip finds a CPU build.
 TORCH := torch==2.13.0
 torch: $(DEV_READY) ## install PyTorch for the LSTM, if pip finds a CPU-only build
@@ -91,7 +99,7 @@ up: ## start the three containers and print the robot's table; the server stays 
 	docker compose up --build
 
 down: ## remove the containers and their volumes
-	docker compose down --volumes
+	docker compose --profile observe down --volumes
 
 table: $(BENCH_READY) ## print Table II of the last demo
 	$(BIN)/loadgen table out/demo/trace.jsonl --windows 5,10,20,30,40,50

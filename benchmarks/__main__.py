@@ -9,7 +9,16 @@ from importlib.metadata import version
 
 from benchmarks.measure import processor
 
-TABLES = ("planner", "decision", "lower_bounds", "round_trip", "server_load", "attacks", "footprint")
+TABLES = (
+    "planner",
+    "decision",
+    "lower_bounds",
+    "round_trip",
+    "server_load",
+    "attacks",
+    "footprint",
+    "page_cost",
+)
 
 
 def main() -> int:

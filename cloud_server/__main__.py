@@ -16,10 +16,11 @@ from offboard.cloud_server.config import ROBOTS, ServerConfig
 from offboard.common.command_line import load, run_command
 from offboard.common.config import as_dict
 from offboard.common.errors import ConfigError
+from offboard.common.host.logs import start_log
 
 DESCRIPTION = (
-    "Run tasks for robots. Robots connect over ZMQ; HTTP serves /health, /ready, /metrics, /config, /tasks "
-    "and /docs. `cloud-server keys` makes the keys of the server."
+    "Run tasks for robots. Robots connect over ZMQ; HTTP serves /live (a page), /health, /ready, /metrics, "
+    "/config, /tasks and /docs. `cloud-server keys` makes the keys of the server."
 )
 
 EMPTY_TASK_MODULE = "offboard.common.empty_task"
@@ -54,7 +55,7 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
     config = load(
         ServerConfig, argv, prog="cloud-server", description=DESCRIPTION, environ=environ, prefix="CLOUD"
     )
-    logging.basicConfig(level=config.log.upper(), format="%(asctime)s %(levelname)s %(message)s")
+    start_log(config.log, config.log_format)
     sys.path.insert(0, str(Path.cwd()))  # as `python -m` does, so that --tasks finds modules of the user
     # These load heavy libraries, which --help and a wrong flag do not need.
     from offboard.cloud_server.executors import EXECUTORS
@@ -89,7 +90,7 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
         keys=keys,
         robots=config.robots_folder,
     )
-    web = make_http(config, server.status, metrics.registry, token=token)
+    web = make_http(config, metrics, server, token=token)
     web.start()
     if config.open_ways:
         warn_each_minute(config.open_ways)
@@ -107,7 +108,8 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
 
 def abandon(drain_s: float) -> NoReturn:
     """End the process at once: the teardown of a normal exit can crash native code that still runs."""
-    log.error("some tasks were still running after the drain time of %g s; they are abandoned", drain_s)
+    text = "tasks were still running after the drain time of %g s and are abandoned; remedy: raise --drain-s"
+    log.error(text, drain_s)
     logging.shutdown()
     os._exit(1)
 

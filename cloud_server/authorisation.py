@@ -42,6 +42,9 @@ class Access(Protocol):
     def robot_of(self, peer: bytes) -> bytes:
         """The robot of this connection. A robot may have several connections."""
 
+    def name_of(self, robot: bytes) -> str:
+        """The name of a robot, for people."""
+
     def shut_out(self, peer: bytes, seconds: float) -> str:
         """Refuse new connections of this robot for a while; returns its name."""
 
@@ -57,6 +60,9 @@ class Everyone:
 
     def robot_of(self, peer: bytes) -> bytes:
         return peer
+
+    def name_of(self, robot: bytes) -> str:
+        return f"connection {robot.hex()[-8:]}" if robot else "all others"
 
     def shut_out(self, peer: bytes, seconds: float) -> str:  # noqa: ARG002 - it cannot be recognised
         return "robot without a key"
@@ -95,7 +101,8 @@ class Authorisation:
         for problem in self._reload():
             raise ConfigError(f"--robots: {problem}")
         if not self._known:
-            log.warning("--robots: %s holds no public key (*%s) yet: no robot can connect", folder, PUBLIC)
+            text = "--robots: %s holds no public key (*%s) yet: no robot can connect; remedy: copy keys there"
+            log.warning(text, folder, PUBLIC)
         self._socket = context.socket(zmq.REP)
         self._socket.bind(ZAP)
         threading.Thread(target=self._run, name="robots", daemon=True).start()
@@ -116,6 +123,9 @@ class Authorisation:
     def robot_of(self, peer: bytes) -> bytes:
         connection = self._connections.get(peer)
         return peer if connection is None else connection.user.encode()
+
+    def name_of(self, robot: bytes) -> str:
+        return self._known.get(robot.decode(errors="replace"), "all others")
 
     def shut_out(self, peer: bytes, seconds: float) -> str:
         connection = self._connections.get(peer)
@@ -149,7 +159,7 @@ class Authorisation:
         problems = self._reload()
         for problem in problems:
             if problem not in self._problems:
-                log.warning("--robots: %s", problem)
+                log.warning("--robots: %s; remedy: correct or remove it", problem)
         self._problems = problems
         for peer, connection in list(self._connections.items()):
             if connection.user not in self._known:
@@ -211,7 +221,8 @@ class Authorisation:
             self._last_warning = now
             where = asked[3].decode(errors="replace") if well_formed else "?"
             why = "was cut off a moment ago" if user in self._known else f"is not in {self._folder}"
-            log.warning("refused a robot at %s: its key %s %s", where, user, why)
+            text = "refused a robot at %s: its key %s %s; remedy: if it is yours, copy its robot.key there"
+            log.warning(text, where, user, why)
         return [ZAP_VERSION, request_id, b"400", b"unknown robot", b"", b""]
 
     def _cut_off(self, peer: bytes, connection: _Connection) -> None:
@@ -221,7 +232,10 @@ class Authorisation:
         self._cut[peer] = None
         while len(self._cut) > CUT_KEPT:
             del self._cut[next(iter(self._cut))]
-        log.warning("cut off robot %s: its key is no longer in %s", connection.name, self._folder)
+        text = (
+            "cut off robot %s: its key is no longer in %s; remedy: if it is yours, copy its key there again"
+        )
+        log.warning(text, connection.name, self._folder)
         end(connection.file, connection.other_end)
 
 

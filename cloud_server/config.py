@@ -7,6 +7,7 @@ from pathlib import Path
 
 from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError
+from offboard.common.host.logs import JSON, LEVELS, TEXT
 from offboard.common.security.exposure import OPEN_REMEDY, on_loopback
 
 MIB = 1024 * 1024
@@ -80,7 +81,14 @@ class ServerConfig:
         "info",
         "least severe messages that are logged",
         group=OUTPUT,
-        choices=("debug", "info", "warning", "error"),
+        choices=LEVELS,
+    )
+    log_format: str = setting(
+        TEXT,
+        "form of the lines of the log: text, or a JSON object each",
+        group=OUTPUT,
+        rare=True,
+        choices=(TEXT, JSON),
     )
     worker_memory: int = setting(
         2048,

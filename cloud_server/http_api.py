@@ -8,23 +8,27 @@ import dataclasses
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable, Generator
 from typing import Any
 
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
 
 from offboard.cloud_server.config import ServerConfig
-from offboard.cloud_server.metrics import Status
+from offboard.cloud_server.metrics import Metrics, ServerLive, Status
+from offboard.cloud_server.server import Server
 from offboard.common import VERSION, tasks
 from offboard.common.config import as_dict
 from offboard.common.errors import ConfigError, MissingExtra
+from offboard.common.live.live_files import DOCS_PATHS, LOOKS, PATHS
+from offboard.common.live.live_pages import LivePages
+from offboard.common.live.look import EVERY_S, Look, Source, Viewers, encode
 from offboard.common.security.http_guard import HttpGuard
 from offboard.common.token_bucket import Bucket
 
 try:
     import uvicorn
     from fastapi import FastAPI, Request, Response
-    from fastapi.responses import JSONResponse, PlainTextResponse
+    from fastapi.responses import JSONResponse, PlainTextResponse, StreamingResponse
 
     from offboard.common.security.bounded_http import BoundedHttp
 except ImportError as error:
@@ -33,20 +37,20 @@ except ImportError as error:
 CONNECTIONS_A_S, CONNECTIONS_AT_ONCE = 100, 512  # new connections per second, and at once
 STALL_S = 2.0  # a turn of the server's loop takes at most 0.5 s
 STOP_S = 2.0
+LOOKS_A_STREAM = 8  # then the page asks again: `bounded_http` ends a request that takes 10 s
 TICKS, UVICORN_TICK_S = 5, 0.1  # five of uvicorn's ten ticks per second are done at once
 
 
-def make_http(
-    config: ServerConfig, status: Callable[[], Status], registry: CollectorRegistry, *, token: str | None
-) -> "HttpServer":
+def make_http(config: ServerConfig, metrics: Metrics, server: Server, *, token: str | None) -> "HttpServer":
     """The HTTP server of the process, bound to its address but not started."""
     app = create_app(
-        status,
-        registry,
+        server.status,
+        metrics.registry,
         as_dict(config),
         token=token,
         loopback=config.http_on_loopback,
         insecure=bool(config.open_ways),
+        live=ServerLive(metrics, server.status, server.robots, config.workers),
     )
     return HttpServer(app, config.http_address)
 
@@ -59,14 +63,20 @@ def create_app(
     token: str | None = None,
     loopback: bool = True,
     insecure: bool = False,
+    live: Source | None = None,
 ) -> FastAPI:
     """The routes, which change nothing. `status` is called once per request, in the HTTP thread.
 
-    With a `token`, every request needs it, except for health, readiness and, on `loopback`, the metrics.
+    With a `token`, every request needs it, except for health, readiness, the pages without their data and, on
+    `loopback`, the metrics. `live`: what /live shows; None: there is no such page.
     """
-    app = FastAPI(title="Offboard cloud server", version=VERSION, redoc_url=None)
+    app = FastAPI(title="Offboard cloud server", version=VERSION, docs_url=None, redoc_url=None)
     open_paths = ("/health", "/ready", *(["/metrics"] if loopback else []))
-    app.add_middleware(HttpGuard, token=token, open_paths=open_paths, loopback=loopback)
+    pages = DOCS_PATHS if live is None else PATHS
+    app.add_middleware(LivePages, paths=pages)
+    app.add_middleware(HttpGuard, token=token, open_paths=open_paths, pages=pages, loopback=loopback)
+    if live is not None:
+        add_looks(app, live)
 
     @app.get("/health", summary="200 while the server works; version and details with the token")
     async def health(request: Request) -> JSONResponse:
@@ -102,6 +112,28 @@ def create_app(
     return app
 
 
+def add_looks(app: FastAPI, live: Source) -> None:
+    """The stream that the page /live reads."""
+    viewers = Viewers()
+    app.state.closing = False
+
+    async def send(looks: Generator[Look]) -> AsyncIterator[bytes]:
+        with viewers.one(looks):
+            for _ in range(LOOKS_A_STREAM):
+                yield encode(next(looks))
+                await asyncio.sleep(EVERY_S)
+                if app.state.closing:
+                    return
+
+    @app.get(LOOKS, include_in_schema=False)  # a stream, which takes seconds to end
+    async def looks() -> Response:
+        if viewers.full:
+            return PlainTextResponse(Viewers.REFUSAL, 503)
+        # The connection is closed, so that its time limit is that of this one stream.
+        headers = {"connection": "close"}
+        return StreamingResponse(send(live.looks()), media_type="text/event-stream", headers=headers)
+
+
 class PacedHttp(BoundedHttp):
     """Accepts a limited number of connections per second, so that HTTP does not take time from the robots."""
 
@@ -133,6 +165,7 @@ class HttpServer:
     """Serves an app in a daemon thread, from `start` until `close`."""
 
     def __init__(self, app: FastAPI, address: tuple[str, int]) -> None:
+        self._app = app
         self._socket = _listen(address)
         host, port = self._socket.getsockname()[:2]
         self.address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
@@ -156,6 +189,7 @@ class HttpServer:
         self._thread.start()
 
     def close(self) -> None:
+        self._app.state.closing = True  # ends the streams of open pages
         self._server.should_exit = True
         if self._thread.is_alive():
             self._thread.join(2 * STOP_S)

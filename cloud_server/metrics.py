@@ -3,10 +3,18 @@
 `http_api` shows them.
 """
 
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Generator
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 
+from offboard.common.live.look import Look
+
+COUNTED_S = 10.0  # after the last look
+ROBOTS_MAX = 256  # robots that the page /live tells apart; further ones are counted together
+OTHERS = b""  # the name of the further ones
 SECONDS_BUCKETS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30)
 
 
@@ -23,36 +31,120 @@ class Status:
     last_task_age_s: float | None
 
 
+@dataclass(slots=True)
+class RobotUse:
+    """What one robot asked of this server since it is counted."""
+
+    tasks: int = 0
+    queue_s: float = 0.0
+    run_s: float = 0.0
+    refused: int = 0
+
+
+class RobotUses:
+    """What each robot asks of this server, counted only while somebody looks at the page /live.
+
+    counting: whether a use must be noted.
+    """
+
+    def __init__(self) -> None:
+        self.counting = False
+        self._until_s = 0.0
+        self._uses: dict[bytes, RobotUse] = {}
+
+    def look(self) -> None:
+        """Somebody looks. Counting ends COUNTED_S after the last look: a page asks for a new stream often."""
+        self._until_s = time.monotonic() + COUNTED_S
+        self.counting = True
+
+    def of(self, robot: bytes) -> RobotUse:
+        if time.monotonic() > self._until_s:
+            self.counting = False
+            self._uses = {}
+            return RobotUse()  # for the last robot that is noted, and then forgotten
+        if robot not in self._uses and len(self._uses) >= ROBOTS_MAX:
+            robot = OTHERS
+        return self._uses.setdefault(robot, RobotUse())
+
+    def counted(self) -> dict[bytes, dict[str, Any]]:
+        return {robot: asdict(use) for robot, use in self._uses.items()}
+
+
 class Metrics:
     """The Prometheus metrics of one server, in a registry of their own."""
 
     def __init__(self) -> None:
+        self.robots = RobotUses()
         r = self.registry = CollectorRegistry()
-        self.requests = Counter("offboard_requests", "Requests by outcome", ["kind", "status"], registry=r)
-        self.queue_depth = Gauge("offboard_queue_depth", "Requests waiting for a worker", registry=r)
-        self.running = Gauge("offboard_running", "Tasks running", registry=r)
+        self.requests = Counter(
+            "offboard_server_requests", "Requests by outcome", ["kind", "status"], registry=r
+        )
+        self.queue_depth = Gauge(
+            "offboard_server_waiting_requests", "Requests waiting for a worker", registry=r
+        )
+        self.running = Gauge("offboard_server_running_tasks", "Tasks running", registry=r)
         self.queue_s = Histogram(
-            "offboard_queue_seconds",
+            "offboard_server_queue_seconds",
             "Time from arrival to start",
             ["kind"],
             buckets=SECONDS_BUCKETS,
             registry=r,
         )
         self.run_s = Histogram(
-            "offboard_run_seconds", "Time in the worker", ["kind"], buckets=SECONDS_BUCKETS, registry=r
+            "offboard_server_run_seconds", "Time in the worker", ["kind"], buckets=SECONDS_BUCKETS, registry=r
         )
-        self.bytes_in = Counter("offboard_bytes_in", "Bytes of messages received", registry=r)
-        self.bytes_out = Counter("offboard_bytes_out", "Bytes of messages sent", registry=r)
-        self.blob_bytes = Gauge("offboard_blob_bytes", "Bytes of stored large arguments", registry=r)
-        self.load = Gauge("offboard_load", "Share of the CPU that other programs take", registry=r)
-        self.capacity = Gauge("offboard_capacity", "Share of one CPU that a task may use", registry=r)
+        self.bytes_in = Counter("offboard_server_received_bytes", "Bytes of messages received", registry=r)
+        self.bytes_out = Counter("offboard_server_sent_bytes", "Bytes of messages sent", registry=r)
+        self.blob_bytes = Gauge("offboard_server_blob_bytes", "Bytes of stored large arguments", registry=r)
+        self.load = Gauge(
+            "offboard_server_other_load_ratio", "Share of the CPU that other programs take", registry=r
+        )
+        self.capacity = Gauge(
+            "offboard_server_task_cpu_ratio", "Share of one CPU that a task may use", registry=r
+        )
         self.dropped = Counter(
-            "offboard_dropped", "Messages and replies that were dropped", ["reason"], registry=r
+            "offboard_server_dropped_messages",
+            "Messages and replies that were dropped",
+            ["reason"],
+            registry=r,
         )
-        self.refused = Counter("offboard_refused", "Handshakes with an unknown key", registry=r)
+        self.refused = Counter(
+            "offboard_server_refused_handshakes", "Handshakes with an unknown key", registry=r
+        )
         self.cut_off = Counter(
-            "offboard_cut_off", "Connections closed because they sent too much", registry=r
+            "offboard_server_cut_off_connections", "Connections closed because they sent too much", registry=r
         )
         self.restarts = Counter(
-            "offboard_executor_restarts", "Workers that died and were replaced", ["reason"], registry=r
+            "offboard_server_worker_restarts", "Workers that died and were replaced", ["reason"], registry=r
         )
+
+
+class ServerLive:
+    """The source of the server's page /live. `robots`: what each robot asks of the server."""
+
+    def __init__(
+        self,
+        metrics: Metrics,
+        status: Callable[[], Status],
+        robots: Callable[[], list[dict[str, Any]]],
+        workers: int,
+    ) -> None:
+        self._metrics = metrics
+        self._status = status
+        self._robots = robots
+        self._workers = workers
+
+    def looks(self) -> Generator[Look]:
+        while True:
+            self._metrics.robots.look()
+            state = {"workers": self._workers, "robots": self._robots(), "samples": self._samples()}
+            yield Look("server", time.time(), server={**asdict(self._status()), **state})
+
+    def _samples(self) -> list[tuple[str, dict[str, str], float]]:
+        """Every metric but the buckets of histograms: name, labels, value."""
+        return [
+            (sample.name, dict(sample.labels), sample.value)
+            for family in self._metrics.registry.collect()
+            for sample in family.samples
+            if not sample.name.endswith(("_bucket", "_created"))
+        ]

@@ -83,7 +83,8 @@ class ReaderThreads:
         try:
             self._start(self._answered(here, outcome))
         except Exception:  # as in the callback of a future: the leading thread must go on
-            log.exception("task %d of kind %s could not be answered", here.request.id, here.request.kind)
+            text = "task %d of kind %s could not be answered; remedy: report this traceback"
+            log.exception(text, here.request.id, here.request.kind)
         return True
 
     def _start(self, chosen: list[Work]) -> None:

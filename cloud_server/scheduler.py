@@ -6,7 +6,7 @@ the lock of the channel.
 
 import logging
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from dataclasses import dataclass, replace
 
 from offboard.cloud_server.authorisation import Access
@@ -83,6 +83,9 @@ class Scheduler:
     @property
     def running(self) -> int:
         return len(self._running)
+
+    def waiting_by_robot(self) -> Counter[bytes]:
+        return Counter(work.robot for work in self._queue)
 
     def request(self, peer: bytes, request: Request) -> None:
         """Put a request into the queue, or answer why not."""
@@ -191,9 +194,14 @@ class Scheduler:
                 traceback=outcome.traceback,
             )  # fmt: skip
             self._sender.send(work.peer, reply)
-        self._count(request, outcome.status if work.wanted else "cancelled")
+        self._count(request, outcome.status if work.wanted else "cancelled", work.queue_s, outcome.run_s)
         self._metrics.queue_s.labels(request.kind).observe(work.queue_s)
         self._metrics.run_s.labels(request.kind).observe(outcome.run_s)
+        if self._metrics.robots.counting:
+            use = self._metrics.robots.of(work.robot)
+            use.tasks += 1
+            use.queue_s += work.queue_s
+            use.run_s += outcome.run_s
 
     def give_up(self) -> int:
         """Answer the waiting requests with `busy`; returns how many requests were waiting or running.
@@ -208,17 +216,23 @@ class Scheduler:
 
     def refuse(self, peer: bytes, request: Request, why: Refusal) -> None:
         """Answer a request that does not run."""
-        self._count(request, why.status)
+        self._count(request, why.status, why.queue_s)
+        if self._metrics.robots.counting and why.status != "need_blob":  # the robot sends that one again
+            self._metrics.robots.of(self._access.robot_of(peer)).refused += 1
         reply = Reply(
             request.id, why.status, why.error,
             queue_s=why.queue_s, queue_depth=len(self._queue), missing=why.missing,
         )  # fmt: skip
         self._sender.send(peer, reply)
 
-    def _count(self, request: Request, status: str) -> None:
+    def _count(self, request: Request, status: str, queue_s: float = 0.0, run_s: float = 0.0) -> None:
         # A robot can send any name. A label for each of them would take memory without limit.
         kind = "unknown" if status == "unknown_task" else request.kind
         self._metrics.requests.labels(kind, status).inc()
+        if log.isEnabledFor(logging.DEBUG):
+            text = "task %d of kind %s: %s after %.6f s of waiting and %.6f s of running"
+            fields = {"id": request.id, "kind": kind, "status": status, "queue_s": queue_s, "run_s": run_s}
+            log.debug(text, request.id, kind, status, queue_s, run_s, extra={"task": fields})
 
 
 class CrashCount:
@@ -251,7 +265,7 @@ class FailureLog:
             return
         self._logged.add(failure)
         log.warning(
-            "task %s failed; its next failures with %s are not logged\n%s",
+            "task %s failed; its next failures with %s are not logged; remedy: correct the task\n%s",
             *failure,
             outcome.traceback.rstrip(),
         )

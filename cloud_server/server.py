@@ -7,15 +7,16 @@ import logging
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import zmq
 
 from offboard.cloud_server.authorisation import Access, Authorisation, Everyone
 from offboard.cloud_server.executors import Executor
 from offboard.cloud_server.fair_queue import Work
-from offboard.cloud_server.metrics import Metrics, Status
+from offboard.cloud_server.metrics import Metrics, RobotUse, Status
 from offboard.cloud_server.rate_limit import CUT_OFF_S, RateLimit, Verdict
 from offboard.cloud_server.reader_threads import ReaderThreads
 from offboard.cloud_server.robot_socket import ReplySender, bind_router
@@ -153,6 +154,16 @@ class Server:
             last_task_age_s=None if last_task is None else now - last_task,
         )
 
+    def robots(self) -> list[dict[str, Any]]:
+        """What each robot asked of this server since it is counted, and how many of its tasks wait now."""
+        with self._channel.lock:
+            uses, waiting = self.metrics.robots.counted(), self._scheduler.waiting_by_robot()
+        nothing = asdict(RobotUse())
+        return [
+            {"robot": self._access.name_of(robot), **uses.get(robot, nothing), "waiting": waiting[robot]}
+            for robot in dict.fromkeys([*uses, *waiting])
+        ]
+
     def _turn(self) -> list[Work]:
         """Wait for messages and read them; returns the work to start."""
         self._channel.wait(POLL_S)
@@ -174,7 +185,8 @@ class Server:
             error = self._warming.exception()
             if error is not None:
                 if isinstance(error, TaskFailed):
-                    log.error("the server cannot start\n%s", error.traceback.rstrip())
+                    text = "the server cannot start; remedy: correct the setup of that task\n%s"
+                    log.error(text, error.traceback.rstrip())
                 raise OffloadError(
                     str(error) if isinstance(error, OffloadError) else describe(error)
                 ) from error
@@ -224,7 +236,11 @@ class Server:
         self.metrics.cut_off.inc()
         name, address = self._access.shut_out(peer, CUT_OFF_S), other_end(file)
         log.warning(
-            "cut off %s at %s for %g s: it sends far more than --robot-mib-s allows", name, address, CUT_OFF_S
+            "cut off %s at %s for %g s: it sends far more than --robot-mib-s allows; "
+            "remedy: if it is yours, raise --robot-mib-s",
+            name,
+            address,
+            CUT_OFF_S,
         )
         end(file, address)
 
@@ -284,7 +300,8 @@ class Server:
         self.metrics.dropped.labels(reason).inc()
         if self._last_turn - self._last_warning >= LOG_PAUSE_S:
             self._last_warning = self._last_turn
-            log.warning("dropped a message: %s (others within %g s are not logged)", error, LOG_PAUSE_S)
+            text = "dropped a message: %s (others within %g s are not logged); remedy: find out who sends it"
+            log.warning(text, error, LOG_PAUSE_S)
 
     def _over(self) -> bool:
         """True if the server may stop: it is drained, or the time for that is over."""

@@ -60,7 +60,8 @@ class UnreadLimit:
             self._lowest = self._resident_bytes()
             threading.Thread(target=self._run, name="unread-limit", daemon=True).start()
         else:
-            log.warning("%s does not exist: the memory for unread messages is not limited", STATM)
+            text = "%s does not exist: the memory for unread messages is not limited; remedy: mount /proc"
+            log.warning(text, STATM)
 
     def took(self, file: int, sizes: Iterable[int]) -> None:
         """A message with frames of these sizes was read. Called by one thread at a time."""
@@ -101,7 +102,8 @@ class UnreadLimit:
         for file in self._too_many(unread):
             self._metrics.cut_off.inc()
             log.warning(
-                "cut off %s: it sent %d bytes more than could be read",
+                "cut off %s: it sent %d bytes more than could be read; "
+                "remedy: if it is your robot, raise --message-mib and --blob-mib",
                 self._seen[file].other_end,
                 unread[file],
             )

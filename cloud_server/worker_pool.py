@@ -126,7 +126,8 @@ class WorkerPool:
                 return
         if death.reason != "closed":
             frames = f"\n{death.failure.traceback.rstrip()}" if death.failure else ""
-            log.warning("worker %d %s; another worker takes its place%s", worker.pid, death, frames)
+            text = "worker %d %s; another worker takes its place; remedy: correct its task, or its limits%s"
+            log.warning(text, worker.pid, death, frames)
             self._changed(death.reason)
 
 

@@ -37,6 +37,9 @@ class RunConfig:
         group=SCENARIO,
         choices=("local", "docker"),
     )
+    watch: bool = setting(
+        False, "show the run on a page while it goes on, and open it in a browser", group=SCENARIO
+    )
     measure: str = setting(
         "scenario",
         "run each task as the scenario says, or on both sites",
@@ -82,6 +85,7 @@ def _run(argv: Sequence[str]) -> int:
     flags = parser.parse_args(argv)
     config = resolve(RunConfig, flags, environ=os.environ, prefix=PREFIX)
     from offboard.loadgen.play.play_scenario import play
+    from offboard.loadgen.play.watch import Page
 
     _find_modules_here()
     path = find_scenario(flags.scenario)
@@ -93,10 +97,21 @@ def _run(argv: Sequence[str]) -> int:
         predictor=config.predictor,
     )
     check_calls(scenario, path)
-    played = play(scenario, config.out, config.testbed)
+    page = Page.OPENED if config.watch else Page.NONE
+    played = play(scenario, config.out, config.testbed, page=page)
     played.check_robots()
     played.check_verdicts()
     return 0
+
+
+def _watch(argv: Sequence[str]) -> int:
+    from offboard.loadgen.play.watch import WatchConfig, run_watch
+
+    parser = _parser("watch", "DIR")
+    parser.add_argument("run", type=Path, metavar="DIR", help="folder of a run, which may still go on")
+    add_flags(parser, WatchConfig, PREFIX)
+    flags = parser.parse_args(argv)
+    return run_watch(flags.run, resolve(WatchConfig, flags, environ=os.environ, prefix=PREFIX))
 
 
 def _compare(argv: Sequence[str]) -> int:
@@ -129,12 +144,18 @@ def _replay(argv: Sequence[str]) -> int:
 def _report(argv: Sequence[str]) -> int:
     from offboard.loadgen.report.report import ReportConfig, run_report
 
-    parser = _parser("report", "DIR")
-    parser.add_argument("run", type=Path, metavar="DIR", help="folder of a run, or a trace or CSV file")
+    parser = _parser("report", "DIR ...")
+    help = "folder of a run, or a trace or CSV file; several folders or traces are compared"
+    parser.add_argument("runs", type=Path, metavar="DIR", nargs="+", help=help)
     add_flags(parser, ReportConfig, PREFIX)
     flags = parser.parse_args(argv)
     _find_modules_here()
-    return run_report(flags.run, resolve(ReportConfig, flags, environ=os.environ, prefix=PREFIX))
+    config = resolve(ReportConfig, flags, environ=os.environ, prefix=PREFIX)
+    if len(flags.runs) == 1:
+        return run_report(flags.runs[0], config)
+    from offboard.loadgen.report.run_comparison import run_comparison
+
+    return run_comparison(flags.runs, config)
 
 
 def _dataset(argv: Sequence[str]) -> int:
@@ -229,10 +250,13 @@ def _find_modules_here() -> None:
 COMMANDS = {
     "demo": Command("make 350 plans on a real map, with three processes on loopback, and Table II", _demo),
     "run": Command("play a scenario, and judge its checks", _run),
+    "watch": Command("show a run on a page, while it goes on or later, with a time slider", _watch),
     "compare": Command("play scenarios with several policies and seeds, and compare the policies", _compare),
     "table": Command("make Table II of the paper from a trace or CSV file", _table),
     "replay": Command("show what each policy would have done with the tasks of a trace or CSV file", _replay),
-    "report": Command("make an HTML page and PNG charts of a run", _report),
+    "report": Command(
+        "make an HTML page and PNG charts of a run, or a page that compares several runs", _report
+    ),
     "dataset": Command(
         "measure the plans of a scenario on both sites, and write them as a CSV file", _dataset
     ),

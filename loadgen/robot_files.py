@@ -47,7 +47,7 @@ def read_fields(path: Path, names: Sequence[str]) -> Iterator[dict[str, Any]]:
     with file:
         for number, line in enumerate(file, 1):
             if not line.endswith(b"\n"):
-                log.warning("%s:%d: torn last line skipped", path, number)
+                log.warning("%s:%d: torn last line skipped; remedy: none, a crash had torn it", path, number)
                 return
             yield _parse(f"{path}:{number}", line, names)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 HERE = Path(__file__).parent
 EXTRAS = {
     "robot": ["planning"],
-    "cloud": ["planning", "cloud"],
+    "cloud": ["planning", "cloud", "live"],
     "bench": ["bench"],
     "dev": ["dev"],
     "peers": ["peers"],

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
 from offboard.common.errors import ConfigError
+from offboard.common.live.robot_live import RobotLive
 from offboard.common.tasks import Task, kind_of
 from offboard.robot_client import policies
 from offboard.robot_client.execution.batch import Batch, Placed, arguments
@@ -150,6 +151,8 @@ class Offloader:
             )
             opened.pop_all()
         offload._life.recording = recording
+        if recording.live is not None:
+            offload.show_on(recording.live)
         offload._life.close_when_dropped(offload)
         return offload
 
@@ -260,6 +263,10 @@ class Offloader:
         """
         self._life.refuse_in_fork()
         return wait_for_sites(self._runners, kind_of(function), timeout_s)
+
+    def show_on(self, live: RobotLive[Record]) -> None:
+        """Show these sites and this allowance on a live page, next to the records that it gets."""
+        live.show(self._runners, self._allowance)
 
     def close(self) -> None:
         """Close all runners, trace and metrics, and save what was learnt. Safe to call twice."""

@@ -30,7 +30,8 @@ def kernel(function: F) -> F:
     try:
         return cast(F, numba.njit(nogil=True, cache=True)(function))
     except RuntimeError as error:  # no folder to write the cache to, as in a read-only container
-        log.warning("every process compiles %s anew: %s; set NUMBA_CACHE_DIR", function.__name__, error)
+        text = "every process compiles %s anew: %s; remedy: set NUMBA_CACHE_DIR to a folder for the cache"
+        log.warning(text, function.__name__, error)
         return cast(F, numba.njit(nogil=True)(function))
 
 

@@ -58,7 +58,7 @@ def _read_ros(path: Path) -> GridMap:
         if occupancy[GREY_UNKNOWN] == FREE and (grey == GREY_UNKNOWN).any():
             log.warning(
                 "%s: pixels of grey %d usually mean unknown, but free_thresh %g makes them free; "
-                "lower it to 0.196 if they are unknown", path, GREY_UNKNOWN, free,
+                "remedy: lower it to 0.196 if they are unknown", path, GREY_UNKNOWN, free,
             )  # fmt: skip
         cells[~opaque] = UNKNOWN
     return GridMap(cells[::-1], resolution, origin)

@@ -25,12 +25,15 @@ def on_loopback(host: str) -> bool:
 
 def warn_each_minute(open_ways: Iterable[str]) -> None:
     """Log what is open to anyone, now and once a minute, in a thread that lives as long as the process."""
-    text = f"--insecure: {'; '.join(open_ways)}: anyone who can reach this process may use it"
+    ways = "; ".join(open_ways)
 
     def warn() -> None:
         again = threading.Event()
         while True:
-            log.warning("%s", text)
+            text = (
+                "--insecure: %s: anyone who can reach this process may use it; remedy: set the missing flags"
+            )
+            log.warning(text, ways)
             again.wait(INSECURE_WARNING_S)
 
     threading.Thread(target=warn, name="insecure", daemon=True).start()

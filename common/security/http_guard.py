@@ -12,18 +12,16 @@ from urllib.parse import urlsplit
 from offboard.common.security.exposure import on_loopback
 
 _CSP = "default-src 'none'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
-# FastAPI's page /docs has an inline script, and loads Swagger from this site.
-_CDN, _ICON = "https://cdn.jsdelivr.net", "https://fastapi.tiangolo.com"
-_DOCS_CSP = (
-    f"{_CSP}; script-src {_CDN} 'unsafe-inline'; style-src {_CDN} 'unsafe-inline'; "
-    f"img-src data: {_ICON}; connect-src 'self'"
+# Of our own pages. The library for charts sets styles inline, and makes pictures from data.
+PAGE_CSP = (
+    f"{_CSP}; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; connect-src 'self'"
 )
-_HEADERS = (
-    (b"x-content-type-options", b"nosniff"),
-    (b"x-frame-options", b"DENY"),
-    (b"cache-control", b"no-store"),
-    (b"referrer-policy", b"no-referrer"),
-)
+HEADERS = {
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+    "referrer-policy": "no-referrer",
+}
+_NO_CACHE = (b"cache-control", b"no-store")
 
 Message = dict[str, Any]
 Send = Callable[[Any], Awaitable[None]]
@@ -36,15 +34,23 @@ class HttpGuard:
     The app behind it reads `request.state.trusted`: True if the client may see everything.
 
     Parameters: without a `token` every client is trusted. `open_paths` need no token, but their clients are
-    not trusted. Set `loopback` if the server listens on loopback only.
+    not trusted. `pages` are our own web pages and their files; they hold no data and need no token. Set
+    `loopback` if the server listens on loopback only.
     """
 
     def __init__(
-        self, app: Any, *, token: str | None = None, open_paths: Collection[str] = (), loopback: bool = True
+        self,
+        app: Any,
+        *,
+        token: str | None = None,
+        open_paths: Collection[str] = (),
+        pages: Collection[str] = (),
+        loopback: bool = True,
     ) -> None:
         self._app = app
         self._token = None if token is None else token.encode()
-        self._open_paths = open_paths
+        self._open_paths = (*open_paths, *pages)
+        self._pages = pages
         self._loopback = loopback
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
@@ -55,13 +61,17 @@ class HttpGuard:
 
         async def send_guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
-                csp = _DOCS_CSP if path == "/docs" else _CSP
-                own = [*_HEADERS, (b"content-security-policy", csp.encode())]
-                message = {**message, "headers": [*message.get("headers", ()), *own]}
+                given = message.get("headers", ())
+                own = {**HEADERS, "content-security-policy": PAGE_CSP if path in self._pages else _CSP}
+                added = [(name.encode(), value.encode()) for name, value in own.items()]
+                added += () if any(name == _NO_CACHE[0] for name, _ in given) else (_NO_CACHE,)
+                message = {**message, "headers": [*given, *added]}
             await send(message)
 
         trusted = self._trusts(headers.get(b"authorization", b""))
-        if self._from_foreign_page(headers):
+        host, origin = (_text(headers.get(name)) for name in (b"host", b"origin"))
+        tokenless = self._loopback and self._token is None
+        if from_foreign_page(host, origin, loopback_only=tokenless):
             await _refuse(send_guarded, 403, "requests from other web pages are refused")
         elif not trusted and path not in self._open_paths:
             await _refuse(send_guarded, 401, "send the token in a header: Authorization: Bearer TOKEN")
@@ -75,18 +85,20 @@ class HttpGuard:
             return True
         return hmac.compare_digest(token.strip(), self._token) and scheme.lower() == b"bearer"
 
-    def _from_foreign_page(self, headers: dict[bytes, bytes]) -> bool:
-        """True if a browser sent this request for a web page of another site.
 
-        Browsers name the page's origin. On loopback without a token the Host header must be this computer
-        too: a foreign site can make its own name resolve to 127.0.0.1 (DNS rebinding).
-        """
-        host = headers.get(b"host")
-        origin = headers.get(b"origin")
-        if origin is not None and origin.partition(b"://")[2] != host:
-            return True
-        tokenless = self._loopback and self._token is None
-        return tokenless and host is not None and not on_loopback(_name(host.decode("latin-1")))
+def from_foreign_page(host: str | None, origin: str | None, *, loopback_only: bool) -> bool:
+    """True if a browser sent a request with these headers for a web page of another site.
+
+    Browsers name the page's origin. With `loopback_only` the Host header must be this computer too: a foreign
+    site can make its own name resolve to 127.0.0.1 (DNS rebinding).
+    """
+    if origin is not None and origin.partition("://")[2] != host:
+        return True
+    return loopback_only and host is not None and not on_loopback(_name(host))
+
+
+def _text(header: bytes | None) -> str | None:
+    return None if header is None else header.decode("latin-1")
 
 
 def _name(host: str) -> str:

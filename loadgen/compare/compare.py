@@ -11,18 +11,20 @@ from statistics import median
 
 from offboard.common.errors import ConfigError
 from offboard.loadgen.compare.compare_settings import CompareConfig, split_strategy
-from offboard.loadgen.compare.comparison_table import comparison_table
+from offboard.loadgen.compare.comparison_table import HEADINGS, comparison_table
 from offboard.loadgen.compare.resume import play_once
 from offboard.loadgen.compare.simulated_tables import simulated
 from offboard.loadgen.play.stolen_cpu_time import NOTED_PERCENT
+from offboard.loadgen.progress import Progress, progress
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import check_calls, find_scenario, read_scenario
-from offboard.loadgen.table.table_formats import Table, render
+from offboard.loadgen.table.table_formats import Table
 
 
 def run_compare(names: Sequence[str], config: CompareConfig) -> int:
     """Play all scenarios, then print one table for each to stdout. Progress lines go to stderr."""
+    config.check_columns(HEADINGS, config.format)
     paths = [find_scenario(name) for name in names]
     scenarios = [
         read_scenario(path).changed(
@@ -38,12 +40,14 @@ def run_compare(names: Sequence[str], config: CompareConfig) -> int:
     if config.simulate:
         sys.stdout.write(simulated(scenarios, config))
     else:
-        sys.stdout.write(render([compare(scenario, config) for scenario in scenarios], config.format))
+        with progress("runs", len(scenarios) * config.seeds * len(config.policies)) as shown:
+            tables = [compare(scenario, config, shown) for scenario in scenarios]
+        sys.stdout.write(config.text(tables, config.format))
     return 0
 
 
-def compare(scenario: Scenario, config: CompareConfig) -> Table:
-    """Play the scenario once for each seed and policy; the table of all policies."""
+def compare(scenario: Scenario, config: CompareConfig, shown: Progress) -> Table:
+    """Play the scenario once for each seed and policy; the table of all policies. Each run is a step."""
     runs: dict[str, list[Outcome]] = {policy: [] for policy in config.policies}
     stolen: dict[str, float] = {}
     for n in range(config.seeds):
@@ -55,6 +59,7 @@ def compare(scenario: Scenario, config: CompareConfig) -> Table:
             changed = scenario.changed(seed=seed, policy=chosen, predictor=predictor)
             played = play_once(changed, out, config.testbed, config.stolen_max)
             runs[policy].append(played.outcome.of(scenario.compared()).between(config.from_task))
+            shown.step()
             if played.stolen_percent is not None:
                 stolen[out.name] = played.stolen_percent
     return replace(comparison_table(scenario, config, runs), notes=_stolen_notes(stolen))

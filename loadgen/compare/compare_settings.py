@@ -8,6 +8,7 @@ from offboard.common.errors import ConfigError
 from offboard.loadgen import rivals
 from offboard.loadgen.compare.resume import PLAYS_MAX
 from offboard.loadgen.play.play_scenario import TESTBEDS
+from offboard.loadgen.table.table_columns import ColumnSettings
 from offboard.loadgen.table.table_formats import FORMATS
 from offboard.robot_client import policies
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
@@ -18,7 +19,7 @@ SIMULATION = "simulation"
 
 
 @dataclass(frozen=True)
-class CompareConfig:
+class CompareConfig(ColumnSettings):
     """What is compared, and where the runs are played."""
 
     policies: tuple[str, ...] = setting(

@@ -3,7 +3,6 @@
 It starts from the outcomes of the runs; `compare` plays them, `simulated_tables` simulates them.
 """
 
-import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 
 from offboard.loadgen.compare.compare_settings import SIMULATION, CompareConfig
 from offboard.loadgen.compare.machine_speed import at_one_speed, speed_slope
+from offboard.loadgen.progress import progress
 from offboard.loadgen.scenario.interval_coverage import interval_columns, interval_figures
 from offboard.loadgen.scenario.outage_recovery import median_recovery
 from offboard.loadgen.scenario.outcome import Answered, Outcome
@@ -80,6 +80,10 @@ HEADINGS: dict[str, Heading] = {
     "time_over_oracle": Heading("time / oracle", "time / oracle", 3),
     "regret_ms": Heading("regret ms", "regret ms", 1),
 }
+FIRST = (  # the most important columns
+    *("tasks", "lost", "mean_ms", "over_first", "p95_ms", "p99_ms"),
+    *("late_percent", "cloud_percent", "time_over_oracle", "recovery"),
+)
 
 
 def comparison_table(
@@ -93,8 +97,11 @@ def comparison_table(
     `each` is `map`, or a replacement that uses several processes.
     """
     names, first = config.policies, runs[config.policies[0]]
-    found = each(_lines, names, [runs[name] for name in names], [first for _ in names])
-    lines = list(itertools.chain.from_iterable(found))
+    lines: list[Line] = []
+    with progress("bootstrap", len(names)) as shown:
+        for found in each(_lines, names, [runs[name] for name in names], [first for _ in names]):
+            lines.extend(found)
+            shown.step()
     span = f", counted from task {config.from_task} on" if config.from_task else ""
     place = f"in {SIMULATION}" if config.simulate else f"on the {config.testbed} testbed"
     caption = (
@@ -103,7 +110,7 @@ def comparison_table(
         " Below each policy are the bounds of its 95 % intervals, from blocks of neighbouring tasks."
     )
     about = {"scenario": scenario.name, "testbed": config.where, "seeds": config.seeds}
-    return Table(caption=caption, about=about, headings=HEADINGS, lines=lines)
+    return Table(caption=caption, about=about, headings=HEADINGS, lines=lines, first=FIRST)
 
 
 def _runs_and_seeds(first: int, count: int) -> str:

@@ -12,7 +12,7 @@ from offboard.loadgen.compare.comparison_table import comparison_table
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.simulation.simulated_testbed import check_simulated
 from offboard.loadgen.simulation.simulation_pool import SimulationPool
-from offboard.loadgen.table.table_formats import Heading, Table, render
+from offboard.loadgen.table.table_formats import Heading, Table
 
 ABOUT = "time over oracle of each policy"
 DIGITS = 3
@@ -25,11 +25,11 @@ def simulated(scenarios: Sequence[Scenario], config: CompareConfig) -> str:
     with SimulationPool(config.jobs) as pool:
         tables = [_table(scenario, config, pool) for scenario in scenarios]
     if len(tables) == 1:
-        return render(tables, config.format)
+        return config.text(tables, config.format)
     summary = summary_table(_over_oracle(scenarios, tables, config.policies), _caption(config))
     if config.format == "csv":  # the summary has other columns
-        return render([summary], config.format) + "\n" + render(tables, config.format)
-    return render([summary, *tables], config.format)
+        return config.text([summary], config.format) + "\n" + config.text(tables, config.format)
+    return config.text([summary, *tables], config.format)
 
 
 def summary_table(figures: Mapping[str, Mapping[str, float | None]], caption: str) -> Table:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from offboard.loadgen.play.run_files import LINK, RobotFiles
+from offboard.loadgen.play.run_files import LINK, PICTURE, RobotFiles
 from offboard.loadgen.scenario.scenario import Scenario, Workload
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, Setup
 
@@ -28,7 +28,10 @@ def setups(scenario: Scenario, out: Path, *, shown: bool = True) -> dict[str, Se
     for files in RobotFiles.of(scenario, out):
         first = files.robot == ROBOT
         parts[files.robot] = Setup(
-            _robot_flags(scenario, files, first=first),
+            {
+                **_robot_flags(scenario, files, first=first),
+                **_picture(scenario, out if shown and first else None),
+            },
             scenario.robot.cpus,
             shown=shown and first,
             command="call" if workload.map is None else "drive",
@@ -72,6 +75,11 @@ def _map_flags(workload: Workload) -> Mapping[str, Any]:
         "obstacles": workload.obstacles,
         "radius": workload.radius_m,
     }
+
+
+def _picture(scenario: Scenario, out: Path | None) -> Mapping[str, Any]:
+    """The flag for the picture of a plan; None: nobody looks at this robot."""
+    return {} if out is None or scenario.workload.map is None else {"picture": out / PICTURE}
 
 
 def _sizes(texts: tuple[str, ...]) -> str | Path | None:

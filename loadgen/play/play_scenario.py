@@ -4,7 +4,9 @@
 """
 
 import json
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,8 +18,20 @@ from offboard.loadgen.play.answer_verification import verified
 from offboard.loadgen.play.part_setups import setups
 from offboard.loadgen.play.player import Player
 from offboard.loadgen.play.run_digest import digests
-from offboard.loadgen.play.run_files import EVENTS, READINGS, SUMMARY, TABLE, TRACE, RobotFiles, clear_folder
+from offboard.loadgen.play.run_files import (
+    EVENTS,
+    PICTURE,
+    READINGS,
+    SUMMARY,
+    TABLE,
+    TRACE,
+    RobotFiles,
+    clear_folder,
+)
+from offboard.loadgen.play.run_table import run_table
 from offboard.loadgen.play.stolen_cpu_time import NOTED_PERCENT, StolenCpuTime
+from offboard.loadgen.play.watch import Page, watching
+from offboard.loadgen.progress import progress
 from offboard.loadgen.robot_files import alone_path, reference_path
 from offboard.loadgen.scenario.outage_recovery import read_outage
 from offboard.loadgen.scenario.outcome import Answered, Outcome
@@ -27,8 +41,9 @@ from offboard.loadgen.scenario.pass_fail_check import Verdict
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.table.measured_rows import write_whole
+from offboard.loadgen.table.table_formats import render
 from offboard.loadgen.table.table_settings import TableConfig
-from offboard.loadgen.table.table_two import table_text
+from offboard.loadgen.table.table_two import read_tables
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.loadgen.testbed.testbed import Setup, Testbed
 
@@ -78,46 +93,64 @@ class Played:
             raise OffloadError(f"{len(failed)} of {len(self.verdicts)} checks of {self.scenario.name} failed")
 
 
-def play(scenario: Scenario, out: Path, testbed: str = "local", *, quiet: bool = False) -> Played:
+def play(
+    scenario: Scenario, out: Path, testbed: str = "local", *, quiet: bool = False, page: Page = Page.NONE
+) -> Played:
     """Play a scenario to its end. Its files in `out` (docs/formats.md) replace those of an older run.
 
-    Unless `quiet`, progress lines and the output of the first robot go to stdout.
+    Unless `quiet`, progress lines and the output of the first robot go to stdout. `page`: the page that shows
+    the run while it goes on.
     """
     say = _say_nothing if quiet else _say
     started_at, workload = datetime.now(UTC), scenario.workload
     played_from = digests(scenario)  # taken now, because the parts load the software now
-    with TESTBEDS[testbed](out, setups(scenario, out, shown=not quiet)) as bed:
+    with ExitStack() as opened:
+        bed = opened.enter_context(TESTBEDS[testbed](out, setups(scenario, out, shown=not quiet)))
         clear_folder(out)
+        if page is not Page.NONE:
+            opened.enter_context(watching(out, say, page=page))
         say(f"starting the cloud server and the relay (logs in {out / 'logs'})")
-        bed.start()
+        with progress("compiling the planner" if workload.map else "starting", to=sys.stdout):
+            bed.start()
         many = "the robot" if workload.robots == 1 else f"{workload.robots} robots"
         tasks = f"{workload.tasks} {'plans' if workload.map else 'tasks'}"
         say(f"starting {many} with a quota of {scenario.robot.cpus:g} CPU: {tasks}")
         stolen = StolenCpuTime()
-        exit_codes = Player(scenario, bed, say).play()
+        with progress("starting the robots", to=sys.stdout) as shown:
+            exit_codes = Player(scenario, bed, say, shown).play()
         stolen_percent = stolen.percent()
     played = replace(judge(scenario, out, exit_codes), stolen_percent=stolen_percent)
     about = {"testbed": testbed, "started_at": started_at.isoformat(timespec="seconds"), **played_from}
     write_summary(out, played, about)
-    for line in _findings(played.outcome):
+    for line in _ending(played, out):
         say(line)
-    for verdict in played.verdicts:
-        say(str(verdict))
-    if stolen_percent is not None and stolen_percent >= NOTED_PERCENT:
-        say(f"warning: the host of this virtual machine took {stolen_percent:.0f} % of its CPU time (steal)")
-    for path in (out / TRACE, alone_path(out / TRACE), out / SUMMARY):
-        if path.exists():
-            say(f"written: {path}")
     return played
 
 
 def play_demo(out: Path) -> int:
     """Play the shipped demo scenario, then print Table II of the plans that were measured on both sites."""
-    play(read_scenario(find_scenario("demo")), out).check_robots()
-    text = table_text(out / TRACE, TableConfig(windows=DEMO_WINDOWS, feedback="both"))
-    (out / TABLE).write_text(text)
-    print(f"\n{text}\nwritten: {out / TABLE}; charts: loadgen report {out}")
+    play(read_scenario(find_scenario("demo")), out, page=Page.SERVED).check_robots()
+    config = TableConfig(windows=DEMO_WINDOWS, feedback="both")
+    tables = read_tables(out / TRACE, config)
+    (out / TABLE).write_text(render(tables, config.format))
+    print(f"\n{config.text(tables, config.format)}\nwritten: {out / TABLE}; charts: loadgen report {out}")
+    if (out / PICTURE).exists():
+        print(f"picture of the last plan: {out / PICTURE}")
+    print(f"the run on a page: loadgen watch {out}")
     return 0
+
+
+def _ending(played: Played, out: Path) -> Iterator[str]:
+    """What a run says at its end: figures, verdicts and the files that it wrote."""
+    yield f"\n{run_table(played.scenario.name, played.outcome)}"
+    yield from _findings(played.outcome)
+    yield from map(str, played.verdicts)
+    stolen_percent = played.stolen_percent
+    if stolen_percent is not None and stolen_percent >= NOTED_PERCENT:
+        yield f"warning: the host of this virtual machine took {stolen_percent:.0f} % of its CPU time (steal)"
+    for path in (out / TRACE, alone_path(out / TRACE), out / SUMMARY, out / PICTURE):
+        if path.exists():
+            yield f"written: {path}"
 
 
 def judge(scenario: Scenario, out: Path, exit_codes: Mapping[str, int]) -> Played:

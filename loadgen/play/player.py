@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from offboard.common.errors import ConfigError, OffloadError
-from offboard.loadgen.play.run_files import ANSWERS, EVENTS, LINK, READINGS, LineCounter, RobotFiles
+from offboard.loadgen.play.run_files import ANSWERS, EVENTS, LINK, READINGS, TRACE, LineCounter, RobotFiles
+from offboard.loadgen.progress import Progress
 from offboard.loadgen.robot.answers import BEGIN_S
+from offboard.loadgen.robot_files import alone_path
 from offboard.loadgen.scenario.event_timeline import ON_A_PART, Event, Timeline, absent_at_first
 from offboard.loadgen.scenario.outcome import Reading
 from offboard.loadgen.scenario.scenario import Scenario
@@ -32,19 +34,24 @@ class Player:
     """Plays the scenario once, on a testbed whose cloud and relay are ready.
 
     Writes the events as they happened, and the memory and handles of the parts, into the folder of the run.
-    `say` receives progress lines for people.
+    `say` receives lines for people, `shown` the progress of the first robot.
     """
 
-    def __init__(self, scenario: Scenario, testbed: Testbed, say: Callable[[str], None]) -> None:
+    def __init__(
+        self, scenario: Scenario, testbed: Testbed, say: Callable[[str], None], shown: Progress
+    ) -> None:
         self._scenario = scenario
         self._say = say
+        self._shown = shown
         self._testbed = testbed
         self._robots = scenario.robots()
         self._parts = {CLOUD, WAN}  # the parts that were started
         self._paused: set[str] = set()  # a paused part cannot be sampled
         self._timeline = Timeline(scenario.timeline())
         self._answers = LineCounter(testbed.out / ANSWERS)
+        self._alone = LineCounter(alone_path(testbed.out / TRACE))
         self._booting: dict[str, Path] = {}  # starting robots, and the file whose creation ends their start
+        self._shown_steps = 0
         self._began_s: float | None = None  # when the first task was due
         self._next_sample_s = 0.0  # seconds after that
 
@@ -78,7 +85,11 @@ class Player:
             if not self._answers.path.exists():
                 return
             self._began_s = time.monotonic() + BEGIN_S
+            self._shown.begin("tasks", self._runs())
         now_s, answered = time.monotonic() - self._began_s, self._answers.count()
+        if answered + (alone := self._alone.count()) != self._shown_steps:
+            self._shown_steps = answered + alone
+            self._shown.to(self._shown_steps)
         for event in self._timeline.due(now_s, answered):
             write_event(json.dumps(self._happened(event, self._began_s)) + "\n")
         if now_s >= self._next_sample_s:
@@ -179,6 +190,9 @@ class Player:
         )
 
     def _limit_s(self) -> float:
+        return max(ROBOT_S_AT_LEAST, ROBOT_S_A_TASK * self._runs())
+
+    def _runs(self) -> int:
+        """The tasks that the first robot runs, those of `alone` included."""
         workload = self._scenario.workload
-        runs = workload.tasks + len(WAYS) * workload.alone
-        return max(ROBOT_S_AT_LEAST, ROBOT_S_A_TASK * runs)
+        return workload.tasks + len(WAYS) * workload.alone

@@ -19,6 +19,7 @@ EVENTS = "events.jsonl"
 READINGS = "usage.jsonl"
 SUMMARY = "summary.json"
 TABLE = "table.md"
+PICTURE = "plan.png"
 ROBOT_SEED_STEP = 1_000_003  # large: robots of one run differ, and so do runs with neighbouring seeds
 
 
@@ -72,7 +73,7 @@ def clear_folder(out: Path) -> None:
     """Make the folder of a run, or remove what an earlier run left in it."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for name in ("trace*.jsonl", "answers*.jsonl", "link*.jsonl", EVENTS, READINGS, SUMMARY):
+        for name in ("trace*.jsonl", "answers*.jsonl", "link*.jsonl", EVENTS, READINGS, SUMMARY, PICTURE):
             for left in out.glob(name):
                 left.unlink()
     except OSError as error:

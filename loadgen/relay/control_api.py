@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from typing import Any, Protocol
 
 from offboard.common.errors import ConfigError, MissingExtra
+from offboard.common.live.live_files import DOCS_PATHS
+from offboard.common.live.live_pages import LivePages
 from offboard.common.security.http_guard import HttpGuard
 from offboard.loadgen.relay.link.link import NAMES
 from offboard.loadgen.relay.link_schedule import Linked, Schedule, parse_schedule
@@ -123,10 +125,12 @@ def control_app(
     app = FastAPI(
         title="Offboard relay",
         description="Reads and changes the link between robot and cloud, live.",
+        docs_url=None,
         redoc_url=None,
     )
     app.add_middleware(BoundedBody)
-    app.add_middleware(HttpGuard, token=token, open_paths=("/health",), loopback=loopback)
+    app.add_middleware(LivePages, paths=DOCS_PATHS)
+    app.add_middleware(HttpGuard, token=token, open_paths=("/health",), pages=DOCS_PATHS, loopback=loopback)
     _add_link(app, relay, insecure=insecure)
     _add_schedule(app, relay, schedule)
     app.add_exception_handler(ConfigError, _bad_value)

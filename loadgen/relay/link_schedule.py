@@ -92,7 +92,7 @@ class Schedule:
             if event.changes:
                 self._linked.set_link(self._linked.link.changed(event.changes), by="schedule")
         except ConfigError as error:  # the link has changed since the schedule was checked
-            log.warning("schedule: the event at %g s was skipped: %s", event.at_s, error)
+            log.warning("schedule: the event at %g s was skipped: %s; remedy: correct it", event.at_s, error)
         if event.reset:
             self._linked.reset()
 

@@ -24,7 +24,7 @@ from offboard.loadgen.report.chart_parts import (
     render,
     scale_times,
 )
-from offboard.loadgen.report.chart_styles import LOOKS, Look, policy_look
+from offboard.loadgen.report.chart_styles import FURTHER_LOOKS, LOOKS, Look, policy_look
 from offboard.loadgen.report.window_charts import accuracy, errors
 from offboard.loadgen.table.measured_rows import Column
 from offboard.loadgen.table.replay import ORACLE, RECORDED
@@ -97,6 +97,18 @@ def distributions(figure: Figure, shown: Mapping[str, Column]) -> None:
     )
 
 
+def runs(figure: Figure, shown: Mapping[str, Column]) -> None:
+    """The empirical distribution of the waiting time, with a line for each run."""
+    axes = figure.add_subplot(xlabel="waiting time (s)", ylabel="tasks answered within", ylim=(-2, 102))
+    axes.yaxis.set_major_formatter(PercentFormatter(decimals=0))
+    looks = dict(zip(shown, FURTHER_LOOKS, strict=False))
+    for number, (name, seconds) in enumerate(shown.items(), 1):
+        look = looks[name]
+        axes.step(*ecdf(seconds), where="post", color=look.colour, linestyle=look.line, gid=f"run-{number}")
+    scale_times(axes.set_xscale, axes.xaxis, np.concatenate(list(shown.values())))
+    legend(figure, [key(look, name) for name, look in looks.items()], columns=2)
+
+
 def _mark_crossing(axes: Axes, size: float, seconds: float) -> Line2D:
     axes.axvline(size, color="#222222", linewidth=0.9, linestyle=(0, (2, 2)), gid="crossing-size")
     ring: dict[str, Any] = {"color": "#222222", "marker": "o", "markersize": 7, "markerfacecolor": "white"}
@@ -110,4 +122,5 @@ PAINTERS: dict[str, Callable[[Figure, Any], None]] = {
     "errors": errors,
     "accuracy": accuracy,
     "ecdf": distributions,
+    "runs": runs,
 }

@@ -3,6 +3,7 @@
 Its charts are made fit for the page in `inline_svg.py`.
 """
 
+import base64
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -31,12 +32,16 @@ RAISED = re.compile(r"\^(\w)")  # as in the heading t^c
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One chart, as the content of an SVG file; None if there is no chart, for the reason in the caption."""
+    """One chart, as the content of an SVG file; None if there is no chart, for the reason in the caption.
+
+    `png` is a picture instead of a chart.
+    """
 
     name: str
     title: str
     caption: str
     svg: bytes | None
+    png: bytes | None = None
 
 
 def page(
@@ -89,6 +94,9 @@ def _pairs(texts: Mapping[str, str]) -> str:
 def _panel(panel: Panel) -> str:
     heading = f"<h2>{escape(panel.title)}</h2>"
     chart = f'<div class="chart">{inline(panel.svg, panel.name, panel.title)}</div>' if panel.svg else ""
+    if panel.png:
+        data = base64.b64encode(panel.png).decode()
+        chart = f'<img src="data:image/png;base64,{data}" alt="{escape(panel.title)}">'
     caption = f"<figcaption>{escape(panel.caption)}</figcaption>"
     return f'<figure id="{panel.name}">{heading}{chart}{caption}</figure>'
 
@@ -141,6 +149,7 @@ figure, aside { margin: 0; padding: clamp(0.6rem, 2vw, 1rem); break-inside: avoi
 figcaption { margin-top: 0.6rem; color: var(--quiet); font-size: 0.9rem; }
 .chart { background: #ffffff; border-radius: 0.4rem; }
 .chart svg { display: block; width: 100%; height: auto; }
+figure img { display: block; width: 100%; height: auto; }
 .chart svg * { stroke-linejoin: round; stroke-linecap: butt; }
 .chart text { font-family: var(--font) !important; }
 @media (max-width: 60rem) { .charts { grid-template-columns: minmax(0, 1fr); } }

@@ -11,7 +11,8 @@ from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError
 from offboard.common.security.plain_files import replace_file
 from offboard.loadgen import rivals
-from offboard.loadgen.play.run_files import find_source
+from offboard.loadgen.play.run_files import PICTURE, TRACE, find_source
+from offboard.loadgen.progress import progress
 from offboard.loadgen.report.captions import all_charts
 from offboard.loadgen.report.findings import Findings
 from offboard.loadgen.report.html_page import Panel, page
@@ -24,6 +25,10 @@ from offboard.robot_client.predictors.window import WINDOW, WINDOW_MAX
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 PAGE = "report.html"
+PLAN = (
+    "The last plan of the run that found a path: where the robot asked for it, what its LiDAR saw there, and"
+    " the path to its goal."
+)
 
 
 @dataclass(frozen=True)
@@ -32,7 +37,8 @@ class ReportConfig:
 
     out: Path | None = setting(
         None,
-        "folder for report.html and the PNGs (default: the folder of the run, or out/NAME for a file)",
+        "folder for report.html and the PNGs (default: the folder of the run, out/NAME for a file, or "
+        "out/comparison for several runs)",
         metavar="DIR",
     )
     predictor: str = setting(
@@ -90,11 +96,17 @@ def run_report(path: Path, config: ReportConfig) -> int:
     from offboard.loadgen.report import charts  # only now, because matplotlib takes long to import
 
     shown = all_charts(findings)
-    drawings = [None if chart.shown is None else charts.draw(chart.name, chart.shown) for chart in shown]
     panels = []
-    for chart, drawing in zip(shown, drawings, strict=True):
-        _write_png(out / f"{chart.name}.png", drawing.png if drawing else None)
-        panels.append(Panel(chart.name, chart.title, chart.caption, drawing.svg if drawing else None))
+    with progress("charts", len(shown)) as drawn:
+        for chart in shown:
+            drawing = None if chart.shown is None else charts.draw(chart.name, chart.shown)
+            _write_png(out / f"{chart.name}.png", drawing.png if drawing else None)
+            panels.append(Panel(chart.name, chart.title, chart.caption, drawing.svg if drawing else None))
+            drawn.step()
+    if (source.parent / PICTURE).is_file() and source.name == TRACE:
+        panels.append(
+            Panel("plan", "A plan on the map", PLAN, svg=None, png=(source.parent / PICTURE).read_bytes())
+        )
     text = page(
         f"Report on {source}",
         about=[about(findings), *findings.rows.notes],

@@ -5,14 +5,17 @@ The settings are read in `__main__`; the tasks are asked for in `run`.
 
 import gc
 import logging
-from collections.abc import Callable, Mapping, Sequence
+import sys
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from offboard.common.config import as_dict, flag_of, settings_of
 from offboard.common.errors import ConfigError, OffloadError
+from offboard.common.host.logs import start_log
 from offboard.common.task_states import TaskStates
+from offboard.loadgen.progress import progress
 from offboard.loadgen.robot.answers import Answers
 from offboard.loadgen.robot.config import DriveConfig, MapSettings, RobotConfig
 from offboard.loadgen.robot.references import References, measure_alone
@@ -25,6 +28,10 @@ from offboard.robot_client.records.trace import Record, Trace
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
+if TYPE_CHECKING:
+    from offboard.loadgen.map_picture import LastPlan
+    from offboard.robot_client.records.metrics import Metrics
+
 log = logging.getLogger(__name__)
 
 Observer = Callable[[Record], None]
@@ -32,7 +39,7 @@ Observer = Callable[[Record], None]
 
 def run_robot(config: RobotConfig) -> int:
     """Run the tasks, then measure those of --alone."""
-    logging.basicConfig(level=config.log.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    start_log(config.log, config.log_format)
     log.info("settings: %s", as_dict(config))
     answers = Answers(config.answers) if config.answers else None
     if answers and answers.done and isinstance(config, DriveConfig) and not config.jump:
@@ -43,11 +50,11 @@ def run_robot(config: RobotConfig) -> int:
     alone = Trace(alone_path(config.trace)) if config.trace and config.alone else None
     files: list[Answers | Lines] = [file for file in (answers, trace) if file]
     try:
-        observers: list[Observer] = [*([trace.write] if trace else []), *_metrics(config, trace)]
         work, states = make_work(config), TaskStates(workers=1)  # shared, so that each setup runs once
         if isinstance(config, DriveConfig) and isinstance(work, Plans):
             write_drive_record(config, work)
-        _run_tasks(config, work, states, answers, observers=observers, files=files)
+        last = _last_plan(config)
+        _run_tasks(config, work, states, answers, trace=trace, files=files, last=last)
         if alone:
             # With its own offloader: what the run learns, records and counts is about the run only.
             with _connect(config, states=states, observers=[alone.write]) as offload:
@@ -60,6 +67,8 @@ def run_robot(config: RobotConfig) -> int:
     for file in files:
         if file.lost:
             raise OffloadError(f"{file.lost} tasks could not be written to {file.path}")
+    if last:
+        print(last.write())
     return 0
 
 
@@ -80,22 +89,14 @@ def _run_tasks(
     states: TaskStates,
     answers: Answers | None,
     *,
-    observers: Sequence[Observer],
+    trace: Trace | None,
     files: list[Answers | Lines],
+    last: "LastPlan | None",
 ) -> None:
     """Run the tasks of `work`, then close `files`, to which the file of --reference is added."""
     own, sites = OwnRecord(), config.sites()
     with ExitStack() as stack:
-        offload = stack.enter_context(
-            _connect(
-                config,
-                states=states,
-                sites=sites,
-                policy=config.policy,
-                settings=config.settings(config.seed),
-                observers=[own, *observers],
-            )
-        )
+        offload = stack.enter_context(_observed(config, states, own, trace))
         again, references = None, None
         if config.trace and config.reference:
             again = stack.enter_context(_connect(config, states=states, sites=sites))
@@ -113,8 +114,14 @@ def _run_tasks(
         for file in files:
             # Before the sites are closed: tasks that are given up by then have no record.
             stack.callback(file.close)
-        run = Run(config, work, offload, own=own, say=print, answers=answers, references=references)
-        with _connect(config, states=states, sites=sites) as unseen:
+        keep = last.keep if last else None
+        run = Run(
+            config, work, offload, own=own, say=print, answers=answers, references=references, keep=keep
+        )
+        with (
+            _connect(config, states=states, sites=sites) as unseen,
+            progress("connecting, and compiling what the first task needs", to=sys.stdout),
+        ):
             absent = unseen.wait_for_sites(work.function, config.connect_s)
             run.warm(unseen)
         absent = absent or offload.wait_for_sites(work.function, config.connect_s)
@@ -127,6 +134,19 @@ def _run_tasks(
         run.run()
 
 
+def _observed(config: RobotConfig, states: TaskStates, own: OwnRecord, trace: Trace | None) -> Offloader:
+    """The offloader whose tasks go into the trace, the metrics and the live page."""
+    metrics = _metrics(config, trace)
+    observers: list[Observer] = [own, *([trace.write] if trace else []), *([metrics] if metrics else [])]
+    settings = config.settings(config.seed)
+    offload = _connect(
+        config, states, settings, sites=config.sites(), policy=config.policy, observers=observers
+    )
+    if metrics:
+        offload.show_on(metrics.live)
+    return offload
+
+
 def _connect(
     config: RobotConfig, states: TaskStates, settings: Settings | None = None, **options: Any
 ) -> Offloader:
@@ -136,19 +156,29 @@ def _connect(
     )
 
 
+def _last_plan(config: RobotConfig) -> "LastPlan | None":
+    """What draws the picture of --picture."""
+    if not isinstance(config, DriveConfig) or config.picture is None:
+        return None
+    from offboard.loadgen.map_picture import LastPlan  # importing the planner compiles it
+
+    return LastPlan(config.picture)
+
+
 def _warn_of_absent(doing: str, absent: Mapping[str, str]) -> None:
     for site, why in absent.items():
         instead = "tasks run elsewhere" if site == ONBOARD else f"tasks run {ONBOARD}"
-        log.warning("%s without %s: %s; %s", doing, site, why, instead)
+        remedy = "correct the setup of the task" if site == ONBOARD else "robot-client check"
+        log.warning("%s without %s: %s; %s; remedy: %s", doing, site, why, instead, remedy)
 
 
-def _metrics(config: RobotConfig, trace: Trace | None) -> list[Observer]:
+def _metrics(config: RobotConfig, trace: Trace | None) -> "Metrics | None":
     """The observer that serves metrics until the process ends, if an address is given for it."""
     if config.metrics is None:
-        return []
+        return None
     from offboard.robot_client.records.metrics import serve_metrics  # its library takes long to load
 
     metrics = serve_metrics(config.metrics, "--metrics")
     if trace:
         metrics.watch(trace)
-    return [metrics]
+    return metrics

@@ -141,6 +141,13 @@ class MapSettings:
         group=PLANS,
         rare=True,
     )
+    picture: Path | None = setting(
+        None,
+        "draw the last plan with a path into this PNG file: map, robot, scan and path",
+        group=PLANS,
+        rare=True,
+        metavar="FILE.png",
+    )
     sizes: tuple[str, ...] = setting(
         (),
         f"input sizes; the robot picks goals that match them: {SIZES_ALLOWED}; repeat the flag for phases",
@@ -157,6 +164,8 @@ class DriveConfig(RobotConfig, MapSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         parse_sizes(self.sizes)
+        if self.picture is not None and self.picture.suffix.lower() != ".png":
+            raise ConfigError(f"--picture: {self.picture} must end with .png")
         if self.jump:
             return
         if self.arrivals != CLOSED:

@@ -4,6 +4,7 @@ Both have their own offloader, so that they and the run learn nothing from each 
 """
 
 import contextlib
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -13,8 +14,9 @@ from typing import Any
 from offboard.common.errors import TaskError
 from offboard.common.task_states import TaskStates
 from offboard.common.tasks import kind_of
+from offboard.loadgen.progress import progress
 from offboard.loadgen.robot.config import RobotConfig
-from offboard.loadgen.robot.summary import describe, show_progress
+from offboard.loadgen.robot.summary import PROGRESS_EVERY, describe
 from offboard.loadgen.robot.work import Work
 from offboard.loadgen.robot_files import read_fields
 from offboard.robot_client.offloader import Offloader
@@ -100,17 +102,18 @@ def measure_alone(config: RobotConfig, work: Work, offload: Offloader, say: Call
     The times say how much the two executions of one task disturb each other; `loadgen table` reads them.
     The only sites of `offload` are onboard and cloud.
     """
-    whole = 0
-    for number, order in enumerate(orders(config.alone, config.seed, WAYS)):
-        request, ran = work.request(), 0
-        for n, way in enumerate(order, 1):
-            answer = offload(work.function, *request, where=way)
-            record = offload.last
-            assert record is not None
-            ran += _ran(record, way)
-            show_progress(number * len(WAYS) + n, config.alone * len(WAYS), partial(describe, record))
-        work.advance(answer)
-        whole += ran == len(WAYS)
+    whole, runs = 0, config.alone * len(WAYS)
+    with progress("on each site alone", runs, to=sys.stdout, every=PROGRESS_EVERY) as shown:
+        for order in orders(config.alone, config.seed, WAYS):
+            request, ran = work.request(), 0
+            for way in order:
+                answer = offload(work.function, *request, where=way)
+                record = offload.last
+                assert record is not None
+                ran += _ran(record, way)
+                shown.step(partial(describe, record))
+            work.advance(answer)
+            whole += ran == len(WAYS)
     missing = f"; the {CLOUD} did not answer for the others" if whole < config.alone else ""
     say(f"run on each site alone and on both at once: {whole} of {config.alone} {work.noun}{missing}")
 

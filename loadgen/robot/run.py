@@ -5,10 +5,11 @@ The tasks come from `work`; where they run is decided by the offloader.
 
 import contextlib
 import itertools
+import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import partial
 from typing import Any, TypeVar
@@ -17,11 +18,12 @@ from offboard.common import errors
 from offboard.common.errors import ConfigError, TaskError
 from offboard.common.host import cpu_time
 from offboard.common.tasks import kind_of
+from offboard.loadgen.progress import Progress, progress
 from offboard.loadgen.robot.answers import Answered, Answers
 from offboard.loadgen.robot.calls import InputsEnded
 from offboard.loadgen.robot.config import RobotConfig
 from offboard.loadgen.robot.references import References
-from offboard.loadgen.robot.summary import Summary, describe, end_progress, show_progress
+from offboard.loadgen.robot.summary import PROGRESS_EVERY, Summary, describe
 from offboard.loadgen.robot.work import Work
 from offboard.loadgen.robot.workload import CLOSED, due_instants
 from offboard.robot_client.offloader import Offloader
@@ -33,6 +35,7 @@ MADE_FIRST_MAX = 1000  # tasks that are made before the first one starts, if non
 LARGE_MADE_MAX = 4  # tasks that are made ahead if their arguments may be megabytes each
 
 T = TypeVar("T")
+Keep = Callable[[Sequence[Any], Any], None]  # gets the arguments of a task and its answer (None: it failed)
 
 
 class OwnRecord(threading.local):
@@ -53,7 +56,7 @@ class Run:
     """Asks for `config.tasks_max` tasks of `work`, the first `config.measure` of them on both sites.
 
     `own` must be an observer of `offload`. With `answers`, each task leaves a line there, tasks that have a
-    line already are left out, and a failed task does not end the run.
+    line already are left out, and a failed task does not end the run. `keep` gets each task.
     """
 
     def __init__(
@@ -66,6 +69,7 @@ class Run:
         say: Callable[[str], None],
         answers: Answers | None = None,
         references: References | None = None,
+        keep: Keep | None = None,
     ) -> None:
         self._config = config
         self._work = work
@@ -74,10 +78,12 @@ class Run:
         self._say = say
         self._answers = answers
         self._references = references
+        self._keep = keep
         self._done = answers.done if answers else frozenset()
         self._left = sum(number not in self._done for number in range(config.tasks_max))
         self._summary = Summary(found=work.found, due=config.arrivals != CLOSED)
         self._noted = 0
+        self._progress: Progress
         self._inputs: int | None = None  # how many there were, if they have ended
         self._lock = threading.Lock()  # of the summary
         self._stopped = False
@@ -102,10 +108,11 @@ class Run:
             count = self._config.tasks_max
             self._say(f"{count - self._left} of {count} tasks had their answer before")
         try:
-            if self._config.arrivals == CLOSED:
-                self._run_closed()
-            else:
-                self._run_open()
+            with progress(self._work.noun, self._left, to=sys.stdout, every=PROGRESS_EVERY) as self._progress:
+                if self._config.arrivals == CLOSED:
+                    self._run_closed()
+                else:
+                    self._run_open()
         except BaseException:  # after Ctrl-C, too, the user sees what was done; nothing is swallowed
             if self._noted:
                 self._say_summary()
@@ -115,8 +122,6 @@ class Run:
     def _say_summary(self) -> None:
         with self._lock:
             lines = self._summary.lines()
-        if self._noted and self._noted != self._left:
-            end_progress()
         if self._inputs is not None:
             self._say(f"the inputs ended after {self._inputs} of {self._config.tasks_max} tasks")
         for line in lines:
@@ -234,6 +239,8 @@ class Run:
                 answer=described,
             )
             self._answers.write(answered)
+        if self._keep is not None:
+            self._keep(request, answer)
         self._note(record, answer, error, late_s=began_s - due_s)
         if self._references and self._references.due(number) and record is not None:
             self._references.measure(
@@ -248,9 +255,7 @@ class Run:
             else:
                 self._summary.add(record, got=self._work.got(answer), late_s=late_s)
             self._noted += 1
-            show_progress(
-                self._noted, self._left, partial(describe, record) if record else partial(str, error)
-            )
+            self._progress.step(partial(describe, record) if record else partial(str, error))
 
 
 def made_ahead(tasks: Iterator[T], most: int = MADE_MAX) -> Generator[T]:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from offboard.common.config import setting
 from offboard.common.errors import ConfigError
+from offboard.common.host.logs import JSON, LEVELS, TEXT
 from offboard.loadgen.robot.workload import ARRIVALS, CLOSED
 
 TASKS_DEFAULT = 200
@@ -68,7 +69,14 @@ class RunSettings:
         "least severe messages that are logged",
         group=OUTPUT,
         rare=True,
-        choices=("debug", "info", "warning", "error"),
+        choices=LEVELS,
+    )
+    log_format: str = setting(
+        TEXT,
+        "form of the lines of the log: text, or a JSON object each",
+        group=OUTPUT,
+        rare=True,
+        choices=(TEXT, JSON),
     )
     measure: int = setting(0, "run the first K tasks on both sites", group=MEASURING, rare=True, minimum=0)
     alone: int = setting(

@@ -1,12 +1,11 @@
-"""The lines that a run prints: one for each task as it goes, and the summary at its end.
+"""What a run says about its tasks: one line for each as it goes, and the summary at its end.
 
 The records that are summed up come from the offloader.
 """
 
 import statistics
-import sys
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from offboard.common.tasks import show_size
 from offboard.robot_client.records.trace import Record
@@ -93,22 +92,6 @@ def describe(record: Record) -> str:
         for one in record.executions
     )
     return f"size {show_size(record.size, '.2f')} -> {took} ({record.decision.reason})"
-
-
-def show_progress(done: int, total: int, about: Callable[[], str]) -> None:
-    """On a terminal, overwrite one line; elsewhere, print a line every PROGRESS_EVERY tasks."""
-    if sys.stdout.isatty():
-        print(f"\r\x1b[K{done}/{total} {about()}"[:160], end="", flush=True)
-        if done == total:
-            print()
-    elif done % PROGRESS_EVERY == 0 or done == total:
-        print(f"{done}/{total} {about()}", flush=True)
-
-
-def end_progress() -> None:
-    """Go to a new line, if the last line of `show_progress` still has the cursor."""
-    if sys.stdout.isatty():
-        print()
 
 
 def _p95(values: Sequence[float]) -> float:

@@ -3,13 +3,14 @@
 import logging
 import multiprocessing
 import os
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import Any, Self
 
 from offboard.loadgen.play.run_files import ROBOT_SEED_STEP
+from offboard.loadgen.progress import progress
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.scenario import Scenario, Workload
 from offboard.loadgen.simulation.model.simulated_tasks import OTHERS_TASKS_MAX, RobotTasks, find_tasks
@@ -57,10 +58,11 @@ class SimulationPool:
             for scenario, robots in zip(scenarios, wanted, strict=True)
         ]
         played: dict[str, list[Outcome]] = {name: [] for name in strategies}
-        for scenario, outcomes in zip(scenarios, self.map(_simulate_all, units), strict=True):
-            print(f"{scenario.name}, seed {scenario.seed}: simulated", file=sys.stderr, flush=True)
-            for name, outcome in zip(strategies, outcomes, strict=True):
-                played[name].append(outcome)
+        with progress("simulating", len(scenarios), every=1) as shown:
+            for scenario, outcomes in zip(scenarios, self.map(_simulate_all, units), strict=True):
+                shown.step(partial("{}, seed {}: simulated".format, scenario.name, scenario.seed))
+                for name, outcome in zip(strategies, outcomes, strict=True):
+                    played[name].append(outcome)
         return played
 
     def _find(self, wanted: Iterable[Wanted]) -> None:
@@ -72,8 +74,10 @@ class SimulationPool:
             if workload.tasks > max(known, most[key].tasks if key in most else 0):
                 most[key] = workload
         units = [(workload, key[1]) for key, workload in most.items()]
-        for key, tasks in zip(most, self.map(_find_tasks, units), strict=True):
-            self._known[key] = tasks
+        with progress("running the tasks of each robot once", len(units)) as shown:
+            for key, tasks in zip(most, self.map(_find_tasks, units), strict=True):
+                self._known[key] = tasks
+                shown.step()
 
     def _tasks(self, robots: Mapping[str, Wanted]) -> dict[str, RobotTasks]:
         return {

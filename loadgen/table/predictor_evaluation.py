@@ -3,7 +3,7 @@
 `table_two` prints the scores; `table_two_figures` computes the figures.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any
@@ -38,10 +38,14 @@ class Evaluation:
         self._correlation_ends = cache(self._find_correlation_ends)
         self._blocks = cache(config.blocks)
 
-    def scores(self, feedback: str) -> Iterator[Score]:
-        """The lines of one table: each predictor with each window, then the constant rules."""
-        for name in self._config.names():
-            yield from self._predictor_scores(name, feedback)
+    def scores(self, feedback: str, step: Callable[[], object] = lambda: None) -> Iterator[Score]:
+        """The lines of one table: each predictor with each window, then the constant rules.
+
+        `step` is called after each of `planned`.
+        """
+        for name, window in planned(self._config):
+            yield from self._predictor_scores(name, window, feedback)
+            step()
         oracle = self._rows.cloud_s < self._rows.onboard_s
         for rule, to_cloud in (
             ("always-onboard", np.zeros_like(oracle)),
@@ -75,21 +79,18 @@ class Evaluation:
             cloud_predicted_s=cloud_s,
         )
 
-    def _predictor_scores(self, name: str, feedback: str) -> Iterator[Score]:
-        for window in self._config.windows:
-            if rivals.slow(name) and window != FULL_WINDOW and not self._config.every_window:
-                continue
-            try:
-                scored = self.predictions(name, window, feedback)
-            except MissingExtra as error:
-                if ALL not in self._config.predictors:
-                    raise
-                yield Score(name, window, note=str(error))
-                continue
-            if scored is None:
-                yield Score(name, window, note="not enough rows")
-            else:
-                yield from self._lines(Score(name, window), scored, self._correlated(window))
+    def _predictor_scores(self, name: str, window: str, feedback: str) -> Iterator[Score]:
+        try:
+            scored = self.predictions(name, window, feedback)
+        except MissingExtra as error:
+            if ALL not in self._config.predictors:
+                raise
+            yield Score(name, window, note=str(error))
+            return
+        if scored is None:
+            yield Score(name, window, note="not enough rows")
+        else:
+            yield from self._lines(Score(name, window), scored, self._correlated(window))
 
     def _length(self, window: str) -> int:
         return len(self._rows) * 4 // 5 if window == FULL_WINDOW else int(window)
@@ -140,6 +141,16 @@ class Evaluation:
             }
 
         return self._blocks(len(rows)).intervals(both)
+
+
+def planned(config: TableConfig) -> list[tuple[str, str]]:
+    """Each predictor with each of its windows; a slow one has only full, unless all are asked for."""
+    return [
+        (name, window)
+        for name in config.names()
+        for window in config.windows
+        if config.every_window or window == FULL_WINDOW or not rivals.slow(name)
+    ]
 
 
 def predict(rows: Rows, length: int, *, predictor: str, feedback: str, seed: int) -> tuple[Column, Column]:

@@ -16,10 +16,11 @@ from offboard.common.config import check, setting
 from offboard.common.errors import DataError
 from offboard.common.tasks import Kind, Task, task
 from offboard.loadgen import rivals
+from offboard.loadgen.progress import progress
 from offboard.loadgen.table import confidence_intervals, table_two_figures
 from offboard.loadgen.table.measured_rows import Column, Rows, read_lived
 from offboard.loadgen.table.measurement_notes import read_noted
-from offboard.loadgen.table.table_formats import Heading, Table, render
+from offboard.loadgen.table.table_formats import Heading, Table
 from offboard.loadgen.table.table_settings import BOTH, FULL, MeasuredTimesConfig
 from offboard.loadgen.table.table_two_figures import Scored, Sides
 from offboard.robot_client import policies
@@ -105,6 +106,7 @@ HEADINGS: dict[str, Heading] = {
     "cloud_percent": Heading("cloud %", r"cloud \%", 2),
     "both_percent": Heading("on both sites %", r"on both sites \%", 2),
 }
+FIRST = ("scored", "mean_s", "p95_s", "time_over_oracle", "accuracy_percent", "cloud_percent")
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +119,8 @@ class Replayed:
 
 def run_replay(path: Path, config: ReplayConfig) -> int:
     """Print the tables of `path` to stdout."""
-    sys.stdout.write(render(tables(path, config), config.format))
+    config.check_columns(HEADINGS, config.format)
+    sys.stdout.write(config.text(tables(path, config), config.format))
     return 0
 
 
@@ -127,7 +130,9 @@ def tables(path: Path, config: ReplayConfig) -> list[Table]:
     if not len(rows) + rows.left_out:
         raise DataError(f"{path}: there is no {config.kind or 'task'} in this trace")
     recorded = [_recorded(lived.waited_s, lived.to_cloud)] if len(lived.waited_s) else []
-    return [_table(path, rows, config, feedback=mode, recorded=recorded) for mode in config.modes()]
+    with progress("policies", len(config.modes()) * (len(config.policies) + 1)) as shown:
+        lines = {mode: [*recorded, *_mode_lines(rows, config, mode, shown.step)] for mode in config.modes()}
+    return [_table(path, rows, config, lines[mode], feedback=mode) for mode in config.modes()]
 
 
 def replay(
@@ -226,12 +231,7 @@ def _replayed(size: float, row: int) -> None:  # noqa: ARG001
     raise AssertionError("a replayed task is looked up, not run")
 
 
-def _table(
-    path: Path, rows: Rows, config: ReplayConfig, *, feedback: str, recorded: list[PolicyScore]
-) -> Table:
-    lines = [*recorded]
-    for name in (*config.policies, ORACLE):
-        lines.extend(_lines(rows, name, config, feedback))
+def _table(path: Path, rows: Rows, config: ReplayConfig, lines: list[PolicyScore], *, feedback: str) -> Table:
     left_out = f" ({rows.left_out} tasks without both times left out)" if rows.left_out else ""
     predictor = config.predictor or "each policy's own"
     about = f"predictor {predictor}, window {config.window}, feedback {feedback}"
@@ -248,7 +248,17 @@ def _table(
         headings={name: of for name, of in HEADINGS.items() if name != "bound" or config.bootstrap},
         lines=lines,
         notes=rows.notes,
+        first=FIRST,
     )
+
+
+def _mode_lines(
+    rows: Rows, config: ReplayConfig, feedback: str, step: Callable[[], object]
+) -> Iterator[PolicyScore]:
+    """The lines of one feedback mode; `step` is called after each policy."""
+    for name in (*config.policies, ORACLE):
+        yield from _lines(rows, name, config, feedback)
+        step()
 
 
 def _lines(rows: Rows, policy: str, config: ReplayConfig, feedback: str) -> Iterator[PolicyScore]:

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 UNDEFINED = "–"  # noqa: RUF001 (the dash for "no value" in tables)
+MARKDOWN_RULE_MIN = 3  # dashes under a heading
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +30,7 @@ class Table:
     `headings` are the columns of Markdown and LaTeX, in order. CSV and JSON hold all fields of the lines.
     `about` comes before the cells of each CSV line, and with the lines in JSON.
     The `note` of a line is shown in its first column. None in a line means undefined.
+    `first` names the most important columns: they are printed if there is no room for all.
     """
 
     caption: str
@@ -36,6 +38,7 @@ class Table:
     headings: Mapping[str, Heading]
     lines: Sequence[Any]
     notes: tuple[str, ...] = ()
+    first: tuple[str, ...] = ()
 
 
 def render(tables: Sequence[Table], format: str) -> str:
@@ -48,15 +51,37 @@ def cells(table: Table, line: Any) -> list[str]:
     return [_cell(table, line, name) for name in table.headings]
 
 
+def markdown_width(table: Table) -> int:
+    """The number of characters in each line of the Markdown table."""
+    return sum(_widths(_markdown_cells(table))) + 3 * len(table.headings) + 1
+
+
 def _markdown(tables: Sequence[Table]) -> str:
+    """Aligned, so that people can read it as it is: text to the left, numbers to the right."""
     blocks = []
     for table in tables:
-        heading = "| " + " | ".join(heading.markdown for heading in table.headings.values()) + " |"
-        rule = "|" + " --- |" * len(table.headings)
-        lines = ["| " + " | ".join(cells(table, line)) + " |" for line in table.lines]
+        texts = _markdown_cells(table)
+        widths, numbers = _widths(texts), [of.digits is not None for of in table.headings.values()]
+        rule = ["-" * (width - number) + ":" * number for width, number in zip(widths, numbers, strict=True)]
+        lines = [_markdown_line(line, widths, numbers) for line in (texts[0], rule, *texts[1:])]
         notes = [f"- {note}" for note in table.notes]
-        blocks.append("\n".join([table.caption, *notes, "", heading, rule, *lines, ""]))
+        blocks.append("\n".join([table.caption, *notes, "", *lines, ""]))
     return "\n".join(blocks)
+
+
+def _markdown_line(texts: Sequence[str], widths: Sequence[int], numbers: Sequence[bool]) -> str:
+    columns = zip(texts, widths, numbers, strict=True)
+    padded = (text.rjust(width) if number else text.ljust(width) for text, width, number in columns)
+    return f"| {' | '.join(padded)} |"
+
+
+def _markdown_cells(table: Table) -> list[list[str]]:
+    """The headings and the lines."""
+    return [[of.markdown for of in table.headings.values()], *(cells(table, line) for line in table.lines)]
+
+
+def _widths(texts: Sequence[Sequence[str]]) -> list[int]:
+    return [max(MARKDOWN_RULE_MIN, *map(len, column)) for column in zip(*texts, strict=True)]
 
 
 def _csv(tables: Sequence[Table]) -> str:

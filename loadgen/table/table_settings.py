@@ -6,6 +6,7 @@ from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError
 from offboard.loadgen import rivals
 from offboard.loadgen.table.confidence_intervals import Blocks
+from offboard.loadgen.table.table_columns import ColumnSettings
 from offboard.loadgen.table.table_formats import FORMATS
 from offboard.robot_client import predictors
 from offboard.robot_client.predictors.window import WINDOW_MAX
@@ -17,7 +18,7 @@ ALL = "all"
 
 
 @dataclass(frozen=True)
-class MeasuredTimesConfig:
+class MeasuredTimesConfig(ColumnSettings):
     """The settings that `table` and `replay` share."""
 
     feedback: str = setting(

@@ -76,6 +76,16 @@ HEADINGS: dict[str, Heading] = {
     "regret_mean_s": Heading("regret s/task", "regret/task", 5),
     "cloud_percent": Heading("cloud %", r"cloud \%", 2),
 }
+FIRST = (  # the most important columns
+    "accuracy_percent",
+    "time_over_oracle",
+    "cloud_s",
+    "cloud_predicted_s",
+    "onboard_s",
+    "onboard_predicted_s",
+    "cloud_mae_s",
+    "onboard_mae_s",
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from offboard.common.errors import ConfigError, OffloadError
+from offboard.loadgen.progress import progress
 
 FILE = Path("docker-compose.yml")
 VERSION = ("docker", "compose", "version")
@@ -30,7 +31,8 @@ def build_images(services: Iterable[str]) -> None:
     """Build the images of these Compose services; Docker skips what has not changed."""
     build = (*BUILD, *services)
     try:
-        code = subprocess.run(build, timeout=BUILD_S, check=False).returncode
+        with progress("building images"):
+            code = subprocess.run(build, timeout=BUILD_S, check=False).returncode
     except subprocess.TimeoutExpired as error:
         raise OffloadError(f"`{' '.join(build)}` has not ended after {BUILD_S:g} s") from error
     if code != 0:

@@ -19,7 +19,6 @@ from offboard.loadgen.relay.link.link_settings import as_flags
 from offboard.loadgen.relay.relay_client import RelayClient, ask
 from offboard.loadgen.testbed import container_part as inside
 from offboard.loadgen.testbed.container_hogs import ContainerHogs
-from offboard.loadgen.testbed.container_output import Output
 from offboard.loadgen.testbed.container_part import FAR, NEAR, kind_of
 from offboard.loadgen.testbed.container_usage import UsageMeter
 from offboard.loadgen.testbed.docker_engine import (
@@ -32,6 +31,7 @@ from offboard.loadgen.testbed.docker_engine import (
     reason,
 )
 from offboard.loadgen.testbed.docker_images import build_images, check_compose
+from offboard.loadgen.testbed.part_output import Output
 from offboard.loadgen.testbed.part_process import (
     KILL_S,
     POLL_S,

@@ -120,7 +120,11 @@ class LocalTestbed:
         return part in self._children and self.exit_code(part) is None
 
     def exit_code(self, part: str) -> int | None:
-        return self._children[part].process.poll()
+        child = self._children[part]
+        code = child.process.poll()
+        if code is not None:
+            child.finish_output()
+        return code
 
     def wait(self, part: str, timeout_s: float | None = None) -> int:
         """Wait for the end of a part and return its exit code.

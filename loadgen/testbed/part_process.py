@@ -13,21 +13,23 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
 from offboard.common.errors import ConfigError, OffloadError
+from offboard.loadgen.progress import drawn_on
 from offboard.loadgen.relay.relay_client import ask
 from offboard.loadgen.testbed.cpu_quota import Quota
+from offboard.loadgen.testbed.part_output import TAIL_BYTES, TAIL_LINES, Output
 from offboard.loadgen.testbed.testbed import PART
 
 LAUNCH_S = 10.0
 POLL_S = 0.05
 TERMINATE_S = 5.0
 KILL_S = 5.0
-TAIL_LINES = 15
-TAIL_BYTES = 1 << 16
+CHUNK_BYTES = 1 << 16
 USAGE_EXIT = 2
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 
@@ -56,7 +58,8 @@ class Part:
     `http` (HOST:PORT) answers 200 at the path `ready` once the process is ready; None: there is nothing to
     wait for.
     `cpus` is its CPU quota; None: no quota.
-    Its output goes to logs/NAME.log, or to our own output if it is `shown`.
+    Its output goes to logs/NAME.log, or to our own output if it is `shown`. On a terminal it goes through
+    this process, which may draw a bar there.
     """
 
     name: str
@@ -77,6 +80,7 @@ class Child:
     log_start: int  # size of the log before this start
     launched: int  # pipe that reaches its end once the launcher has become the part
     quota: Quota | None = None
+    output: Output | None = None
 
     def wait_launched(self) -> None:
         """Wait until the process can no longer outlive us; from then on it may be stopped."""
@@ -97,6 +101,14 @@ class Child:
         """Send a signal to the process and to its workers, which are in its process group."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.process.pid, number)
+
+    def finish_output(self) -> None:
+        """Wait for the last output of a process that has ended, if it goes through us."""
+        if self.output is not None:
+            self.output.finish()
+            self.output = None
+            assert self.process.stdout is not None
+            self.process.stdout.close()
 
     def tail(self) -> str:
         """The last lines that the process logged since its start."""
@@ -124,17 +136,23 @@ def launch(part: Part, log: Path, *, again: bool) -> Child:
             str(launching),
             *part.command,
         ]
-        output: Any = {} if part.shown else {"stdout": file, "stderr": subprocess.STDOUT}
+        through_us = part.shown and drawn_on(sys.stdout)
+        output: Any = {"stdout": subprocess.PIPE if through_us else file, "stderr": subprocess.STDOUT}
         process = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
             env={**os.environ, PART: part.name},
             start_new_session=True,
             pass_fds=[launching],
-            **output,
+            **({} if part.shown and not through_us else output),
         )
         os.close(launching)
-        return Child(part, process, log, log_start=file.tell(), launched=launched)
+        child = Child(part, process, log, log_start=file.tell(), launched=launched)
+    if process.stdout is not None:
+        chunks = iter(partial(os.read, process.stdout.fileno(), CHUNK_BYTES), b"")
+        child.output = Output(part.name, chunks, None)
+        child.output.start()
+    return child
 
 
 def wait_ready(child: Child, timeout_s: float) -> None:

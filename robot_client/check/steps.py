@@ -203,7 +203,7 @@ class Check:
         if reply is None:
             raise StepFailed(
                 f"no answer within {self._timeout_s:g} s",
-                "the workers may be busy: look at queue_depth in /metrics of the server, and check again",
+                "the workers may be busy: see waiting_requests in /metrics of the server, and check again",
             )
         if reply.status in ("busy", "expired"):
             raise StepFailed(

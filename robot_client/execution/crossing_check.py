@@ -50,4 +50,6 @@ class CrossingCheck:
     def _log(self, kind: Kind, why: str, *, ran: bool) -> None:
         if (kind.name, ran) not in self._logged:
             self._logged.add((kind.name, ran))
-            log.warning("%s: only onboard can answer such a call: %s", kind.name, why)
+            log.warning(
+                "%s: only onboard can answer such a call: %s; remedy: change that value", kind.name, why
+            )

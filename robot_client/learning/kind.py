@@ -93,7 +93,7 @@ class KindMemory:
         except BaseException as error:  # the function is the user's own
             if is_interrupt(error):
                 raise
-            log.exception("cannot read the work of task %s from its result", self.kind.name)
+            log.exception("cannot read the work of task %s; remedy: correct its `work`", self.kind.name)
             return None
 
     def work_of_any(self, executions: Iterable[Execution]) -> float | None:

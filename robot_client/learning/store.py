@@ -117,7 +117,9 @@ class Store:
             if self._writer is not None:
                 self._writer.join(WRITE_WAIT_S)
         if self._writing():
-            log.warning("memory %s: not written within %g s", self.path, WRITE_WAIT_S)
+            log.warning(
+                "memory %s: not written within %g s; remedy: use a faster disk", self.path, WRITE_WAIT_S
+            )
 
     def _writing(self) -> bool:
         return self._writer is not None and self._writer.is_alive()
@@ -138,7 +140,7 @@ class Store:
     def _warn(self, why: str | None) -> None:
         """Warn once, until the file can be written again."""
         if not self._failed:
-            log.warning("memory %s cannot be written: %s; tasks go on", self.path, why)
+            log.warning("memory %s cannot be written: %s; remedy: use another file", self.path, why)
         self._failed = True
 
     def _read(self) -> dict[str, KeptKind]:
@@ -152,7 +154,8 @@ class Store:
             return {}
         except (OSError, Unreadable) as error:
             reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
-            log.warning("memory %s: %s; starting cold, %s", self.path, reason, self._set_aside())
+            said = "memory %s: %s; starting cold, %s; remedy: none, the tasks are learnt again"
+            log.warning(said, self.path, reason, self._set_aside())
             return {}
 
     def _set_aside(self) -> str:

@@ -69,7 +69,8 @@ class PolicyServerRunner:
     ) -> None:
         check_policy_server(site, endpoint, insecure=insecure)
         if is_readable(endpoint):
-            log.warning("%s: %s: anybody on the way can read and change what is sent", site, endpoint)
+            text = "%s: %s: anybody on the way can read and change what is sent; remedy: use wss://"
+            log.warning(text, site, endpoint)
         self.site = site
         self._endpoint = endpoint
         self._absent: str | None = f"no answer from {endpoint} yet"
@@ -176,7 +177,7 @@ class PolicyServerRunner:
                     log.info("%s: connection to %s lost: %s", self.site, self._endpoint, why)
             except Exception as error:
                 why = describe(error)
-                log.exception("%s: %s", self.site, self._endpoint)
+                log.exception("%s: %s; remedy: report this traceback", self.site, self._endpoint)
             self._down(f"not connected to {self._endpoint}: {why}", f"the connection was lost: {why}")
             await asyncio.sleep(self._reconnect_s)
             self._reconnect_s = min(2 * self._reconnect_s, RECONNECT_MAX_S)
@@ -312,6 +313,5 @@ class PolicyServerRunner:
         now_s = time.perf_counter()
         if now_s - self._warned_s >= LOG_PAUSE_S:
             self._warned_s = now_s
-            log.warning(
-                "%s: %s: %s (others within %g s are not logged)", self.site, self._endpoint, why, LOG_PAUSE_S
-            )
+            text = "%s: %s: %s (others within %g s are not logged); remedy: see the log of that server"
+            log.warning(text, self.site, self._endpoint, why, LOG_PAUSE_S)

@@ -72,7 +72,8 @@ class Lines:
         with self._counting:
             first, self.lost = not self.lost, self.lost + count
         if first:
-            log.error("%s %s: a line is lost: %s; others are only counted", self._what, self.path, why)
+            text = "%s %s: a line is lost: %s; others are only counted; remedy: free the disk"
+            log.error(text, self._what, self.path, why)
 
     def _cut_torn_line(self) -> None:
         """Remove half a line that a crash has left. A file of another kind is never changed."""
@@ -82,7 +83,9 @@ class Lines:
             raise ConfigError(f"{self._what} {self.path}: the file exists and is no {self._what}")
         kept = _end_of_last_line(self.path)
         if kept < self.path.stat().st_size:
-            log.warning("%s %s: cut off a torn last line", self._what, self.path)
+            log.warning(
+                "%s %s: cut off a torn last line; remedy: none, a crash had torn it", self._what, self.path
+            )
             os.truncate(self.path, kept)
 
 

@@ -5,78 +5,55 @@ The records are made in `offloader`.
 
 import logging
 from collections.abc import Iterator
-from threading import Thread
-from wsgiref.simple_server import WSGIServer
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, start_http_server
-from prometheus_client.core import CounterMetricFamily
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.registry import Collector
 
-from offboard.common.errors import ConfigError
-from offboard.robot_client.records.trace import Record, Trace
-from offboard.robot_client.sites.runner import PORT_MAX, Execution
+from offboard.common.live.live_port import LivePort
+from offboard.common.live.robot_live import RobotLive
+from offboard.robot_client.learning.regret import Regret
+from offboard.robot_client.records.trace import Record, Trace, as_dict
+from offboard.robot_client.sites.runner import Execution
 
 SECONDS_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
-
-REGRET = {
-    "": "Mean seconds per task that the better site would have saved",
-    "_low": "Lower end of the 90 % interval of robot_regret_seconds",
-    "_high": "Upper end of the 90 % interval of robot_regret_seconds",
-}
 
 log = logging.getLogger(__name__)
 
 
 class Metrics:
-    """An observer of the offloader that counts into `registry`."""
+    """An observer of the offloader that counts into `registry`, and keeps records for the page /live."""
 
     def __init__(self, registry: CollectorRegistry) -> None:
-        self._registry = registry
-        self._server: WSGIServer | None = None
-        self._thread: Thread | None = None
+        r = self._registry = registry
+        self._port: LivePort | None = None
+        self.live = RobotLive(as_dict)
+        site = ["kind", "site"]
         self._tasks = Counter(
-            "robot_tasks", "Tasks, by the site whose answer was used", ["kind", "site"], registry=registry
+            "offboard_robot_tasks", "Tasks, by the site whose answer was used", site, registry=r
         )
         self._executions = Counter(
-            "robot_executions",
-            "Executions by site and outcome",
-            ["kind", "site", "outcome"],
-            registry=registry,
+            "offboard_robot_executions", "Executions by site and outcome", [*site, "outcome"], registry=r
         )
+        about = "Seconds that the caller waited"
         self._waited = Histogram(
-            "robot_waited_seconds",
-            "Seconds that the caller waited",
-            ["kind"],
-            buckets=SECONDS_BUCKETS,
-            registry=registry,
+            "offboard_robot_wait_seconds", about, ["kind"], buckets=SECONDS_BUCKETS, registry=r
         )
-        self._predicted = Gauge(
-            "robot_predicted_seconds", "Last prediction, in seconds", ["kind", "site"], registry=registry
-        )
-        self._interval = Counter(
-            "robot_interval",
-            "Answers, by whether their time was inside the 90 % interval of the prediction",
-            ["kind", "site", "inside"],
-            registry=registry,
-        )
-        self._decisions = Counter(
-            "robot_decisions",
-            "Tasks, by the site that was chosen",
-            ["kind", "site", "policy"],
-            registry=registry,
-        )
-        self._duplicates = Counter(
-            "robot_duplicates",
-            "Executions beyond the first of a task: warm-up, measuring, probes, hedges, fallbacks",
-            ["kind"],
-            registry=registry,
-        )
-        self._regret = {
-            name: Gauge(f"robot_regret{name}_seconds", f"{what}, from probes", registry=registry)
-            for name, what in REGRET.items()
-        }
+        about = "Last prediction, in seconds"
+        self._predicted = Gauge("offboard_robot_predicted_seconds", about, site, registry=r)
+        about = "Answers, by whether their time was inside the 90 % interval of the prediction"
+        self._interval = Counter("offboard_robot_interval_checks", about, [*site, "inside"], registry=r)
+        about = "Tasks, by the site that was chosen"
+        self._decisions = Counter("offboard_robot_decisions", about, [*site, "policy"], registry=r)
+        about = "Executions beyond the first of a task: warm-up, measuring, probes, hedges, fallbacks"
+        self._duplicates = Counter("offboard_robot_duplicate_executions", about, ["kind"], registry=r)
+        about = "1 if the last task of this kind could use the site; 0 if it was silent or absent"
+        self._usable = Gauge("offboard_robot_site_usable", about, site, registry=r)
+        self._regret = _LatestRegret()
+        registry.register(self._regret)
 
     def __call__(self, record: Record) -> None:
+        self.live.keep(record)
         self._tasks.labels(record.kind, record.used or "none").inc()
         self._waited.labels(record.kind).observe(record.waited_s)
         self._decisions.labels(record.kind, record.decision.site, record.decision.policy).inc()
@@ -88,11 +65,11 @@ class Metrics:
         for site, outlook in record.sites.items():
             if outlook.predicted_s is not None:
                 self._predicted.labels(record.kind, site).set(outlook.predicted_s)
-
+        for site in {**self.live.sites, **record.sites}:  # a server that never answered is shown too
+            found = record.sites.get(site)
+            self._usable.labels(record.kind, site).set(found is not None and not found.condition.silent)
         if record.regret is not None:
-            regret = record.regret
-            for name, value in zip(REGRET, (regret.mean_s, regret.low_s, regret.high_s), strict=True):
-                self._regret[name].set(value)
+            self._regret.latest = record.regret
 
     def _judge(self, record: Record, execution: Execution) -> None:
         """Count whether the time was inside its interval. A run without an answer has no time to compare."""
@@ -106,17 +83,15 @@ class Metrics:
         """Also serve how many records `trace` has lost."""
         self._registry.register(_Lost(trace))
 
-    def serve(self, host: str, port: int) -> None:
-        """Answer GET /metrics in a background thread until `close`."""
-        self._server, self._thread = start_http_server(port, host, registry=self._registry)
-        log.info("metrics: http://%s:%d/metrics", host, self._server.server_port)
+    def serve(self, address: str, where: str) -> None:
+        """Answer GET /metrics and /live in background threads until `close`."""
+        self._port = LivePort(address, where, source=self.live, registry=self._registry)
+        log.info("metrics: %s/metrics; live page: %s/live", self._port.url, self._port.url)
 
     def close(self) -> None:
         """Stop serving."""
-        if self._server is not None and self._thread is not None:
-            self._server.shutdown()
-            self._server.server_close()
-            self._thread.join()
+        if self._port is not None:
+            self._port.close()
 
 
 class _Lost(Collector):
@@ -127,18 +102,28 @@ class _Lost(Collector):
 
     def collect(self) -> Iterator[CounterMetricFamily]:
         yield CounterMetricFamily(
-            "robot_trace_lost", "Records that the disk did not take in time", self._trace.lost
+            "offboard_robot_trace_lost_records",
+            "Records that the disk did not take in time",
+            self._trace.lost,
         )
+
+
+class _LatestRegret(Collector):
+    """The newest estimate. Before the first one there is no metric, as 0 would mean that nothing was lost."""
+
+    latest: Regret | None = None
+
+    def collect(self) -> Iterator[GaugeMetricFamily]:
+        name = "offboard_robot_regret{}_seconds"
+        if (found := self.latest) is not None:
+            what = "Mean seconds per task that the better site would have saved, estimated from probes"
+            yield GaugeMetricFamily(name.format(""), what, found.mean_s)
+            for end, value in (("low", found.low_s), ("high", found.high_s)):
+                yield GaugeMetricFamily(name.format(f"_{end}"), f"The {end} end of its 90 % interval", value)
 
 
 def serve_metrics(address: str, where: str) -> Metrics:
     """Metrics that are served at HOST:PORT. A ConfigError, which begins with `where`, if that fails."""
-    host, _, port = address.rpartition(":")
-    if not host or not port.isdecimal() or int(port) > PORT_MAX:
-        raise ConfigError(f"{where}: {address!r} is not HOST:PORT with a port 0 to {PORT_MAX}")
     metrics = Metrics(CollectorRegistry())
-    try:
-        metrics.serve(host, int(port))
-    except (OSError, UnicodeError) as error:
-        raise ConfigError(f"{where}: {address} cannot be served: {error}") from error
+    metrics.serve(address, where)
     return metrics

@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from offboard.common.errors import is_interrupt
+from offboard.common.live.robot_live import RobotLive
 from offboard.robot_client.learning.learner import PendingTask
 from offboard.robot_client.learning.regret import Regret
 from offboard.robot_client.learning.savings import Savings
@@ -30,6 +31,7 @@ class Recording:
 
     def __init__(self, *, trace: Path | str | None, metrics: str | None) -> None:
         self.observers: tuple[Observer, ...] = ()
+        self.live: RobotLive[Record] | None = None
         with ExitStack() as opened:
             file = self._trace = None if trace is None else Trace(Path(trace))
             if file is not None:
@@ -43,6 +45,7 @@ class Recording:
                 if file is not None:
                     served.watch(file)
                 self.observers += (served,)
+                self.live = served.live
             self._opened = opened.pop_all()
 
     def leave_to_parent(self) -> None:
@@ -87,10 +90,21 @@ def record_of(
 
 def tell(observers: Iterable[Observer], record: Record) -> None:
     """Call each observer. One that fails must not cost the caller its answer, whatever it raises."""
+    if log.isEnabledFor(logging.DEBUG):
+        _log_task(record)
     for observe in observers:
         try:
             observe(record)
         except BaseException as error:  # an observer is the user's own code
             if is_interrupt(error):
                 raise
-            log.exception("observer %r failed on task %d (%s)", observe, record.i, record.kind)
+            log.exception(
+                "observer %r failed on task %d (%s); remedy: correct it", observe, record.i, record.kind
+            )
+
+
+def _log_task(record: Record) -> None:
+    site, why, used, waited_s = (record.decision.site, record.decision.reason, record.used, record.waited_s)
+    text = "task %d of kind %s: answered by %s after %.6f s; chosen: %s: %s"
+    fields = {"i": record.i, "kind": record.kind, "used": used, "waited_s": waited_s, "site": site}
+    log.debug(text, record.i, record.kind, used or "no site", waited_s, site, why, extra={"task": fields})

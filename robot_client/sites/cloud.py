@@ -111,7 +111,8 @@ class CloudRunner:
             return self._pauses.why_absent(kind.name)
         if kind.name not in self._warned:
             self._warned.add(kind.name)
-            log.warning("%s: %s: this task stays onboard", self.site, why)
+            text = "%s: %s: this task stays onboard; remedy: install the same version there, and restart it"
+            log.warning(text, self.site, why)
         return Lasting(why)
 
     def submit(self, task: Task, budget_s: float) -> "Future[Execution]":
@@ -309,12 +310,10 @@ class CloudRunner:
         except ProtocolError as error:
             if received_s - self._warned_s >= LOG_PAUSE_S:
                 self._warned_s = received_s
-                log.warning(
-                    "%s: message dropped: %s (others within %g s are not logged)",
-                    self.site,
-                    error,
-                    LOG_PAUSE_S,
+                text = (
+                    "%s: message dropped: %s (others within %g s are not logged); remedy: robot-client check"
                 )
+                log.warning(text, self.site, error, LOG_PAUSE_S)
 
     def _take(self, message: wire.Message, received_s: float, bytes_in: int) -> None:
         if isinstance(message, wire.Hello):

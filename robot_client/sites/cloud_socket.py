@@ -138,8 +138,5 @@ def _dealer(context: "zmq.Context[Any]", endpoint: str, keys: RobotKeys | None) 
 def _warn_of_plain_text(site: str, endpoint: str) -> None:
     """Log a warning unless the server is on this computer."""
     if not on_loopback(endpoint.removeprefix("tcp://").rpartition(":")[0].strip("[]")):
-        log.warning(
-            "%s: %s without keys: anybody on the network path can read and change what is sent",
-            site,
-            endpoint,
-        )
+        text = "%s: %s without keys: anybody on the network path can read and change what is sent; "
+        log.warning(text + "remedy: robot-client keys", site, endpoint)

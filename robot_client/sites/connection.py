@@ -88,7 +88,8 @@ class Connection:
 
     def handshake_failed(self, failure: HandshakeFailure, now_s: float) -> None:
         if failure.text == UNKNOWN_ROBOT != self._detail and self.state is not State.CLOSED:
-            self._log(logging.WARNING, f"{self._endpoint}: {failure.text}; asking again", now_s)
+            text = f"{self._endpoint}: {failure.text}; asking again; remedy: copy robot.key to the server"
+            self._log(logging.WARNING, text, now_s)
         if failure.final:
             self._move(State.GIVEN_UP, failure.text, due_s=now_s + CONNECT_EVERY_S)
         else:
@@ -100,7 +101,9 @@ class Connection:
             self.due_s = now_s + CONNECT_EVERY_S
         elif self.state is not State.HANDSHAKE_FAILED:
             if self.state is State.UP:
-                self._log(logging.WARNING, f"connection to {self._endpoint} lost", now_s)
+                self._log(
+                    logging.WARNING, f"connection to {self._endpoint} lost; remedy: robot-client check", now_s
+                )
             self._move(State.LOST)
 
     def hello_answered(self, now_s: float) -> bool:
@@ -118,7 +121,7 @@ class Connection:
         """A message came in another version of the wire format."""
         if self.state in (State.INCOMPATIBLE, State.GIVEN_UP, State.CLOSED):
             return
-        self._log(logging.WARNING, f"{why}: tasks stay onboard", now_s)
+        self._log(logging.WARNING, f"{why}: tasks stay onboard; remedy: install one version", now_s)
         self._move(State.INCOMPATIBLE, why)
         self.why_absent = Lasting(why)
 

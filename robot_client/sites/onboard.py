@@ -205,13 +205,9 @@ class OnboardRunner:
                 self._queue.put(None)
         _give_up(waiting)
         if count := join_all(self._started, CLOSE_WAIT_S):
-            log.warning(
-                "%s: %d of its threads still run a task %g s after the close; if that is native code, "
-                "it may crash when the process ends",
-                ONBOARD,
-                count,
-                CLOSE_WAIT_S,
-            )
+            text = "%s: %d of its threads still run a task %g s after the close; if that is native code, "
+            text += "it may crash when the process ends; remedy: end calls before the close"
+            log.warning(text, ONBOARD, count, CLOSE_WAIT_S)
         with self._lock:
             running = [run for run in self._runs.values() if not run.abandoned]
             for run in running:

@@ -15,6 +15,7 @@ from offboard.loadgen.testbed.docker_engine import RUN
 ROOT = Path(__file__).parents[2]
 PROJECT = "offboard-test"
 HTTP_PORT, WAN_HTTP_PORT = "18000", "18001"
+ROBOT_METRICS_PORT, PROMETHEUS_PORT = "19100", "19090"
 SETTINGS = {
     "TASKS": "80",
     "MEASURE": "60",
@@ -22,6 +23,8 @@ SETTINGS = {
     "WINDOWS": "5,10,20",
     "CLOUD_HTTP_PORT": HTTP_PORT,
     "WAN_HTTP_PORT": WAN_HTTP_PORT,
+    "ROBOT_METRICS_PORT": ROBOT_METRICS_PORT,
+    "PROMETHEUS_PORT": PROMETHEUS_PORT,
 }
 COMMAND_S = 600
 

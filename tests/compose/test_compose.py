@@ -55,7 +55,8 @@ def test_the_server_stays_up_after_the_robot(up: Compose) -> None:
     assert json.loads(get(f"{up.url}/health", token)[1])["version"]
     assert get(f"{up.url}/ready")[0] == 200
     assert get(f"{up.url}/metrics")[0] == 401
-    assert 'offboard_requests_total{kind="plan_path",status="ok"}' in get(f"{up.url}/metrics", token)[1]
+    answered = 'offboard_server_requests_total{kind="plan_path",status="ok"}'
+    assert answered in get(f"{up.url}/metrics", token)[1]
     assert "plan_path" in [one["name"] for one in json.loads(get(f"{up.url}/tasks", token)[1])]
 
 

@@ -89,7 +89,9 @@ def memory(served: Served) -> int:
 def dropped(served: Served) -> float:
     text = httpx.get(f"{served.http}/metrics").text
     return sum(
-        float(line.split()[-1]) for line in text.splitlines() if line.startswith("offboard_dropped_total")
+        float(line.split()[-1])
+        for line in text.splitlines()
+        if line.startswith("offboard_server_dropped_messages_total")
     )
 
 

@@ -46,11 +46,11 @@ class Served:
     @property
     def asked(self) -> int:
         labels = {"kind": "both_sums", "status": "need_blob"}
-        return int(self.metrics.registry.get_sample_value("offboard_requests_total", labels) or 0)
+        return int(self.metrics.registry.get_sample_value("offboard_server_requests_total", labels) or 0)
 
     @property
     def kept_bytes(self) -> float:
-        return self.metrics.registry.get_sample_value("offboard_blob_bytes") or 0.0
+        return self.metrics.registry.get_sample_value("offboard_server_blob_bytes") or 0.0
 
 
 @pytest.fixture

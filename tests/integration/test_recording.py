@@ -30,7 +30,7 @@ def test_an_offloader_serves_metrics_and_writes_a_trace_until_it_is_closed(
         found = re.search(r"metrics: (http://127\.0\.0\.1:(\d+)/metrics)", caplog.text)
         assert found is not None
         text = urllib.request.urlopen(found[1], timeout=5).read().decode()
-        assert 'robot_tasks_total{kind="echo",site="onboard"} 3.0' in text
+        assert 'offboard_robot_tasks_total{kind="echo",site="onboard"} 3.0' in text
     offload.close()
     assert [record["i"] for record in read_trace(path)] == [0, 1, 2]
     with pytest.raises(URLError):

@@ -93,7 +93,7 @@ def test_other_source_on_the_server_is_one_line(
         assert offload.last is not None
         assert offload.last.decision.reason == f"cloud: {said}"
     assert [one.getMessage() for one in caplog.records if "stays onboard" in one.getMessage()] == [
-        f"cloud: {said}: this task stays onboard"
+        f"cloud: {said}: this task stays onboard; remedy: install the same version there, and restart it"
     ]
 
 

@@ -15,13 +15,13 @@ from tests.table_loops import Line, csv_of
 def print_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., str]:
-    """Writes a CSV dataset (text, or lines of numbers), runs `loadgen table` on it, returns its output."""
+    """Writes a CSV dataset (text, or lines of numbers), runs `loadgen table --all` on it."""
     monkeypatch.chdir(tmp_path)
 
     def run(rows: str | list[Line], name: str = "twelve.csv", **settings: Any) -> str:
         text = rows if isinstance(rows, str) else csv_of(rows)
         Path(name).write_text(text, encoding="utf-8")
-        assert run_table(Path(name), TableConfig(**settings)) == 0
+        assert run_table(Path(name), TableConfig(all_columns="columns" not in settings, **settings)) == 0
         return capsys.readouterr().out
 
     return run

@@ -155,9 +155,9 @@ def test_the_log_says_each_change_once(caplog: pytest.LogCaptureFixture) -> None
             event(connection)
     assert [record.getMessage() for record in caplog.records] == [
         f"cloud: {ENDPOINT} is up",
-        f"cloud: connection to {ENDPOINT} lost",
-        f"cloud: {ENDPOINT}: {UNKNOWN_ROBOT}; asking again",
-        f"cloud: {VERSIONS}: tasks stay onboard",
+        f"cloud: connection to {ENDPOINT} lost; remedy: robot-client check",
+        f"cloud: {ENDPOINT}: {UNKNOWN_ROBOT}; asking again; remedy: copy robot.key to the server",
+        f"cloud: {VERSIONS}: tasks stay onboard; remedy: install one version",
     ]
 
 

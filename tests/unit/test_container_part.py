@@ -11,8 +11,8 @@ import yaml
 from offboard.common.errors import ConfigError
 from offboard.loadgen.play.part_setups import setups
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
-from offboard.loadgen.testbed.container_output import Output
 from offboard.loadgen.testbed.container_part import IMAGES, as_popen, as_seen, measured, quota, service_of
+from offboard.loadgen.testbed.part_output import Output
 from offboard.loadgen.testbed.process_owner import is_gone, owner
 
 

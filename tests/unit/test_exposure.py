@@ -78,4 +78,7 @@ def test_an_insecure_process_keeps_warning(monkeypatch: pytest.MonkeyPatch) -> N
     finally:
         monkeypatch.undo()
         exposure.log.removeHandler(handler)
-    assert said[0] == "--insecure: --http: x is open: anyone who can reach this process may use it"
+    assert said[0] == (
+        "--insecure: --http: x is open: anyone who can reach this process may use it; "
+        "remedy: set the missing flags"
+    )

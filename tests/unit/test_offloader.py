@@ -224,7 +224,9 @@ def test_what_cannot_be_sent_is_answered_onboard(
             assert offload(add_one, number, where=where) == number + 1
             assert offload.last is not None
             assert offload.last.used == ONBOARD
-    assert caplog.messages == [f"add_one: only onboard can answer such a call: {refused}"]
+    assert caplog.messages == [
+        f"add_one: only onboard can answer such a call: {refused}; remedy: change that value"
+    ]
 
 
 @pytest.mark.parametrize("where", [None, ONBOARD, CLOUD])

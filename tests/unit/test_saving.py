@@ -125,7 +125,7 @@ def test_a_failing_disk_gives_one_warning_and_costs_no_answer(
         assert offload(store_plain, 2.0) == 2.0
         wait_for_writers()
     assert [one.getMessage() for one in caplog.records if one.levelno == logging.WARNING] == [
-        f"memory {robot.path} cannot be written: Is a directory; tasks go on"
+        f"memory {robot.path} cannot be written: Is a directory; remedy: use another file"
     ]
     blocked.rmdir()
     offload.close()

@@ -102,7 +102,7 @@ def test_a_stalled_disk_stops_no_task(
     assert trace.lost == 3 * WAITING_MAX - in_pipe
     assert errors(caplog) == [
         f"trace {trace.path}: a line is lost: {WAITING_MAX} records wait for the disk; "
-        "others are only counted"
+        "others are only counted; remedy: free the disk"
     ]
 
 
@@ -149,10 +149,10 @@ def test_the_lost_records_are_a_metric(tmp_path: Path, stall: Callable[[Trace], 
     registry = CollectorRegistry()
     trace = Trace(tmp_path / "trace.jsonl")
     Metrics(registry).watch(trace)
-    assert registry.get_sample_value("robot_trace_lost_total") == 0
+    assert registry.get_sample_value("offboard_robot_trace_lost_records_total") == 0
     stall(trace)
     fill(trace, WAITING_MAX + 100)
-    assert registry.get_sample_value("robot_trace_lost_total") == trace.lost > 0
+    assert registry.get_sample_value("offboard_robot_trace_lost_records_total") == trace.lost > 0
     trace.close()
 
 

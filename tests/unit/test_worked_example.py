@@ -15,7 +15,7 @@ Print = Callable[..., str]
 def test_the_page_shows_what_the_command_prints(print_table: Print) -> None:
     """docs/evaluation.md shows exactly what `loadgen table` prints for its twelve rows."""
     out = print_table(TWELVE, windows=("3", "full"), feedback="both")
-    _, _, shown = section("What is printed").partition("feedback both`\n")
+    _, _, shown = section("What is printed").partition("feedback both --all`\n")
     assert shown.strip() == out.strip()
 
 

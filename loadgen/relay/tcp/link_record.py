@@ -90,7 +90,9 @@ class LinkRecord:
         self._thread.join(CLOSE_S)
         if self._thread.is_alive():
             log.warning(
-                "the record of the link could not be written within %g s: its end is missing", CLOSE_S
+                "the record of the link was not written within %g s: its end is missing; "
+                "remedy: use a faster disk",
+                CLOSE_S,
             )
 
     def _event(self, what: str, now_s: float, **more: Any) -> str:
@@ -125,7 +127,8 @@ class LinkRecord:
             while left and not self._broken:
                 left = left[self._file.write(left) :]
         except OSError as error:
-            log.warning("cannot write the record of the link: %s; later lines are dropped", error.strerror)
+            text = "cannot write the record of the link: %s; later lines are dropped; remedy: free its disk"
+            log.warning(text, error.strerror)
             self._broken = True
         with self._lock:
             self._waiting_bytes -= len(text)

@@ -84,7 +84,7 @@ class Relay:
     def target_down(self, error: OSError) -> None:
         """Log, once, that the cloud accepts no connections, so that clients are disconnected."""
         if self._target_is_up:
-            log.warning("cannot connect to %s:%d: %s", *self.target, error)
+            log.warning("cannot connect to %s:%d: %s; remedy: start it, or correct --to", *self.target, error)
         self._target_is_up = False
 
     def abort(self) -> None:

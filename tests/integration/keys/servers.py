@@ -44,7 +44,9 @@ def token_file(folder: Path) -> Path:
 def metric(served: Served, name: str) -> float:
     """The sum of a metric of the server over all of its labels."""
     text = httpx.get(f"{served.http}/metrics").text
-    return sum(float(line.split()[-1]) for line in text.splitlines() if line.startswith(f"offboard_{name}"))
+    full = f"offboard_server_{name}"
+    assert full.partition("{")[0] in text, f"the server has no metric {full}"
+    return sum(float(line.split()[-1]) for line in text.splitlines() if line.startswith(full))
 
 
 def why_not(offload: Offloader) -> str:

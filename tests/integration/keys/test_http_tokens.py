@@ -13,13 +13,13 @@ pytestmark = [pytest.mark.integration, pytest.mark.timeout(90)]
 
 
 def test_http_needs_its_token(serve: Serve, tmp_path: Path) -> None:
-    """Without the token everything is 401, except /health and /ready, which then say little."""
+    """Without the token all is 401, except pages without data, and /health and /ready, which say little."""
     served = serve(None, "--http", "0.0.0.0:0", "--token-file", str(token_file(tmp_path)))
     wrong = [None, "Bearer", "Bearer wrong", f"Basic {TOKEN}", f"Bearer {TOKEN}x", f"Bearer {TOKEN[:-1]}"]
     for authorization in wrong:
         headers = {"Authorization": authorization} if authorization else {}
         with httpx.Client(base_url=served.http, headers=headers) as http:
-            for path in ("/metrics", "/config", "/tasks", "/docs", "/openapi.json", "/nothing"):
+            for path in ("/metrics", "/config", "/tasks", "/live/looks", "/openapi.json", "/nothing"):
                 refused = http.get(path)
                 assert (refused.status_code, refused.headers["www-authenticate"]) == (401, "Bearer"), path
                 assert VERSION not in refused.text

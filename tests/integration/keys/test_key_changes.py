@@ -91,7 +91,7 @@ def test_a_removed_robot_gets_no_answer(keys: Keys, serve: Serve, tmp_path: Path
         assert not raw.socket.poll(0)
     assert not mark.exists()
     assert metric(served, 'requests_total{kind="mark_once",status="cancelled"}') == 1
-    assert metric(served, 'dropped_total{reason="unknown robot"}') == 1
+    assert metric(served, 'dropped_messages_total{reason="unknown robot"}') == 1
 
 
 def test_a_broken_file_does_not_keep_a_removed_robot_in(keys: Keys, serve: Serve, robot: Robot) -> None:

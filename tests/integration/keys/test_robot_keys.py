@@ -38,7 +38,7 @@ def test_a_robot_without_keys_is_not_served(keys: Keys, serve: Serve, robot: Rob
     offload = robot(served.endpoint, None)
     until(lambda: NO_HANDSHAKE in why_not(offload))
     stays_onboard(offload)
-    assert metric(served, "bytes_in_total") == 0
+    assert metric(served, "received_bytes_total") == 0
 
 
 def test_a_robot_that_is_not_known_is_refused(keys: Keys, serve: Serve, robot: Robot) -> None:
@@ -47,7 +47,7 @@ def test_a_robot_that_is_not_known_is_refused(keys: Keys, serve: Serve, robot: R
     offload = robot(served.endpoint, keys.make("stranger"))
     until(lambda: UNKNOWN_ROBOT in why_not(offload))
     stays_onboard(offload)
-    assert metric(served, "refused_total") > 0
+    assert metric(served, "refused_handshakes_total") > 0
     until(lambda: served.logged("refused a robot at 127.0.0.1"))
     keys.let_in("stranger")
     assert offload.wait_for_sites(echo, WAIT_S) == {}
@@ -92,7 +92,7 @@ def test_a_server_with_another_key_gets_no_task(keys: Keys, serve: Serve, robot:
     offload = robot(served.endpoint, folder)
     until(lambda: NO_HANDSHAKE in why_not(offload))
     stays_onboard(offload)
-    assert metric(served, "bytes_in_total") == 0
+    assert metric(served, "received_bytes_total") == 0
 
 
 def test_a_plain_server_gets_no_task_from_a_robot_with_keys(keys: Keys, serve: Serve, robot: Robot) -> None:
@@ -100,7 +100,7 @@ def test_a_plain_server_gets_no_task_from_a_robot_with_keys(keys: Keys, serve: S
     served = serve(None)
     offload = robot(served.endpoint, keys.add("arm"))
     until(lambda: NO_HANDSHAKE in why_not(offload))
-    assert metric(served, "bytes_in_total") == 0
+    assert metric(served, "received_bytes_total") == 0
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_plain_text_is_not_read(keys: Keys, serve: Serve, said: bytes) -> None:
     served = serve(keys)
     answered = says_until_closed(served.port, said)
     assert b"READY" not in answered
-    assert metric(served, "bytes_in_total") == 0
+    assert metric(served, "received_bytes_total") == 0
 
 
 def test_each_site_has_its_own_server_key(keys: Keys, serve: Serve, tmp_path: Path) -> None:

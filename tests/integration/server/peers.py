@@ -81,8 +81,10 @@ class Running:
         self.answered = self.server.run()
 
     def counted(self, name: str, **labels: str) -> float:
-        """The value of a metric."""
-        return self.metrics.registry.get_sample_value(f"offboard_{name}", labels) or 0.0
+        """The value of a metric; 0 if it has no such labels yet."""
+        full, registry = f"offboard_server_{name}", self.metrics.registry
+        assert any(full.removesuffix("_total") == one.name for one in registry.collect()), full
+        return registry.get_sample_value(full, labels) or 0.0
 
     def close(self) -> None:
         self.server.drain()

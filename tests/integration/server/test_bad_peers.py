@@ -42,7 +42,7 @@ def test_random_and_mutated_frames_do_no_harm(serve: Serve, join: Join) -> None:
     until(lambda: running.server.status().running + running.server.status().queue_depth == 0)
     grown = resident_bytes() - memory
     assert grown < 50 * 2**20
-    assert running.counted("dropped_total", reason="malformed") > 500
+    assert running.counted("dropped_messages_total", reason="malformed") > 500
     assert running.counted("blob_bytes") <= 2**20
 
 
@@ -51,7 +51,7 @@ def test_a_message_above_the_limit_is_dropped(serve: Serve, join: Join) -> None:
     running = serve(message_bytes_max=2**17)
     good, bad = join(running.server.endpoint), join(running.server.endpoint)
     bad.request(1, "served_sum", *[np.zeros(8000)] * 4)
-    until(lambda: running.counted("dropped_total", reason="malformed") == 1)
+    until(lambda: running.counted("dropped_messages_total", reason="malformed") == 1)
     bad.send(Blob(bytes(2**18)))
     assert good.value(1, "served_sum", np.ones(5)) == 5
     assert running.counted("blob_bytes") == 0
@@ -69,7 +69,7 @@ def test_the_reply_to_a_robot_that_left_is_dropped(serve: Serve, join: Join, pip
     until(lambda: running.server.status().queue_depth == 1)
     pipe.write_text("go")
     assert peer.reply().status == "ok"
-    assert running.counted("dropped_total", reason="gone") == 1
+    assert running.counted("dropped_messages_total", reason="gone") == 1
 
 
 def test_a_robot_that_does_not_read_does_not_stop_others(serve: Serve, join: Join) -> None:
@@ -79,7 +79,7 @@ def test_a_robot_that_does_not_read_does_not_stop_others(serve: Serve, join: Joi
     for n in range(600):
         deaf.request(n, "served_zeros", 100_000)
         assert n % 10 or good.value(n, "served_sum", np.ones(5)) == 5
-    assert running.counted("dropped_total", reason="not reading") > 0
+    assert running.counted("dropped_messages_total", reason="not reading") > 0
     deaf.close()
 
 

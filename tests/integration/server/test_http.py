@@ -39,8 +39,8 @@ def test_http_shows_the_server(serve: Serve, join: Join) -> None:
         assert shown["version"] == VERSION
         assert http.get("/ready").status_code == 200
         metrics = http.get("/metrics").text
-        assert 'offboard_requests_total{kind="served_sum",status="ok"} 1.0' in metrics
-        assert 'offboard_run_seconds_count{kind="served_sum"} 1.0' in metrics
+        assert 'offboard_server_requests_total{kind="served_sum",status="ok"} 1.0' in metrics
+        assert 'offboard_server_run_seconds_count{kind="served_sum"} 1.0' in metrics
         assert http.get("/config").json() == {"workers": 1}
         task = next(task for task in http.get("/tasks").json() if task["name"] == "served_sum")
         assert task["duplicate"] is False

@@ -169,7 +169,7 @@ def test_the_log_shows_where_a_setup_raised(tmp_path: Path, name: str, when: str
     first, *shown, last = done.stderr.splitlines()
     cause = "FileNotFoundError: no model in models"
     assert last == f"cloud-server: {when} of task find_things: {cause}"
-    assert first.endswith("ERROR the server cannot start")
+    assert first.endswith(": the server cannot start; remedy: correct the setup of that task")
     assert shown[0] == "Traceback (most recent call last):"
     assert shown[-1] == cause
     files = [line for line in shown if line.startswith("  File ")]

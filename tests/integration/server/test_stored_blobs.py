@@ -61,7 +61,7 @@ def test_a_compressed_blob_of_another_size_is_dropped(serve: Serve, join: Join, 
     peer.send(Blob(compress(array.data.cast("B")), size))
     peer.request(1, "served_sum", array)
     assert peer.reply().status == "need_blob"
-    assert running.counted("dropped_total", reason="malformed") == 1
+    assert running.counted("dropped_messages_total", reason="malformed") == 1
     assert running.counted("blob_bytes") == 0
 
 
@@ -72,7 +72,7 @@ def test_a_compressed_blob_counts_with_all_its_bytes(serve: Serve, join: Join) -
     for n in range(3):
         array = np.full(100_000, float(n))
         peer.send(Blob(compress(array.data.cast("B")), array.nbytes))
-    until(lambda: running.counted("dropped_total", reason="quota") == 2)
+    until(lambda: running.counted("dropped_messages_total", reason="quota") == 2)
     assert running.counted("blob_bytes") == 800_000
 
 
@@ -83,9 +83,9 @@ def test_a_flood_of_compressed_blobs_is_cut_off(serve: Serve, join: Join) -> Non
     peer, packed = join(running.server.endpoint), compress(bytes(size))
     for _ in range(4):
         peer.send(Blob(packed, size))
-    until(lambda: running.counted("cut_off_total") == 1)
+    until(lambda: running.counted("cut_off_connections_total") == 1)
     assert running.counted("blob_bytes") == size
-    assert running.counted("dropped_total", reason="quota") == 3
+    assert running.counted("dropped_messages_total", reason="quota") == 3
 
 
 def test_a_waiting_request_keeps_its_blobs(serve: Serve, join: Join, pipe: Path) -> None:

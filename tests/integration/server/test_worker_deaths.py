@@ -28,7 +28,7 @@ def test_without_a_worker_the_server_is_busy(serve: Serve, join: Join) -> None:
     assert peer.reply().status == "busy"
     until(lambda: running.server.status().ready)
     assert peer.value(3, "served_sum", np.ones(9)) == 9
-    assert running.counted("executor_restarts_total", reason="signal") == 1 + SPARES
+    assert running.counted("worker_restarts_total", reason="signal") == 1 + SPARES
 
 
 def test_other_workers_go_on_after_a_death(serve: Serve, join: Join, pipe: Path) -> None:
@@ -52,13 +52,13 @@ def test_a_request_that_killed_three_workers_is_not_run_again(serve: Serve, join
     for crashes in range(1, 4):
         peer.request(7, "served_die")
         assert "SIGKILL" in peer.reply().error
-        until(lambda: running.counted("executor_restarts_total", reason="signal") == crashes)  # noqa: B023
+        until(lambda: running.counted("worker_restarts_total", reason="signal") == crashes)  # noqa: B023
         until(lambda: running.server.status().ready)
     peer.request(7, "served_die")
     reply = peer.reply()
     assert (reply.status, reply.error) == ("failed", "its worker died 3 times; it is not run again")
     assert peer.value(8, "served_count") == other.value(7, "served_count") == 0
-    assert running.counted("executor_restarts_total", reason="signal") == 3
+    assert running.counted("worker_restarts_total", reason="signal") == 3
 
 
 def test_a_run_beyond_its_budget_is_failed_not_expired(serve: Serve, join: Join, pipe: Path) -> None:

@@ -1,6 +1,6 @@
-"""The output of a container, written to a log or to our stdout while the container runs.
+"""The output of a part, written to a log or to our stdout while the part runs.
 
-`docker_testbed` attaches to the container.
+`docker_testbed` attaches to a container; `part_process` reads the pipe of a process.
 """
 
 import codecs
@@ -10,9 +10,9 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-from offboard.loadgen.testbed.part_process import TAIL_BYTES, TAIL_LINES
-
-END_S = 5.0  # longest wait for the last output of a container that has ended
+TAIL_LINES = 15
+TAIL_BYTES = 1 << 16
+END_S = 5.0  # longest wait for the last output of a part that has ended
 
 
 class Output(threading.Thread):
@@ -43,7 +43,7 @@ class Output(threading.Thread):
                         file.write(chunk)
 
     def finish(self) -> None:
-        """Wait for the last output of a container that has ended, at most END_S."""
+        """Wait for the last output of a part that has ended, at most END_S."""
         self.join(END_S)
 
     def tail(self) -> str:

@@ -1,0 +1,203 @@
+// Draws the charts with plotly. What they show is computed in `memory.js`.
+
+import { amount, answered } from "./memory.js";
+
+/* global Plotly */
+
+const SYMBOLS = ["circle", "diamond", "square", "triangle-up"];
+const BINS = 30;
+const time = { type: "date" };
+const OPTIONS = { displayModeBar: false, responsive: true };
+
+export const colour = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+export const siteNumber = (sites, site) => Math.max(0, sites.indexOf(site)) % SYMBOLS.length;
+const siteColour = (sites, site) => colour(`--site-${siteNumber(sites, site)}`);
+const faded = (hex, share) => hex + Math.round(share * 255).toString(16).padStart(2, "0");
+
+// Charts change their width when a card is added next to theirs.
+const resized = new ResizeObserver(entries => {
+  for (const { target } of entries) if (target.data) Plotly.Plots.resize(target);
+});
+
+// A card with a heading, a chart and a sentence that says what it shows. It is made at its first use.
+function card(id, title) {
+  let figure = document.getElementById(id);
+  if (figure === null) {
+    figure = document.createElement("figure");
+    figure.id = id;
+    const heading = document.createElement("h2"), plot = document.createElement("div");
+    heading.textContent = title;
+    plot.className = "plot";
+    plot.setAttribute("role", "img");
+    resized.observe(plot);
+    figure.append(heading, plot, document.createElement("p"));
+    document.getElementById("charts").append(figure);
+  }
+  figure.querySelector("h2").textContent = title;
+  return figure;
+}
+
+function draw(id, title, traces, layout, said) {
+  const figure = card(id, title), text = colour("--text"), grid = colour("--grid");
+  const axis = { gridcolor: grid, zerolinecolor: grid, linecolor: grid, automargin: true };
+  figure.querySelector(".plot").setAttribute("aria-label", `${title}. ${said}`);
+  figure.querySelector("p").textContent = said;
+  Plotly.react(figure.querySelector(".plot"), traces, {
+    paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", font: { color: text, size: 12 },
+    margin: { l: 48, r: 12, t: 8, b: 36 }, dragmode: false, showlegend: traces.length > 1,
+    legend: { orientation: "h", y: 1.02, yanchor: "bottom", x: 0 }, hovermode: "closest", ...layout,
+    xaxis: { ...axis, ...layout.xaxis }, yaxis: { ...axis, rangemode: "tozero", ...layout.yaxis },
+  }, OPTIONS);
+}
+
+export function remove(id) {
+  const figure = document.getElementById(id);
+  if (figure !== null) { resized.unobserve(figure.querySelector(".plot")); Plotly.purge(figure.querySelector(".plot")); figure.remove(); }
+}
+
+const bands = spans => spans.map(([from, to, site]) => ({
+  type: "rect", xref: "x", yref: "paper", x0: from, x1: to, y0: 0, y1: 1, line: { width: 0 }, layer: "below",
+  fillcolor: faded(colour("--bad"), 0.22), name: site,
+}));
+const lines = events => events.map(event => ({
+  type: "line", xref: "x", yref: "paper", x0: event.at_s * 1000, x1: event.at_s * 1000, y0: 0, y1: 1,
+  line: { dash: "dot", width: 1, color: colour("--faint") },
+}));
+
+// Size or work against seconds: what was measured, and each site's prediction with its 90 % band.
+export function drawTimes(tasks, sites) {
+  const traces = [];
+  for (const site of sites) {
+    const own = siteColour(sites, site), done = tasks.filter(task => answered(task, site));
+    const known = tasks.filter(task => (task.sites[site] || {}).predicted_s != null)
+      .sort((a, b) => amount(a) - amount(b));
+    const banded = known.filter(task => task.sites[site].low_s !== null && task.sites[site].high_s !== null);
+    traces.push({
+      x: banded.map(amount), y: banded.map(task => task.sites[site].predicted_s), mode: "markers",
+      name: `${site}, predicted`, marker: { symbol: "line-ew-open", size: 7, color: own },
+      error_y: {
+        type: "data", symmetric: false, thickness: 1.5, width: 0, color: faded(own, 0.28),
+        array: banded.map(task => task.sites[site].high_s - task.sites[site].predicted_s),
+        arrayminus: banded.map(task => task.sites[site].predicted_s - Math.max(0, task.sites[site].low_s)),
+      },
+    }, {
+      x: done.map(amount), y: done.map(task => answered(task, site).seconds), mode: "markers",
+      name: `${site}, measured`, marker: { symbol: SYMBOLS[siteNumber(sites, site)], size: 6, color: own },
+    });
+  }
+  const what = tasks.some(task => task.features.work !== undefined) ? "work" : "size";
+  // A site that is silent may be expected to take very long: that must not flatten everything else.
+  const measured = tasks.flatMap(task => task.executions.filter(one => one.ok).map(one => one.seconds));
+  const highs = sites.map(site => Math.max(0, ...tasks.map(task => (task.sites[site] || {}).high_s ?? 0)))
+    .filter(high => high > 0);
+  const top = 1.1 * Math.max(0, ...measured, highs.length ? Math.min(...highs) : 0);
+  const cut = Math.max(0, ...highs) > top ? " Longer predictions are cut off." : "";
+  draw("times", `Time by ${what}: measured, and predicted with the 90 % band`, traces,
+    { xaxis: { title: { text: what } }, yaxis: { title: { text: "seconds" }, ...(top ? { range: [0, top] } : {}) } },
+    `The last ${tasks.length} tasks. Dashes with bars: each site's prediction and its 90 % band.${cut}`);
+}
+
+// When each task began, how long its caller waited, and whose answer was used.
+export function drawHistory(tasks, sites, spans, events) {
+  const traces = [...sites, null].map(site => {
+    const own = tasks.filter(task => task.used === site);
+    return {
+      x: own.map(task => task.at), y: own.map(task => task.waited_s), mode: "markers",
+      name: site || "no answer", text: own.map(task => task.decision.reason),
+      marker: {
+        symbol: site ? SYMBOLS[siteNumber(sites, site)] : "x", size: 7,
+        color: site ? siteColour(sites, site) : colour("--bad"),
+      },
+    };
+  }).filter(trace => trace.x.length);
+  const out = spans.length ? ` Red: ${[...new Set(spans.map(span => span[2]))].join(", ")} silent or absent.` : "";
+  draw("history", "How long each task took, by the site that answered", traces,
+    { xaxis: time, yaxis: { title: { text: "seconds" } }, shapes: [...bands(spans), ...lines(events)] },
+    `The last ${tasks.length} tasks.${out}`);
+}
+
+// Where tasks were sent over time.
+export function drawPlaces(tasks, sites) {
+  if (!tasks.length) return;
+  const from = tasks[0].at, width = Math.max(1000, (tasks[tasks.length - 1].at - from) / BINS);
+  const chosen = site => tasks.filter(task => task.decision.site === site || task.decision.both);
+  const traces = sites.map(site => {
+    const counts = new Map();
+    for (const task of chosen(site)) {
+      const bin = from + width * (Math.floor((task.at - from) / width) + 0.5);
+      counts.set(bin, (counts.get(bin) || 0) + 1);
+    }
+    return { x: [...counts.keys()], y: [...counts.values()], type: "bar", name: site, width,
+      marker: { color: siteColour(sites, site) } };
+  });
+  draw("places", "Where tasks were sent", traces,
+    { barmode: "stack", xaxis: time, yaxis: { title: { text: "tasks" } } },
+    sites.map(site => `${site}: ${chosen(site).length}`).join(", ") + `, of ${tasks.length} tasks.`);
+}
+
+// Where the time of remote answers went: on the link, in the queue, in the worker.
+export function drawParts(tasks) {
+  const done = tasks.flatMap(task => task.executions
+    .filter(one => one.ok && one.site !== "onboard" && one.run_s !== null && one.network_s !== null)
+    .map(one => ({ at: task.at, ...one })));
+  if (!done.length) { remove("parts"); return; }
+  const names = [["network_s", "link", "--site-0"], ["queue_s", "queue", "--site-3"], ["run_s", "run", "--site-1"]];
+  const traces = names.map(([field, name, own]) => ({
+    x: done.map((_, i) => i + 1 - done.length), y: done.map(one => one[field] || 0), type: "bar", name,
+    marker: { color: colour(own) },
+  }));
+  draw("parts", "Time of remote answers: link, queue, run", traces,
+    { barmode: "stack", bargap: 0, xaxis: { title: { text: "answer, 0 is the last" } }, yaxis: { title: { text: "seconds" } } },
+    `The last ${done.length} remote answers.`);
+}
+
+// Round trips and queues of the sites: from the heartbeats now, and from what each task was decided with.
+export function drawLink(samples, tasks, sites, spans) {
+  const remote = sites.filter(site => site !== "onboard"), traces = [], queues = [];
+  for (const site of remote) {
+    const points = [
+      ...tasks.map(task => [task.at, task.features[`${site}.round_trip_s`], task.features[`${site}.queue`]]),
+      ...samples.filter(one => one.sites && one.sites[site])
+        .map(one => [one.at, one.sites[site].round_trip_s, one.sites[site].queue]),
+    ].filter(point => point[1] != null).sort((a, b) => a[0] - b[0]);
+    queues.push(...points.map(point => point[2] || 0));
+    const common = { x: points.map(point => point[0]), mode: "lines+markers", marker: { size: 3 } };
+    traces.push(
+      { ...common, y: points.map(point => 1000 * point[1]), name: `${site}: round trip`, line: { color: siteColour(sites, site) } },
+      { ...common, y: points.map(point => point[2] || 0), name: `${site}: queue`, yaxis: "y2", line: { color: colour("--faint"), dash: "dot", shape: "hv" } });
+  }
+  if (!traces.some(trace => trace.x.length)) { remove("link"); return; }
+  draw("link", "Link and queue, from heartbeats", traces, {
+    xaxis: time, yaxis: { title: { text: "ms" } }, shapes: bands(spans),
+    yaxis2: {
+      overlaying: "y", side: "right", rangemode: "tozero", title: { text: "tasks" }, showgrid: false,
+      automargin: true, tickformat: "d", nticks: 4, range: [0, Math.max(4, ...queues) * 1.05],
+    },
+  }, "Solid: round trip. Dotted: tasks that wait at the site.");
+}
+
+// The queue and the workers of a server.
+export function drawServer(samples) {
+  const x = samples.map(one => one.at);
+  const line = (name, values, own, dash, shape = "hv") => ({ x, y: values, mode: "lines", name, line: { color: colour(own), dash, shape } });
+  draw("queue", "Queue and workers", [
+    line("waiting", samples.map(one => one.server.queue_depth), "--site-1"),
+    line("running", samples.map(one => one.server.running), "--site-0"),
+    line("workers", samples.map(one => one.server.workers), "--faint", "dot"),
+  ], { xaxis: time, yaxis: { title: { text: "tasks" } } }, "Since this page is open, one sample a second.");
+  const totals = samples.map(one => {
+    const found = new Map();
+    for (const [name, labels, value] of one.server.samples) {
+      if (name === "offboard_server_requests_total") found.set(labels.status, (found.get(labels.status) || 0) + value);
+    }
+    return found;
+  });
+  const statuses = [...new Set(totals.flatMap(found => [...found.keys()]))];
+  const own = ["--site-0", "--site-1", "--site-3", "--site-2"];
+  const rate = status => totals.map((found, i) => i === 0 ? null
+    : ((found.get(status) || 0) - (totals[i - 1].get(status) || 0)) / Math.max(0.001, (x[i] - x[i - 1]) / 1000));
+  draw("rates", "Requests a second, by outcome",
+    statuses.map((status, i) => line(status, rate(status), own[i % own.length], i < own.length ? "solid" : "dash", "vh")), // a rate is that of the second before
+    { xaxis: time, yaxis: { title: { text: "a second" } } },
+    statuses.length ? `Outcomes: ${statuses.join(", ")}.` : "No request yet.");
+}

@@ -1,0 +1,150 @@
+// What the page remembers of the looks, within limits, and how things were at a time.
+
+const SHOWN = 200; // tasks of a kind in the charts
+const KEPT_OF_A_KIND = { robot: SHOWN, run: 20000 }; // the time slider of a run reaches back to its start
+const SAMPLES = 900; // looks: a quarter of an hour
+const EVENTS = 500;
+
+const started = task => Date.parse(task.started_at);
+
+export class Memory {
+  constructor() {
+    this.source = null;
+    this.kinds = new Map(); // by "kind" or "robot: kind", the tasks in the order of their answers
+    this.seen = new Map(); // the same keys: the ids of these tasks
+    this.samples = []; // looks without their tasks
+    this.events = [];
+    this.over = false;
+    this.leftOut = 0; // tasks of a busy robot that were not sent
+    this.latest = null; // the key of the kind of the last task
+  }
+
+  add(look) {
+    this.source = look.source;
+    this.over = look.over;
+    this.leftOut += look.left_out;
+    for (const task of look.tasks) this.#addTask(task);
+    this.events.push(...look.events);
+    this.events.splice(0, this.events.length - EVENTS);
+    this.samples.push({ ...look, tasks: [], events: [], at: look.now_s * 1000 });
+    this.samples.splice(0, this.samples.length - SAMPLES);
+  }
+
+  #addTask(task) {
+    const key = task.robot ? `${task.robot}: ${task.kind}` : task.kind;
+    if (!this.kinds.has(key)) { this.kinds.set(key, []); this.seen.set(key, new Set()); }
+    const tasks = this.kinds.get(key), seen = this.seen.get(key);
+    if (seen.has(task.id)) return; // sent again after the connection was lost
+    seen.add(task.id);
+    tasks.push({ ...task, at: started(task), ended: started(task) + 1000 * task.waited_s });
+    this.latest = key;
+    const kept = KEPT_OF_A_KIND[this.source] || SHOWN;
+    for (const old of tasks.splice(0, tasks.length - kept)) seen.delete(old.id);
+  }
+
+  // The first and the last instant that is known, in ms; null if nothing is.
+  span() {
+    const all = [...this.kinds.values()].filter(tasks => tasks.length);
+    const firsts = all.map(tasks => tasks[0].at), lasts = all.map(tasks => tasks[tasks.length - 1].ended);
+    if (this.source !== "run" && this.samples.length) {
+      firsts.push(this.samples[0].at);
+      lasts.push(this.samples[this.samples.length - 1].at);
+    }
+    return firsts.length ? [Math.min(...firsts), Math.max(...lasts)] : null;
+  }
+
+  // The last tasks of a kind that had ended by then.
+  tasks(key, until) {
+    const all = (this.kinds.get(key) || []).filter(task => task.ended <= until);
+    return all.slice(-SHOWN);
+  }
+
+  samplesUntil(until) {
+    return this.samples.filter(sample => sample.at <= until);
+  }
+}
+
+export const median = values => {
+  const sorted = [...values].sort((a, b) => a - b);
+  return sorted.length ? sorted[Math.floor(sorted.length / 2)] : null;
+};
+
+export const sum = values => values.reduce((total, one) => total + one, 0);
+
+// What the predictors were asked with: the expected work, if sites learn times per work, else the size.
+export const amount = task => task.features.work ?? (Array.isArray(task.size) ? task.size[0] : task.size);
+
+export const ms = seconds => seconds == null ? "unknown" : seconds >= 1 ? `${seconds.toFixed(2)} s` : `${(1000 * seconds).toFixed(seconds < 0.01 ? 2 : 0)} ms`;
+export const percent = share => `${Math.round(100 * share)} %`;
+
+export const answered = (task, site) => task.executions.find(one => one.site === site && one.ok);
+
+// The other sites that a task could have used, with their outlook: [[site, outlook], ...].
+export const others = (task, site) => Object.entries(task.sites)
+  .filter(([name]) => name !== site && !task.features[`${name}.silent`]);
+
+// How many answers were inside the 90 % band of their prediction, and the median of the relative errors:
+// {count, inside, error, sites}; `sites` has the same for each site.
+export function judged(tasks) {
+  const tested = tasks.flatMap(task => task.executions.map(one => [one, task.sites[one.site]]))
+    .filter(([one, outlook]) => one.ok && outlook && outlook.low_s !== null && outlook.high_s !== null);
+  const judge = some => ({
+    count: some.length,
+    inside: some.filter(([one, { low_s, high_s }]) => low_s <= one.seconds && one.seconds <= high_s).length,
+    error: median(some.map(([one, outlook]) => Math.abs(one.seconds - outlook.predicted_s) / one.seconds)),
+  });
+  const names = [...new Set(tested.map(([one]) => one.site))];
+  return { ...judge(tested), sites: Object.fromEntries(names.map(site => [site, judge(tested.filter(([one]) => one.site === site))])) };
+}
+
+// The sum of a metric of the server over all of its labels.
+export const total = (server, name) => sum(server.samples.filter(one => one[0] === name).map(one => one[2]));
+
+// What a server counted since the first look, or since it began to count again: {from, to, seconds, robots}.
+// The robots are sorted by the time of workers that they used.
+export function sinceStart(samples) {
+  const used = look => sum(look.server.robots.map(one => one.run_s));
+  const again = samples.findLastIndex((look, i) => i > 0
+    && (look.server.uptime_s < samples[i - 1].server.uptime_s || used(look) < used(samples[i - 1])));
+  const from = samples[Math.max(0, again)], to = samples[samples.length - 1];
+  const robots = to.server.robots.map(one => {
+    const before = from.server.robots.find(other => other.robot === one.robot);
+    const change = name => one[name] - (before ? before[name] : 0);
+    return { ...one, tasks: change("tasks"), queue_s: change("queue_s"), run_s: change("run_s"), refused: change("refused") };
+  });
+  return { from, to, seconds: (to.at - from.at) / 1000, robots: robots.sort((a, b) => b.run_s - a.run_s) };
+}
+
+// Where the time of the answers of other computers went: {link, queue, run}, in seconds.
+export function parts(tasks) {
+  const remote = tasks.flatMap(task => task.executions).filter(
+    one => one.ok && one.site !== "onboard" && one.run_s !== null && one.network_s !== null);
+  const total = name => sum(remote.map(one => one[name] || 0));
+  return { count: remote.length, link: total("network_s"), queue: total("queue_s"), run: total("run_s") };
+}
+
+// Spans of time, in ms, in which a site was silent or absent: [[from, to, site], ...].
+export function outages(samples, tasks) {
+  const points = new Map();
+  const note = (site, at, out) => {
+    if (!points.has(site)) points.set(site, []);
+    points.get(site).push([at, out]);
+  };
+  for (const { at, sites } of samples) {
+    for (const [site, now] of Object.entries(sites || {})) note(site, at, now.silent || now.absent !== null);
+  }
+  for (const site of new Set(tasks.flatMap(task => Object.keys(task.sites)))) {
+    for (const task of tasks) note(site, task.at, !(site in task.sites) || Boolean(task.features[`${site}.silent`]));
+  }
+  const spans = [];
+  for (const [site, states] of points) {
+    let from = null, last = null;
+    for (const [at, out] of states.sort((a, b) => a[0] - b[0])) {
+      if (out && from === null) from = at;
+      if (!out && from !== null) { spans.push([from, at, site]); from = null; }
+      last = at;
+    }
+    if (from !== null) spans.push([from, last, site]);
+  }
+  return spans;
+}
