@@ -56,7 +56,7 @@ def run_ros2(argv: Sequence[str]) -> int:
             )
         )
         for line in prepare(offload, config.connect_s):
-            log.warning("starting without %s; goals are planned elsewhere", line)
+            log.warning("starting without %s: goals are planned elsewhere; remedy: robot-client check", line)
         serve(offload, facts)
     return 0
 

@@ -156,7 +156,7 @@ class PlannerServer:
         except (OffloadError, ValueError) as error:
             return Outcome(ABORTED, UNKNOWN, str(error))
         except Exception as error:  # a goal without an answer would leave nav2 waiting
-            log.exception("a goal failed")
+            log.exception("a goal failed; remedy: report this traceback")
             return Outcome(ABORTED, UNKNOWN, f"{type(error).__name__}: {error}")
 
     def _stopped(self, pending: PendingGoal) -> Outcome:

@@ -74,7 +74,7 @@ class Topics:
         try:
             self._world.see_map(grid_of(message))
         except ValueError as error:
-            self._warn(f"a map is ignored: {error}")
+            self._warn(f"a map is ignored: {error}", "correct the node that publishes it")
 
     def update_map(self, message: Any) -> None:
         """An OccupancyGridUpdate."""
@@ -83,7 +83,7 @@ class Topics:
         if not fits or not self._world.update_map(
             message.x, message.y, cells.reshape(message.height, message.width)
         ):
-            self._warn("an update does not fit the map, and is ignored")
+            self._warn("an update does not fit the map, and is ignored", "publish the map before it")
 
     def see_pose(self, message: Any) -> None:
         """A PoseWithCovarianceStamped or an Odometry; one in another frame says nothing."""
@@ -95,7 +95,10 @@ class Topics:
         frame = message.header.frame_id
         laser = self._transforms.of(frame, self._robot_frame)
         if laser is None:
-            self._warn(f"scans in frame {frame!r} are ignored: its place on the robot is not known")
+            self._warn(
+                f"scans in frame {frame!r} are ignored: its place on the robot is not known",
+                "install tf2_ros",
+            )
             return
         scan = scan_of(message)
         self._world.see_scan(scan if laser == SAME else moved_scan(scan, laser))
@@ -117,7 +120,7 @@ class Topics:
     def path(self, outcome: Outcome, stamp_ns: int) -> Any:
         """The Path of an outcome, which is empty if there is none. Any thread may call this."""
         if outcome.ending == ABORTED:
-            log.warning("no plan: %s: %s", outcome.status, outcome.message)
+            log.warning("no plan: %s: %s; remedy: send another goal", outcome.status, outcome.message)
         return path_message(self._library, outcome.poses, Header(self._map_frame, stamp_ns))
 
     def diagnostics(self, stamp_ns: int) -> Any:
@@ -144,8 +147,8 @@ class Topics:
         place = self._transforms.of(frame, self._map_frame)
         return (pose, frame) if place is None else (moved(pose, place), self._map_frame)
 
-    def _warn(self, text: str) -> None:
+    def _warn(self, text: str, remedy: str) -> None:
         """Say it once: the same thing comes with every message of the topic."""
         if text not in self._warned:
             self._warned.add(text)
-            log.warning("%s", text)
+            log.warning("%s; remedy: %s", text, remedy)

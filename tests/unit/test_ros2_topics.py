@@ -104,7 +104,7 @@ def test_poses_and_scans_in_unknown_frames_are_ignored(
         for _ in range(3):
             made.see_scan(ros.scan_message(PLAIN, scan, ros.Header("laser")))
     assert [record.message for record in caplog.records] == [
-        "scans in frame 'laser' are ignored: its place on the robot is not known"
+        "scans in frame 'laser' are ignored: its place on the robot is not known; remedy: install tf2_ros"
     ]
     made.close()
 
@@ -138,7 +138,7 @@ def test_updates_that_do_not_fit_are_ignored(
     wall.x, wall.height = 0, 41
     made.update_map(wall)
     assert [record.message for record in caplog.records if "update" in record.message] == [
-        "an update does not fit the map, and is ignored"
+        "an update does not fit the map, and is ignored; remedy: publish the map before it"
     ]
     made.close()
 
