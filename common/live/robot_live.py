@@ -8,10 +8,11 @@ from collections import deque
 from collections.abc import Callable, Generator, Mapping
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
-from offboard.common.live.look import KEPT_MAX, Look
+from offboard.common.live.look import EVERY_S, KEPT_MAX, Look
 from offboard.common.tasks import Kind, kinds
 
 TASKS_MAX = 15  # of a look after the first one: a viewer costs a robot with a tenth of a CPU less than 2 %
+WATCHED_S = 2 * EVERY_S  # after a look, until the next one is due
 SPENT = ("duplicates", "bytes_left", "joules_left")
 
 R = TypeVar("R")
@@ -26,7 +27,7 @@ class Site(Protocol):
 
 
 class RobotLive(Generic[R]):
-    """The source of a robot's page. `keep` takes the record of each task; all else is left to the viewers.
+    """The source of a robot's page. All but `keep` is left to the viewers.
 
     line: makes the line of the trace of a record.
     """
@@ -34,7 +35,7 @@ class RobotLive(Generic[R]):
     def __init__(self, line: Callable[[R], Mapping[str, Any]]) -> None:
         self._line = line
         self._records: deque[R] = deque(maxlen=KEPT_MAX)
-        self.keep = self._records.append
+        self._due_s = self._watched_until_s = 0.0
         self.sites: Mapping[str, Site] = {}
         self._allowance: object = None
 
@@ -42,9 +43,21 @@ class RobotLive(Generic[R]):
         """Also show these sites, and what may be spent. They are read without a lock, for people."""
         self.sites, self._allowance = sites, allowance
 
+    def keep(self, record: R) -> None:
+        """Keep the record of a task; while nobody looks, one of each EVERY_S.
+
+        Each record that is kept costs the garbage collector about 1 % of what it takes to make it.
+        """
+        now_s = time.monotonic()
+        if now_s >= self._due_s:
+            self._records.append(record)
+            if now_s >= self._watched_until_s:
+                self._due_s = now_s + EVERY_S
+
     def looks(self) -> Generator[Look]:
         last, kind, most = None, None, KEPT_MAX
         while True:
+            self._due_s, self._watched_until_s = 0.0, time.monotonic() + WATCHED_S
             new, last = self._after(last)
             lines = [self._line(record) for record in new[-most:]]
             kind = lines[-1]["kind"] if lines else kind

@@ -5,6 +5,7 @@ The records are made in `offloader`.
 
 import logging
 from collections.abc import Iterator
+from functools import cache
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
@@ -22,52 +23,54 @@ log = logging.getLogger(__name__)
 
 
 class Metrics:
-    """An observer of the offloader that counts into `registry`, and keeps records for the page /live."""
+    """An observer of the offloader that counts into `registry`, and keeps records for the page /live.
+
+    Finding a metric by its labels takes most of the time of counting, so what was found is cached.
+    """
 
     def __init__(self, registry: CollectorRegistry) -> None:
         r = self._registry = registry
         self._port: LivePort | None = None
         self.live = RobotLive(as_dict)
         site = ["kind", "site"]
-        self._tasks = Counter(
-            "offboard_robot_tasks", "Tasks, by the site whose answer was used", site, registry=r
-        )
-        self._executions = Counter(
-            "offboard_robot_executions", "Executions by site and outcome", [*site, "outcome"], registry=r
-        )
-        about = "Seconds that the caller waited"
-        self._waited = Histogram(
-            "offboard_robot_wait_seconds", about, ["kind"], buckets=SECONDS_BUCKETS, registry=r
-        )
+        about = "Tasks, by the site whose answer was used"
+        self._tasks = cache(Counter("offboard_robot_tasks", about, site, registry=r).labels)
+        about, labels = "Executions by site and outcome", [*site, "outcome"]
+        self._executions = cache(Counter("offboard_robot_executions", about, labels, registry=r).labels)
+        about, name = "Seconds that the caller waited", "offboard_robot_wait_seconds"
+        waits = Histogram(name, about, ["kind"], buckets=SECONDS_BUCKETS, registry=r)
+        self._waited = cache(waits.labels)
         about = "Last prediction, in seconds"
-        self._predicted = Gauge("offboard_robot_predicted_seconds", about, site, registry=r)
+        self._predicted = cache(Gauge("offboard_robot_predicted_seconds", about, site, registry=r).labels)
         about = "Answers, by whether their time was inside the 90 % interval of the prediction"
-        self._interval = Counter("offboard_robot_interval_checks", about, [*site, "inside"], registry=r)
-        about = "Tasks, by the site that was chosen"
-        self._decisions = Counter("offboard_robot_decisions", about, [*site, "policy"], registry=r)
+        labels = [*site, "inside"]
+        self._interval = cache(Counter("offboard_robot_interval_checks", about, labels, registry=r).labels)
+        about, labels = "Tasks, by the site that was chosen", [*site, "policy"]
+        self._decisions = cache(Counter("offboard_robot_decisions", about, labels, registry=r).labels)
         about = "Executions beyond the first of a task: warm-up, measuring, probes, hedges, fallbacks"
-        self._duplicates = Counter("offboard_robot_duplicate_executions", about, ["kind"], registry=r)
+        name = "offboard_robot_duplicate_executions"
+        self._duplicates = cache(Counter(name, about, ["kind"], registry=r).labels)
         about = "1 if the last task of this kind could use the site; 0 if it was silent or absent"
-        self._usable = Gauge("offboard_robot_site_usable", about, site, registry=r)
+        self._usable = cache(Gauge("offboard_robot_site_usable", about, site, registry=r).labels)
         self._regret = _LatestRegret()
         registry.register(self._regret)
 
     def __call__(self, record: Record) -> None:
         self.live.keep(record)
-        self._tasks.labels(record.kind, record.used or "none").inc()
-        self._waited.labels(record.kind).observe(record.waited_s)
-        self._decisions.labels(record.kind, record.decision.site, record.decision.policy).inc()
-        self._duplicates.labels(record.kind).inc(len(record.executions) - 1)
+        self._tasks(record.kind, record.used or "none").inc()
+        self._waited(record.kind).observe(record.waited_s)
+        self._decisions(record.kind, record.decision.site, record.decision.policy).inc()
+        self._duplicates(record.kind).inc(len(record.executions) - 1)
         for execution in record.executions:
             outcome = "ok" if execution.failure is None else type(execution.failure).__name__
-            self._executions.labels(record.kind, execution.site, outcome).inc()
+            self._executions(record.kind, execution.site, outcome).inc()
             self._judge(record, execution)
         for site, outlook in record.sites.items():
             if outlook.predicted_s is not None:
-                self._predicted.labels(record.kind, site).set(outlook.predicted_s)
+                self._predicted(record.kind, site).set(outlook.predicted_s)
         for site in {**self.live.sites, **record.sites}:  # a server that never answered is shown too
             found = record.sites.get(site)
-            self._usable.labels(record.kind, site).set(found is not None and not found.condition.silent)
+            self._usable(record.kind, site).set(found is not None and not found.condition.silent)
         if record.regret is not None:
             self._regret.latest = record.regret
 
@@ -77,7 +80,7 @@ class Metrics:
         if not execution.ok or outlook is None or outlook.low_s is None or outlook.high_s is None:
             return
         inside = str(outlook.low_s <= execution.seconds <= outlook.high_s).lower()
-        self._interval.labels(record.kind, execution.site, inside).inc()
+        self._interval(record.kind, execution.site, inside).inc()
 
     def watch(self, trace: Trace) -> None:
         """Also serve how many records `trace` has lost."""

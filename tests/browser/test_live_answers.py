@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.timeout(60)]
 
 SOON_MS = 10_000
 TASKS = 60
-POLICY = "hedge:probe:greedy"
+POLICY = "default"
 
 Ask = Callable[..., Page]
 

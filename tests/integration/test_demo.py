@@ -1,6 +1,7 @@
 """`loadgen run demo`, shortened: a real map, three processes, and a robot with a CPU quota."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -11,7 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from offboard.loadgen.play import play_scenario
 from offboard.loadgen.robot_files import read_trace
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
 
@@ -81,6 +84,19 @@ def test_a_scenario_can_be_played_to_its_end(tmp_path: Path) -> None:
     assert all(record["decision"]["both"] for record in records)
     assert all(one["ok"] for record in records for one in record["executions"])
     assert all(one["bytes_out"] < 100_000 for record in records for one in record["executions"])
+
+
+def test_the_demo_says_how_to_look_at_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """At its start it names the address of its page, at its end a picture and the command for the page."""
+    short = read_scenario(find_scenario("demo")).changed(tasks=24, measure_all=True)
+    monkeypatch.setattr(play_scenario, "read_scenario", lambda _: short)
+    assert play_scenario.play_demo(tmp_path) == 0
+    first, *_, picture, watch = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"live page: http://127\.0\.0\.1:\d+/live", first)
+    assert picture == f"picture of the last plan: {tmp_path / 'plan.png'}"
+    assert watch == f"the run on a page: loadgen watch {tmp_path}"
 
 
 def test_the_same_seed_gives_the_same_tasks(tmp_path: Path) -> None:

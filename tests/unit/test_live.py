@@ -2,12 +2,14 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from offboard.cloud_server.metrics import RobotUses
 from offboard.common.errors import MissingExtra
+from offboard.common.live import robot_live
 from offboard.common.live.live_files import PATHS, page_file
 from offboard.common.live.look import KEPT_MAX, VIEWERS_MAX, Look, Viewers, encode
 from offboard.common.live.robot_live import TASKS_MAX, RobotLive
@@ -23,6 +25,8 @@ def decoded(look: Look) -> Any:
 
 
 def records(live: RobotLive[dict[str, Any]], *numbers: int) -> None:
+    """Tasks of a robot that somebody looks at."""
+    next(live.looks())
     for i in numbers:
         live.keep({"i": i, "kind": "no such kind"})
 
@@ -81,6 +85,22 @@ def test_records_are_read_only_for_viewers() -> None:
     assert made == []
     next(live.looks())
     assert made == list(range(10))
+
+
+def test_while_nobody_looks_few_records_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Then it is one a second, so that tasks cost as much as without a page; a viewer gets all again."""
+    live = RobotLive[dict[str, Any]](dict)
+    now_s = 1000.0
+    monkeypatch.setattr(robot_live, "time", SimpleNamespace(monotonic=lambda: now_s, time=lambda: now_s))
+    for i in range(30):
+        live.keep({"i": i, "kind": "no such kind"})
+        now_s += 0.1
+    looks = live.looks()
+    assert [task["i"] for task in next(looks).tasks] == [0, 10, 20]
+    for i in range(30, 35):
+        live.keep({"i": i, "kind": "no such kind"})
+        now_s += 0.1
+    assert [task["i"] for task in next(looks).tasks] == [30, 31, 32, 33, 34]
 
 
 def test_robots_are_counted_until_nobody_looks(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,14 +15,14 @@ export function whyThere(tasks, sites, spans, absent) {
   if (!task) return ["No task yet.", ""];
   const { site, both, policy, reason } = task.decision;
   const by = task.used === site || both ? "" : `, answered by ${task.used ?? "no site"}`;
-  const figures = `Task ${task.i}${by}, took ${ms(task.waited_s)}. ${reason}`;
+  const took = `Task ${task.i}${by}, took ${ms(task.waited_s)}.`, figures = `${took} ${reason}`;
   if (both) return ["On all sites, to learn how long each takes.", figures];
   if (policy === "pinned") return [`${upper(site)}: the call asks for this site.`, figures];
   const left = others(task, site), away = sites.filter(name => name !== site && !left.some(([other]) => other === name));
   if (away.length && !left.length) return [`${upper(site)}: ${away.map(name => awayText(name, task, spans, absent)).join(", ")}.`, figures];
   const own = task.sites[site]?.predicted_s, best = left.filter(([, one]) => one.predicted_s != null)
     .sort((a, b) => a[1].predicted_s - b[1].predicted_s)[0];
-  if (own == null || !best) return [`${upper(site)}: the policy had no other choice.`, figures];
+  if (own == null || !best) return [`${upper(site)}: ${reason}.`, took];
   const [name, other] = best;
   if (own > other.predicted_s) return [`${upper(site)}: the policy preferred it to ${name}, although it may take longer.`, figures];
   return [`${upper(site)}: it should take ${ms(own)} there, and ${ms(other.predicted_s)} on ${name}.`, figures];
@@ -58,8 +58,8 @@ export function predictionsGood(tasks) {
 
 // A policy that hedges plans a second run for each task that could have one, unless the budget is used up.
 export function moreBudget(tasks, budget) {
-  const last = tasks[tasks.length - 1], regret = last && last.regret;
-  const could = tasks.filter(task => !task.decision.both && task.decision.policy.split(":").includes("hedge")
+  const last = tasks[tasks.length - 1], regret = last && last.regret, policy = last && last.decision.policy;
+  const could = tasks.filter(task => !task.decision.both && task.decision.policy === policy
     && others(task, task.decision.site).some(([, one]) => one.predicted_s != null));
   const planned = could.filter(task => task.decision.second !== null);
   const second = tasks.filter(task => task.executions.length > 1).length;
@@ -69,7 +69,7 @@ export function moreBudget(tasks, budget) {
     : "The estimated regret is unknown until six probes have run."}`;
   const refused = 1 - planned.length / could.length;
   if (!tasks.length) return ["No task yet.", ""];
-  if (!last.decision.policy.split(":").includes("hedge")) return [`No: the policy ${last.decision.policy} plans no second runs.`, figures];
+  if (!planned.length && policy !== "default" && !policy.split(":").includes("hedge")) return [`No: the policy ${policy} plans no second runs.`, figures];
   if (!could.length) return ["Unknown: no task could have a second run.", figures];
   if (refused < REFUSED_LEAST) return [`No: a second run was allowed for each of ${could.length} tasks, if it had been late.`, figures];
   return [`Perhaps: ${percent(refused)} of ${could.length} tasks could not have a second run.`, figures];

@@ -74,7 +74,7 @@ export const sum = values => values.reduce((total, one) => total + one, 0);
 // What the predictors were asked with: the expected work, if sites learn times per work, else the size.
 export const amount = task => task.features.work ?? (Array.isArray(task.size) ? task.size[0] : task.size);
 
-export const ms = seconds => seconds == null ? "unknown" : seconds >= 1 ? `${seconds.toFixed(2)} s` : `${(1000 * seconds).toFixed(seconds < 0.01 ? 2 : 0)} ms`;
+export const ms = seconds => seconds == null ? "unknown" : seconds < 5e-6 ? "0 ms" : seconds >= 1 ? `${seconds.toFixed(2)} s` : `${(1000 * seconds).toFixed(seconds < 0.01 ? 2 : 0)} ms`;
 export const percent = share => `${Math.round(100 * share)} %`;
 
 export const answered = (task, site) => task.executions.find(one => one.site === site && one.ok);
