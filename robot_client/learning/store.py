@@ -117,9 +117,8 @@ class Store:
             if self._writer is not None:
                 self._writer.join(WRITE_WAIT_S)
         if self._writing():
-            log.warning(
-                "memory %s: not written within %g s; remedy: use a faster disk", self.path, WRITE_WAIT_S
-            )
+            said = "memory %s: not written within %g s; remedy: use a faster disk"
+            log.warning(said, self.path, WRITE_WAIT_S)
 
     def _writing(self) -> bool:
         return self._writer is not None and self._writer.is_alive()

@@ -83,9 +83,8 @@ class Lines:
             raise ConfigError(f"{self._what} {self.path}: the file exists and is no {self._what}")
         kept = _end_of_last_line(self.path)
         if kept < self.path.stat().st_size:
-            log.warning(
-                "%s %s: cut off a torn last line; remedy: none, a crash had torn it", self._what, self.path
-            )
+            text = "%s %s: cut off a torn last line; remedy: none, a crash had torn it"
+            log.warning(text, self._what, self.path)
             os.truncate(self.path, kept)
 
 
