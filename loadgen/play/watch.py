@@ -23,7 +23,7 @@ from offboard.common.errors import ConfigError, MissingExtra
 from offboard.common.live.live_files import charts_file
 from offboard.common.live.live_port import PORT_MAX, LivePort
 from offboard.common.live.look import Look
-from offboard.loadgen.play.run_files import EVENTS, SUMMARY
+from offboard.loadgen.play.run_files import EVENTS, SUMMARY, TRACE
 from offboard.loadgen.testbed.testbed import ROBOT
 
 LINES_A_LOOK_MAX = 5000  # of each file
@@ -55,6 +55,8 @@ def run_watch(folder: Path, config: WatchConfig) -> int:
     if not folder.is_dir():
         raise ConfigError(f"DIR: {folder} is not a folder; give the folder of a run, such as out/run")
     charts_file()
+    if not any(folder.glob(f"*{TRACE}")):
+        print(f"{folder} holds no {TRACE} yet: the page is empty until a run writes one there")
     with watching(folder, print, port=config.port, page=Page.OPENED):
         print("Ctrl-C ends it", flush=True)
         threading.Event().wait()
