@@ -17,10 +17,10 @@ from prometheus_client.exposition import MetricsHandler
 from offboard.common.errors import ConfigError, MissingExtra
 from offboard.common.live.live_files import LIVE, LOOKS, PATHS, page_file
 from offboard.common.live.look import EVERY_S, Source, Viewers, encode
+from offboard.common.security.address import address as host_and_port
 from offboard.common.security.exposure import on_loopback
 from offboard.common.security.http_guard import HEADERS, PAGE_CSP, from_foreign_page
 
-PORT_MAX = 65_535
 STALL_S = 10.0  # a client that neither sends nor reads for this long is left
 
 
@@ -34,14 +34,12 @@ class LivePort:
     def __init__(
         self, address: str, where: str, *, source: Source, registry: CollectorRegistry | None = None
     ) -> None:
-        host, _, port = address.rpartition(":")
-        if not host or not port.isdecimal() or int(port) > PORT_MAX:
-            raise ConfigError(f"{where}: {address!r} is not HOST:PORT with a port 0 to {PORT_MAX}")
+        place = host_and_port(where, address)
         try:
-            self._server = _Server((host.strip("[]"), int(port)), source, registry)
+            self._server = _Server(place, source, registry)
         except (OSError, UnicodeError) as error:
             raise ConfigError(f"{where}: {address} cannot be served: {error}") from error
-        self.url = f"http://{host}:{self._server.server_port}"
+        self.url = f"http://{address.rpartition(':')[0]}:{self._server.server_port}"
         self._thread = Thread(target=self._server.serve_forever, name="live-port", daemon=True)
         self._thread.start()
 

@@ -21,8 +21,9 @@ from typing import Any
 from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError, MissingExtra
 from offboard.common.live.live_files import charts_file
-from offboard.common.live.live_port import PORT_MAX, LivePort
+from offboard.common.live.live_port import LivePort
 from offboard.common.live.look import Look
+from offboard.common.security.address import PORT_MAX
 from offboard.loadgen.play.run_files import EVENTS, SUMMARY, TRACE
 from offboard.loadgen.testbed.testbed import ROBOT
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from offboard.common.config import setting
 from offboard.common.errors import ConfigError
+from offboard.common.security.address import address
 from offboard.common.security.exposure import LOOPBACK, OPEN_REMEDY, on_loopback, warn_each_minute
 from offboard.common.security.private_files import read_token
 from offboard.loadgen.relay.control_api import ControlServer, control_app
@@ -20,7 +21,7 @@ from offboard.loadgen.relay.link_schedule import Schedule, read_schedule
 from offboard.loadgen.relay.tcp.link_record import LinkRecord
 from offboard.loadgen.relay.tcp.precise_selector import PreciseSelector
 from offboard.loadgen.relay.tcp.relay import Relay
-from offboard.loadgen.relay.tcp.tcp_address import BACKLOG, address, bind, name_of
+from offboard.loadgen.relay.tcp.tcp_address import BACKLOG, bind, name_of
 from offboard.loadgen.relay.toxiproxy.proxies import Proxies, RelaySettings
 from offboard.loadgen.relay.toxiproxy.toxiproxy_api import toxiproxy_app
 

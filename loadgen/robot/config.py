@@ -6,6 +6,7 @@ from pathlib import Path
 from offboard.common.config import REQUIRED, check, setting
 from offboard.common.errors import ConfigError
 from offboard.common.planning.planner_names import DIJKSTRA, PLANNERS
+from offboard.common.security.address import address
 from offboard.loadgen.robot.decision_settings import DecisionSettings
 from offboard.loadgen.robot.run_settings import RunSettings
 from offboard.loadgen.robot.workload import CLOSED, SIZES_ALLOWED, parse_sizes
@@ -95,6 +96,8 @@ class RobotConfig(RunSettings, DecisionSettings, ServerSettings):
         self.check_servers()
         self.check_decisions()
         self.check_run(cloud=self.cloud)
+        if self.metrics is not None:
+            address("--metrics", self.metrics)
         if self.memory is not None and self.memory in (self.trace, self.answers):
             raise ConfigError(f"--memory: {self.memory} is also the file of --trace or --answers")
 

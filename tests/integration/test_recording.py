@@ -45,7 +45,7 @@ def test_an_offloader_serves_metrics_and_writes_a_trace_until_it_is_closed(
 @pytest.mark.parametrize(
     ("metrics", "error"),
     [
-        ("9100", "metrics: '9100' is not HOST:PORT with a port 0 to 65535"),
+        ("9100", "metrics: '9100' is not HOST:PORT with a port from 0 to 65535"),
         ("127.0.0.1:99999", "metrics: '127.0.0.1:99999' is not HOST:PORT"),
         ("192.0.2.1:9100", "metrics: 192.0.2.1:9100 cannot be served: "),
     ],

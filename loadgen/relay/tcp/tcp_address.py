@@ -1,20 +1,11 @@
-"""HOST:PORT as text, and the socket that listens there."""
+"""The socket that listens at HOST:PORT."""
 
 import socket
 
 from offboard.common.errors import ConfigError
+from offboard.common.security.address import address
 
 BACKLOG = 128  # connections that the kernel holds before they are accepted
-PORT_MAX = 65_535
-
-
-def address(flag: str, text: str) -> tuple[str, int]:
-    """Host and port of HOST:PORT, or [HOST]:PORT for IPv6; ConfigError names the flag."""
-    host, _, port = text.rpartition(":")
-    host = host.removeprefix("[").removesuffix("]")
-    if not (host and "/" not in host and port.isascii() and port.isdigit() and int(port) <= PORT_MAX):
-        raise ConfigError(f"{flag}: {text!r} is not HOST:PORT with a port from 0 to {PORT_MAX}")
-    return host, int(port)
 
 
 def bind(flag: str, text: str) -> socket.socket:

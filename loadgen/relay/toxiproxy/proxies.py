@@ -10,7 +10,8 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from offboard.common.errors import ConfigError
-from offboard.loadgen.relay.tcp.tcp_address import BACKLOG, address, bind, name_of
+from offboard.common.security.address import address
+from offboard.loadgen.relay.tcp.tcp_address import BACKLOG, bind, name_of
 from offboard.loadgen.relay.toxiproxy.toxic_relay import ToxicRelay
 from offboard.loadgen.relay.toxiproxy.toxics import Refused, Toxic, link_of
 
