@@ -39,7 +39,7 @@ def test_the_robot_finishes_and_the_table_is_printed(up: Compose, tmp_path: Path
     assert up.exit_code("robot") == 0, up("logs", "robot")
     assert up.exit_code("table") == 0, up("logs", "table")
     assert "80 tasks answered" in up("logs", "robot")
-    assert "feedback chosen" in up("logs", "table")
+    assert "| oracle" in up("logs", "table")
     docker("cp", f"{up('ps', '-aq', 'robot').strip()}:/out/trace.jsonl", str(tmp_path))
     records = list(read_trace(tmp_path / "trace.jsonl"))
     assert len(records) == 80

@@ -56,10 +56,10 @@ def test_a_dropped_offloader_leaves_no_thread_and_no_socket(testbed: Callable[..
     """The first one does: pyzmq keeps a thread and its sockets for the rest of the process."""
     endpoint = testbed().endpoint
     make_context("test").term()
-    before = threads(), sockets()
+    names, count = threads(), sockets()  # what earlier tests have left may still go
     for _ in range(3):
         use_and_drop(endpoint)
-    until(lambda: (threads(), sockets()) == before)
+    until(lambda: set(threads()) <= set(names) and sockets() <= count)
 
 
 def test_a_forked_process_is_refused_and_can_connect_itself(testbed: Callable[..., LocalTestbed]) -> None:
