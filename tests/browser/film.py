@@ -14,7 +14,7 @@ from offboard.common.live.live_port import LivePort
 from offboard.loadgen.play.watch import RunLive
 from tests.browser import chromium
 
-SIZE = {"width": 960, "height": 760}
+SIZE = {"width": 1100, "height": 800}
 FRAMES, FRAME_MS, LAST_MS = 40, 200, 2_000
 FIRST = 100  # of the 1,000 steps of the slider: before that there is too little to see
 QUALITY = 50
