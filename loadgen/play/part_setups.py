@@ -1,4 +1,4 @@
-"""How each part of a run is started: the flags and CPU quotas of cloud server, relay and robots.
+"""How each part of a run is started: the flags and CPU quotas of servers, relays and robots.
 
 The testbed adds the addresses and starts the parts.
 """
@@ -7,11 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from offboard.loadgen.play.run_files import LINK, PICTURE, RobotFiles
+from offboard.loadgen.play.run_files import PICTURE, ROBOT_SEED_STEP, RobotFiles, link_file
+from offboard.loadgen.scenario.event_timeline import absent_at_first
 from offboard.loadgen.scenario.scenario import Scenario, Workload
-from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, Setup
+from offboard.loadgen.testbed.testbed import ROBOT, Setup, relay_of
 
 PLANNER = "offboard.common.planning.planner"
+ABSENT_CONNECT_S = 2.0  # that a robot waits for its servers if some are not there at first
 
 
 def setups(scenario: Scenario, out: Path, *, shown: bool = True) -> dict[str, Setup]:
@@ -19,12 +21,14 @@ def setups(scenario: Scenario, out: Path, *, shown: bool = True) -> dict[str, Se
 
     `shown` passes the output of the first robot on to our stdout; other output goes to logs.
     """
-    workload, cloud = scenario.workload, scenario.cloud
+    workload, links = scenario.workload, scenario.links()
     module = workload.task.partition(":")[0] if workload.task else PLANNER
-    parts = {
-        CLOUD: Setup({"executor": cloud.executor, "workers": cloud.workers, "tasks": module}, cloud.cpus),
-        WAN: Setup({**scenario.link, "seed": scenario.seed, "truth": out / LINK}),
-    }
+    parts = {}
+    for n, cloud in enumerate(scenario.servers):
+        flags = {"executor": cloud.executor, "workers": cloud.workers, "tasks": module}
+        parts[cloud.name] = Setup(flags, cloud.cpus)
+        relay, seed = relay_of(cloud.name), scenario.seed + n * ROBOT_SEED_STEP
+        parts[relay] = Setup({**links[cloud.name], "seed": seed, "truth": link_file(out, relay)})
     for files in RobotFiles.of(scenario, out):
         first = files.robot == ROBOT
         parts[files.robot] = Setup(
@@ -43,6 +47,7 @@ def _robot_flags(scenario: Scenario, files: RobotFiles, *, first: bool) -> Mappi
     """Flags of `loadgen drive` or `call`. Only the first robot runs `alone` and `reference`."""
     workload, robot = scenario.workload, scenario.robot
     policy, predictor = robot.names()
+    servers = {server.name for server in scenario.servers}
     flags = {
         **(_map_flags(workload) if workload.map else {"task": workload.task, "inputs": workload.inputs}),
         "sizes": _sizes(workload.sizes),
@@ -59,6 +64,8 @@ def _robot_flags(scenario: Scenario, files: RobotFiles, *, first: bool) -> Mappi
         "heartbeats": robot.heartbeats,
         "window": robot.window,
         "timeout": robot.timeout_s,
+        # Nobody waits for a server that an event starts later.
+        "connect": ABSENT_CONNECT_S if absent_at_first(scenario.timeline()) & servers else None,
         "seed": files.seed,
         "trace": files.trace,
         "answers": files.answers,

@@ -16,7 +16,7 @@ from offboard.common import VERSION
 from offboard.common.errors import OffloadError
 from offboard.loadgen.play.answer_verification import verified
 from offboard.loadgen.play.part_setups import setups
-from offboard.loadgen.play.player import Player
+from offboard.loadgen.play.player import Player, started_at_first
 from offboard.loadgen.play.run_digest import digests
 from offboard.loadgen.play.run_files import (
     EVENTS,
@@ -109,9 +109,9 @@ def play(
         clear_folder(out)
         if page is not Page.NONE:
             opened.enter_context(watching(out, say, page=page))
-        say(f"starting the cloud server and the relay (logs in {out / 'logs'})")
+        say(f"starting {_servers_of(scenario)} (logs in {out / 'logs'})")
         with progress("compiling the planner" if workload.map else "starting", to=sys.stdout):
-            bed.start()
+            bed.start(*started_at_first(scenario))
         many = "the robot" if workload.robots == 1 else f"{workload.robots} robots"
         tasks = f"{workload.tasks} {'plans' if workload.map else 'tasks'}"
         say(f"starting {many} with a quota of {scenario.robot.cpus:g} CPU: {tasks}")
@@ -138,6 +138,11 @@ def play_demo(out: Path) -> int:
         print(f"picture of the last plan: {out / PICTURE}")
     print(f"the run on a page: loadgen watch {out}")
     return 0
+
+
+def _servers_of(scenario: Scenario) -> str:
+    count = len(scenario.servers)
+    return "the cloud server and the relay" if count == 1 else f"{count} servers, each with its relay"
 
 
 def _ending(played: Played, out: Path) -> Iterator[str]:

@@ -12,7 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from offboard.common.errors import ConfigError, OffloadError
-from offboard.loadgen.play.run_files import ANSWERS, EVENTS, LINK, READINGS, TRACE, LineCounter, RobotFiles
+from offboard.loadgen.play.run_files import (
+    ANSWERS,
+    EVENTS,
+    READINGS,
+    TRACE,
+    LineCounter,
+    RobotFiles,
+    link_file,
+)
 from offboard.loadgen.progress import Progress
 from offboard.loadgen.robot.answers import BEGIN_S
 from offboard.loadgen.robot_files import alone_path
@@ -21,13 +29,19 @@ from offboard.loadgen.scenario.outcome import Reading
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.table.site_disturbance import WAYS
 from offboard.loadgen.testbed.part_process import USAGE_EXIT
-from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, Testbed
+from offboard.loadgen.testbed.testbed import ROBOT, WAN, Testbed, kind_of
 
 POLL_S = 0.02
 READ_EVERY_S = 2.0
 BOOT_CPUS = 1.0
 ROBOT_S_A_TASK = 10.0  # a run that takes longer than this for each of its tasks has hung
 ROBOT_S_AT_LEAST = 300.0
+
+
+def started_at_first(scenario: Scenario) -> tuple[str, ...]:
+    """The servers and relays that run before the robots; events start the others."""
+    later = absent_at_first(scenario.timeline())
+    return tuple(part for part in scenario.parts() if kind_of(part) != ROBOT and part not in later)
 
 
 class Player:
@@ -45,7 +59,7 @@ class Player:
         self._shown = shown
         self._testbed = testbed
         self._robots = scenario.robots()
-        self._parts = {CLOUD, WAN}  # the parts that were started
+        self._parts = set(started_at_first(scenario))  # the parts that were started
         self._paused: set[str] = set()  # a paused part cannot be sampled
         self._timeline = Timeline(scenario.timeline())
         self._answers = LineCounter(testbed.out / ANSWERS)
@@ -125,8 +139,8 @@ class Player:
 
     def _apply(self, event: Event) -> None:
         (part,) = event.parts() if event.action in ON_A_PART else (None,)
-        if part == WAN and event.action in ("start", "restart"):
-            self._keep_truth()
+        if part is not None and kind_of(part) == WAN and event.action in ("start", "restart"):
+            self._keep_truth(part)
         if part in self._robots and event.action == "start":
             self._start(part)
         else:
@@ -136,11 +150,11 @@ class Player:
         elif part is not None and event.action not in ("cut", "join"):
             self._paused.discard(part)
 
-    def _keep_truth(self) -> None:
+    def _keep_truth(self, relay: str) -> None:
         """Keep the link record of an ended relay as link-1.jsonl, ...: the next one overwrites link.jsonl."""
-        truth = self._testbed.out / LINK
+        truth = link_file(self._testbed.out, relay)
         if truth.exists():
-            count = sum(1 for _ in truth.parent.glob(f"{truth.stem}-*.jsonl"))
+            count = sum(1 for _ in truth.parent.glob(f"{truth.stem}-[0-9]*.jsonl"))
             truth.rename(truth.with_stem(f"{truth.stem}-{count + 1}"))
 
     def _start_all(self, until: float) -> None:

@@ -10,11 +10,11 @@ from typing import Self
 
 from offboard.common.errors import ConfigError, DataError
 from offboard.loadgen.scenario.scenario import Scenario
-from offboard.loadgen.testbed.testbed import ROBOT
+from offboard.loadgen.testbed.testbed import ROBOT, WAN
 
 TRACE = "trace.jsonl"
 ANSWERS = "answers.jsonl"
-LINK = "link.jsonl"
+LINK = "link.jsonl"  # of the relay of `cloud`; that of `edge` writes link-edge.jsonl
 EVENTS = "events.jsonl"
 READINGS = "usage.jsonl"
 SUMMARY = "summary.json"
@@ -39,6 +39,12 @@ class RobotFiles:
             suffix = robot.removeprefix(ROBOT)
             trace, answers = (out / name.replace(".", f"{suffix}.", 1) for name in (TRACE, ANSWERS))
             yield cls(robot, trace, answers, scenario.seed + n * ROBOT_SEED_STEP)
+
+
+def link_file(out: Path, relay: str) -> Path:
+    """The file in which a relay records what its link did."""
+    path = out / LINK
+    return path.with_stem(f"{path.stem}{relay.removeprefix(WAN)}")
 
 
 class LineCounter:

@@ -12,7 +12,7 @@ from offboard.common.errors import ConfigError, DataError
 from offboard.common.toml_file import line_of, unknown
 from offboard.loadgen.relay.link.link import Link
 from offboard.loadgen.testbed.cpu_quota import CPUS_MAX, CPUS_MIN
-from offboard.loadgen.testbed.testbed import WAN, Testbed
+from offboard.loadgen.testbed.testbed import WAN, Testbed, kind_of
 
 EVENTS_MAX = 10_000
 AT_S_MAX = 86_400.0
@@ -21,7 +21,9 @@ HOGS_MAX = 16
 WHEN = ("at_s", "at_task")
 ON_A_PART = ("kill", "stop", "start", "restart", "pause", "resume", "cut", "join")
 ACTIONS = ("link", "cpus", "hogs", "reset", *ON_A_PART)
-KEYS = (*WHEN, *ACTIONS)
+ON = "on"  # names the server whose link an event changes
+ON_A_LINK = ("link", "reset")
+KEYS = (*WHEN, ON, *ACTIONS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,23 +32,26 @@ class Event:
 
     `value` depends on the action: the name of a part, {part: CPUs}, {part: number of hogs}, conditions as in
     PUT /link of the relay, or True.
+    `on` is the server whose link changes; None: all links.
     """
 
     action: str
     value: Any
     at_s: float | None = None
     at_task: int | None = None
+    on: str | None = None
 
     def shown(self) -> dict[str, Any]:
         """The event as a scenario file writes it."""
         when = {"at_s": self.at_s} if self.at_s is not None else {"at_task": self.at_task}
-        return {**when, self.action: self.value}
+        where = {} if self.on is None else {ON: self.on}
+        return {**when, **where, self.action: self.value}
 
     def apply(self, testbed: Testbed) -> None:
         """Make the event happen on a testbed."""
         match self.action:
             case "link":
-                testbed.set_link(**self.value)
+                testbed.set_link(self.on, **self.value)
             case "cpus":
                 for part, cpus in self.value.items():
                     testbed.set_cpus(part, cpus)
@@ -54,7 +59,7 @@ class Event:
                 for part, count in self.value.items():
                     testbed.set_hogs(part, count)
             case "reset":
-                testbed.reset()
+                testbed.reset(self.on)
             case "restart":
                 testbed.kill(self.value)
                 testbed.start(self.value)
@@ -93,11 +98,11 @@ def absent_at_first(events: Sequence[Event]) -> set[str]:
 
 
 def parse_events(
-    table: Mapping[str, Any], path: Path, *, parts: Sequence[str], link: Link
+    table: Mapping[str, Any], path: Path, *, parts: Sequence[str], links: Mapping[str, Link]
 ) -> tuple[Event, ...]:
     """The events of a scenario file, in its order; DataError names file and line.
 
-    `parts` are the names that events may use, `link` is the link that they change.
+    `parts` are the names that events may use, `links` are the links that they change, by server.
     """
     lines = path.read_text().splitlines()
     given = table.get("event", [])
@@ -108,7 +113,7 @@ def parse_events(
     events = []
     for number, event in enumerate(given, 1):
         try:
-            events.append(_parse(event, parts, link))
+            events.append(_parse(event, parts, links))
         except ConfigError as error:
             key, _, said = str(error).partition(": ")
             place = f"{path}:{line_of(lines, 'event', number, key)}"
@@ -116,7 +121,7 @@ def parse_events(
     return tuple(events)
 
 
-def _parse(given: Mapping[str, Any], parts: Sequence[str], link: Link) -> Event:
+def _parse(given: Mapping[str, Any], parts: Sequence[str], links: Mapping[str, Link]) -> Event:
     """One event; the text of a ConfigError starts with the key."""
     for key in given:
         if key not in KEYS:
@@ -131,13 +136,27 @@ def _parse(given: Mapping[str, Any], parts: Sequence[str], link: Link) -> Event:
     number = _number(whens[0], given[whens[0]], 0, AT_S_MAX if whens[0] == "at_s" else AT_TASK_MAX)
     if whens[0] == "at_task" and number != int(number):
         raise ConfigError(f"at_task: {number} is not a whole number")
-    value = _value(actions[0], given[actions[0]], parts, link)
+    on = _on(given, actions[0], links)
+    changed = list(links.values()) if on is None else [links[on]]
+    value = _value(actions[0], given[actions[0]], parts, changed)
     if whens[0] == "at_s":
-        return Event(actions[0], value, at_s=number)
-    return Event(actions[0], value, at_task=int(number))
+        return Event(actions[0], value, at_s=number, on=on)
+    return Event(actions[0], value, at_task=int(number), on=on)
 
 
-def _value(action: str, value: Any, parts: Sequence[str], link: Link) -> Any:
+def _on(given: Mapping[str, Any], action: str, links: Mapping[str, Link]) -> str | None:
+    """The server whose link an event changes; None: all of them."""
+    on = given.get(ON)
+    if on is None:
+        return None
+    if action not in ON_A_LINK:
+        raise ConfigError(f"{ON}: only an event with {' or '.join(ON_A_LINK)} can be on one link")
+    if on not in links:
+        raise ConfigError(f"{ON}: {on!r} is not one of {', '.join(links)}")
+    return str(on)
+
+
+def _value(action: str, value: Any, parts: Sequence[str], links: Sequence[Link]) -> Any:
     if action in ON_A_PART:
         return _part(action, value, parts)
     if action == "reset":
@@ -148,7 +167,8 @@ def _value(action: str, value: Any, parts: Sequence[str], link: Link) -> Any:
         raise ConfigError(f"{action}: {value!r} is not a table, or is empty")
     if action == "link":
         try:
-            link.changed(value)
+            for link in links:
+                link.changed(value)
         except ConfigError as error:
             raise ConfigError(f"link: {error}") from None
         return value
@@ -159,7 +179,7 @@ def _number_by_part(action: str, value: Mapping[str, Any], parts: Sequence[str])
     """{part: CPUs} or {part: number of hogs}."""
     low, high = (CPUS_MIN, CPUS_MAX) if action == "cpus" else (0, HOGS_MAX)
     named = {_part(action, part, parts): _number(action, number, low, high) for part, number in value.items()}
-    if WAN in named:
+    if any(kind_of(part) == WAN for part in named):
         raise ConfigError(f"{action}: the relay has no CPU quota")
     if action == "cpus":
         return named

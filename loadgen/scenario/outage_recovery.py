@@ -11,7 +11,7 @@ from typing import Any
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.outcome_files import read_lines
 from offboard.loadgen.testbed.testbed import ROBOT
-from offboard.robot_client.sites.runner import CLOUD
+from offboard.robot_client.sites.runner import ONBOARD
 
 SPAN = 10  # tasks over which a share is computed
 WITHIN_PERCENT = 10.0  # recovered: the share differs from the one before the outage by at most this
@@ -43,7 +43,7 @@ def recovery_tasks(run: Outcome) -> float | None:
         return None
     began, ended = run.outage
     sent = sorted(
-        (one.i, one.chosen == CLOUD)
+        (one.i, one.chosen != ONBOARD)
         for one in run.answered
         if one.robot == ROBOT and one.chosen and not one.both
     )

@@ -20,6 +20,7 @@ class Answered:
     `unverified` says why an answer whose bytes are not the expected ones could not be compared further.
     `intervals` are the prediction intervals of its executions.
     `server_s` is the run time that the cloud server reported, without link and queue.
+    `probed` says whether a second site ran it too, so that its time is learnt.
     `overhead_s` is what Offboard itself added to the time of the task; None: unknown.
     """
 
@@ -39,6 +40,7 @@ class Answered:
     overhead_s: float | None = None
     used: str | None = None
     quality: float | None = None
+    probed: bool = False
 
     @property
     def response_s(self) -> float:

@@ -11,9 +11,10 @@ import numpy as np
 
 from offboard.loadgen.scenario.outcome import Outcome, Reading
 from offboard.loadgen.table.table_two_figures import quantile
-from offboard.robot_client.sites.runner import CLOUD
+from offboard.robot_client.sites.runner import ONBOARD
 
 GROWTH_FROM = 1 / 3  # share of the run that is left out: a process needs it to reach its usual size
+SHARE = "cloud_percent"  # the figure that can be asked for one site
 READINGS_MIN = 6  # readings of a part that are needed to tell whether it grows
 
 
@@ -72,7 +73,18 @@ def _late(run: Outcome) -> list[bool]:
 
 
 def _in_the_cloud(run: Outcome) -> list[bool]:
-    return [one.chosen == CLOUD for one in run.answered if one.chosen and not one.both]
+    return [one.chosen != ONBOARD for one in run.answered if one.chosen and not one.both]
+
+
+def site_percent(run: Outcome, site: str) -> float | None:
+    """The share of one site in the tasks that were sent to one site."""
+    return _percent(lambda run: [one.chosen == site for one in run.answered if one.chosen and not one.both])(
+        run
+    )
+
+
+def _probed(run: Outcome) -> list[bool]:
+    return [one.probed for one in run.answered if one.chosen]
 
 
 def _twice(run: Outcome) -> list[bool]:
@@ -142,9 +154,10 @@ FIGURES: dict[str, Figure] = {
     "p99_ms": Figure("ms", "99 % of the tasks are answered within this time", _quantile_ms(99)),
     "late_percent": Figure("%", "tasks answered after their deadline", _percent(_late), "deadline_ms"),
     "quality": Figure("of 1", "mean quality of the variants that answered", _quality),
-    "cloud_percent": Figure(
-        "%", "share of the cloud in the tasks that were sent to one site", _percent(_in_the_cloud)
+    SHARE: Figure(
+        "%", "share of the servers in the tasks that were sent to one site", _percent(_in_the_cloud)
     ),
+    "probe_percent": Figure("%", "tasks that were probes of a second site", _percent(_probed)),
     "twice_percent": Figure("%", "tasks that ran on two sites", _percent(_twice)),
     "accuracy_percent": Figure(
         "%",

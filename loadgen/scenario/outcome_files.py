@@ -12,7 +12,7 @@ from offboard.common.errors import DataError
 from offboard.loadgen.robot_files import read_trace
 from offboard.loadgen.scenario.interval_coverage import intervals_of, late_seconds
 from offboard.loadgen.scenario.outcome import Answered, Reading, Reference
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD
+from offboard.robot_client.sites.runner import ONBOARD
 
 
 def read_answered(answers: Path, records: Path, robot: str) -> list[Answered]:
@@ -37,14 +37,22 @@ def read_answered(answers: Path, records: Path, robot: str) -> list[Answered]:
                 sites=tuple(one["site"] for one in executions),
                 intervals=intervals_of(record, late),
                 server_s=next(
-                    (one["run_s"] for one in executions if one["site"] == CLOUD and one["ok"]), None
+                    (one["run_s"] for one in executions if one["site"] != ONBOARD and one["ok"]), None
                 ),
                 overhead_s=overhead_s(record) if record else None,
                 used=used,
+                probed=is_probed(record) if record else False,
                 quality=record["sites"][used].get("quality") if used else None,
             )
         )
     return found
+
+
+def is_probed(record: Mapping[str, Any]) -> bool:
+    """Whether the task was run on a second site from the start, to learn how that site does."""
+    decision = record["decision"]
+    ran = any(one["site"] == decision["second"] for one in record["executions"])
+    return ran and not decision["second_after_s"]
 
 
 def overhead_s(record: Mapping[str, Any]) -> float | None:

@@ -3,7 +3,7 @@
 How a figure is computed is in `outcome_figures`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from offboard.common.config import check, from_table, setting
 from offboard.common.errors import ConfigError, DataError
 from offboard.common.toml_file import line_of, unknown
 from offboard.loadgen.scenario.outcome import Outcome
-from offboard.loadgen.scenario.outcome_figures import FIGURES
+from offboard.loadgen.scenario.outcome_figures import FIGURES, SHARE, site_percent
 
 CHECKS_MAX = 100
 
@@ -26,6 +26,7 @@ class Check:
     """
 
     figure: str = setting("", "name of the figure")
+    site: str = setting("", "the site whose share counts, for cloud_percent; else that of all servers")
     at_most: float | None = setting(None, "largest allowed value")
     at_least: float | None = setting(None, "smallest allowed value")
     from_task: int = setting(0, "first task that counts", minimum=0)
@@ -37,6 +38,8 @@ class Check:
         check(self)
         if self.figure not in FIGURES:
             raise ConfigError(f"figure: {unknown('figure', self.figure, tuple(FIGURES))}")
+        if self.site and self.figure != SHARE:
+            raise ConfigError(f"site: {self.site!r} is only for the figure {SHARE}")
         if (self.at_most is None) == (self.at_least is None):
             raise ConfigError("figure: give either at_most or at_least")
         if self.to_task is not None and self.to_task <= self.from_task:
@@ -46,10 +49,12 @@ class Check:
         which, limit = ("at most", self.at_most) if self.at_most is not None else ("at least", self.at_least)
         span = f" from task {self.from_task}" if self.from_task else ""
         span += f" before task {self.to_task}" if self.to_task is not None else ""
-        return f"{self.figure} {which} {limit:g} {FIGURES[self.figure].unit}{span}"
+        of = f" of {self.site}" if self.site else ""
+        return f"{self.figure}{of} {which} {limit:g} {FIGURES[self.figure].unit}{span}"
 
     def judge(self, run: Outcome) -> "Verdict":
-        value = FIGURES[self.figure].compute(run.between(self.from_task, self.to_task))
+        run = run.between(self.from_task, self.to_task)
+        value = site_percent(run, self.site) if self.site else FIGURES[self.figure].compute(run)
         if value is None:
             return Verdict(self, None, holds=False)
         holds = value <= self.at_most if self.at_most is not None else value >= (self.at_least or 0.0)
@@ -80,11 +85,17 @@ class Verdict:
 
 
 def parse_checks(
-    table: Mapping[str, Any], path: Path, *, tasks: int, known: Mapping[str, bool]
+    table: Mapping[str, Any],
+    path: Path,
+    *,
+    tasks: int,
+    known: Mapping[str, bool],
+    sites: Sequence[str],
 ) -> tuple[Check, ...]:
     """The checks in a scenario file; DataError names file and line.
 
-    `tasks` and `known` describe the workload. A check that no run of it can compute is an error too.
+    `tasks` and `known` describe the workload, `sites` are those of the scenario. A check that no run of it
+    can compute is an error too.
     """
     given = table.get("check", [])
     if not isinstance(given, list) or not all(isinstance(one, dict) for one in given):
@@ -102,6 +113,8 @@ def parse_checks(
         try:
             checks.append(from_table(Check, one, path, f"check {number}"))
             check_computable(checks[-1], tasks=tasks, known=known)
+            if checks[-1].site not in ("", *sites):
+                raise ConfigError(f"site: {checks[-1].site!r} is not one of {', '.join(sites)}")
         except DataError as error:
             raise DataError(f"{place}: {str(error).removeprefix(f'{path}: ')}") from None
         except ConfigError as error:

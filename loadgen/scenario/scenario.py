@@ -3,7 +3,7 @@
 `scenario_file` reads it from TOML, `play` runs it with real processes, `simulation` in virtual time.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,13 @@ from offboard.loadgen.scenario.outcome_figures import FIGURES
 from offboard.loadgen.scenario.pass_fail_check import Check, check_computable
 from offboard.loadgen.scenario.random_faults import Chaos
 from offboard.loadgen.testbed.cpu_quota import CPUS_MAX, CPUS_MIN
-from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN
+from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, relay_of
 from offboard.robot_client import policies
+from offboard.robot_client.policies import BOTH
+from offboard.robot_client.sites.runner import ONBOARD
 
 ROBOTS_MAX = 64
+SERVERS_MAX = 16
 
 
 @dataclass(frozen=True)
@@ -76,9 +79,8 @@ class Workload:
         if self.alone > self.tasks:
             raise ConfigError(f"workload.alone: {self.alone} is above workload.tasks {self.tasks}")
 
-    def parts(self) -> tuple[str, ...]:
-        """The names of all parts of the run: cloud, relay and robots."""
-        return (CLOUD, WAN, *(ROBOT if n == 1 else f"{ROBOT}-{n}" for n in range(1, self.robots + 1)))
+    def robot_names(self) -> tuple[str, ...]:
+        return tuple(ROBOT if n == 1 else f"{ROBOT}-{n}" for n in range(1, self.robots + 1))
 
     def robot(self, seed: int) -> RobotConfig:
         """The settings of a robot with this workload; ConfigError if they contradict each other."""
@@ -131,14 +133,22 @@ class RobotPart:
 
 @dataclass(frozen=True)
 class CloudPart:
-    """`[cloud]`: how the server runs tasks, and its CPU quota."""
+    """`[cloud]`, or each `[[cloud]]` if there are several servers: how one runs tasks, and its CPU quota.
 
+    `link` holds the conditions of its link that differ from those of the scenario.
+    """
+
+    name: str = setting(CLOUD, "name of the server and of its site; one server is named cloud")
     cpus: float = setting(1.0, "CPU quota, in CPUs", minimum=CPUS_MIN, maximum=CPUS_MAX)
     executor: str = setting("threads", "kind of workers", choices=("threads", "processes"))
     workers: int = setting(1, "number of tasks that run at the same time", minimum=1)
+    link: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check(self)
+        if not self.name.isidentifier() or self.name in (ONBOARD, BOTH, WAN, ROBOT):
+            taken = f"other than {ONBOARD}, {BOTH}, {WAN} and {ROBOT}"
+            raise ConfigError(f"cloud.name: {self.name!r} is not a name of letters, digits and _, {taken}")
 
 
 @dataclass(frozen=True)
@@ -146,7 +156,7 @@ class Scenario:
     """A whole run.
 
     `about` says what the scenario imitates and what it tests.
-    `link` holds the conditions of the link, under the flag names of `loadgen wan`.
+    `link` has the conditions of each link, under the flag names of `loadgen wan`; a server may add its own.
     `events` are the events of the file; `timeline` adds the random faults of `chaos`.
     """
 
@@ -155,11 +165,24 @@ class Scenario:
     workload: Workload
     about: str = ""
     robot: RobotPart = field(default_factory=RobotPart)
-    cloud: CloudPart = field(default_factory=CloudPart)
+    servers: tuple[CloudPart, ...] = (CloudPart(),)
     link: Mapping[str, Any] = field(default_factory=dict)
     events: tuple[Event, ...] = ()
     checks: tuple[Check, ...] = ()
     chaos: Chaos | None = None
+
+    def __post_init__(self) -> None:
+        check_servers(self.servers)
+        if self.chaos is not None and len(self.servers) > 1:
+            raise ConfigError("chaos: random faults need a scenario with one server")
+
+    def parts(self) -> tuple[str, ...]:
+        """The names of all parts of the run: servers, relays and robots."""
+        return parts_of([server.name for server in self.servers], self.workload)
+
+    def links(self) -> dict[str, Mapping[str, Any]]:
+        """The conditions of the link to each server."""
+        return {server.name: {**self.link, **server.link} for server in self.servers}
 
     def timeline(self) -> tuple[Event, ...]:
         """All events: those of the file, and the random faults drawn from the seed."""
@@ -171,7 +194,7 @@ class Scenario:
 
     def robots(self) -> tuple[str, ...]:
         """The names of the robots."""
-        return self.workload.parts()[2:]
+        return self.workload.robot_names()
 
     def compared(self) -> tuple[str, ...]:
         """The robots whose times count in a comparison: the first one, and every robot that is never paused.
@@ -224,3 +247,17 @@ class Scenario:
             robot=robot,
             checks=checks,
         )
+
+
+def check_servers(servers: Sequence[CloudPart]) -> None:
+    """ConfigError unless each server has a name of its own, and one is named cloud."""
+    names = [server.name for server in servers]
+    if len(names) > SERVERS_MAX:
+        raise ConfigError(f"cloud: {len(names)} servers, at most {SERVERS_MAX} are allowed")
+    if len(set(names)) < len(names) or CLOUD not in names:
+        raise ConfigError(f"cloud.name: {', '.join(names)}: each name once, and {CLOUD} among them")
+
+
+def parts_of(servers: Sequence[str], workload: Workload) -> tuple[str, ...]:
+    """The names of the servers, of their relays and of the robots."""
+    return (*servers, *map(relay_of, servers), *workload.robot_names())

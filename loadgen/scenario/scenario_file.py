@@ -16,7 +16,15 @@ from offboard.loadgen.relay.link.link_settings import LinkFlags
 from offboard.loadgen.scenario.event_timeline import parse_events
 from offboard.loadgen.scenario.pass_fail_check import parse_checks
 from offboard.loadgen.scenario.random_faults import Chaos
-from offboard.loadgen.scenario.scenario import CloudPart, RobotPart, Scenario, Workload
+from offboard.loadgen.scenario.scenario import (
+    CloudPart,
+    RobotPart,
+    Scenario,
+    Workload,
+    check_servers,
+    parts_of,
+)
+from offboard.robot_client.sites.runner import ONBOARD
 
 SHIPPED = Path(__file__).parents[1] / "scenarios"
 NAME = r"[A-Za-z0-9][A-Za-z0-9_-]*"
@@ -27,7 +35,8 @@ LINK_KEYS = tuple(f.name for f in fields(LinkFlags))
 def read_scenario(path: Path) -> Scenario:
     """The scenario in a TOML file; DataError names the file and the wrong key."""
     table = read_toml(path)
-    known = [{"events": "event", "checks": "check"}.get(f.name, f.name) for f in fields(Scenario)]
+    keys = {"events": "event", "checks": "check", "servers": "cloud"}
+    known = [keys.get(f.name, f.name) for f in fields(Scenario)]
     for key in table:
         if key not in known:
             raise unknown_key(path, key, known)
@@ -41,19 +50,21 @@ def read_scenario(path: Path) -> Scenario:
         raise DataError(f"{path}: seed = {seed!r} is not a whole number of at least 0")
     workload = _workload(_table(table, "workload", path), path)
     link = _link(_table(table, "link", path), path)
+    servers = _servers(table, path)
+    links = {one.name: from_table(LinkFlags, {**link, **one.link}, path, "link").link for one in servers}
     return Scenario(
         name=name,
         seed=seed,
         workload=workload,
         about=str(table.get("about", "")).strip(),
         robot=from_table(RobotPart, _table(table, "robot", path), path, "robot"),
-        cloud=from_table(CloudPart, _table(table, "cloud", path), path, "cloud"),
+        servers=servers,
         link=link,
-        events=parse_events(
-            table, path, parts=workload.parts(), link=from_table(LinkFlags, link, path, "link").link
+        events=parse_events(table, path, parts=parts_of(list(links), workload), links=links),
+        checks=parse_checks(
+            table, path, tasks=workload.tasks, known=workload.known(), sites=(ONBOARD, *links)
         ),
-        checks=parse_checks(table, path, tasks=workload.tasks, known=workload.known()),
-        chaos=_chaos(table, workload, path),
+        chaos=_chaos(table, workload, path, servers=len(servers)),
     )
 
 
@@ -130,9 +141,30 @@ def _sizes(texts: tuple[str, ...], path: Path) -> tuple[str, ...]:
     return (str(place),)
 
 
-def _chaos(table: Mapping[str, Any], workload: Workload, path: Path) -> Chaos | None:
+def _servers(table: Mapping[str, Any], path: Path) -> tuple[CloudPart, ...]:
+    """The server in [cloud], or the servers in [[cloud]]; each of these may have a table `link`."""
+    given = table.get("cloud", {})
+    if not isinstance(given, list):
+        return (from_table(CloudPart, _table(table, "cloud", path), path, "cloud"),)
+    found = []
+    for number, one in enumerate(given, 1):
+        if not isinstance(one, dict):
+            raise DataError(f"{path}: cloud is not a table, nor a list of tables, each under [[cloud]]")
+        own = {key: value for key, value in one.items() if key != "link"}
+        part = from_table(CloudPart, own, path, f"cloud {number}")
+        found.append(replace(part, link=_link(_table(one, "link", path), path)))
+    try:
+        check_servers(found)
+    except ConfigError as error:
+        raise DataError(f"{path}: {error}") from None
+    return tuple(found)
+
+
+def _chaos(table: Mapping[str, Any], workload: Workload, path: Path, *, servers: int) -> Chaos | None:
     if "chaos" not in table:
         return None
+    if servers > 1:
+        raise DataError(f"{path}: chaos: random faults need one server, not {servers}")
     if workload.rate is None:
         raise DataError(
             f"{path}: chaos: random faults come by the clock; workload.arrivals must not be closed"

@@ -1,6 +1,6 @@
-"""The other robots of a simulated scenario: they load the server, and always choose the faster site."""
+"""The other robots of a simulated scenario: they load the servers, and always choose the fastest site."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -28,7 +28,7 @@ class RobotSettings:
 
 
 class OtherRobot:
-    """Runs its tasks one after the other, each on the site that is really faster, between `begin` and `end`.
+    """Runs its tasks one after the other, each on the site that is really fastest, between `begin` and `end`.
 
     It neither learns nor repeats: a task that the server refuses or loses runs onboard.
     """
@@ -37,31 +37,47 @@ class OtherRobot:
         self,
         settings: RobotSettings,
         clock: VirtualClock,
-        server: SimulatedServer,
+        servers: Mapping[str, SimulatedServer],
         costs: TrueCosts,
-        link: Link,
+        links: Mapping[str, Link],
     ) -> None:
         self.cpu = SimulatedCpu(clock, settings.cpus)
-        self.connection = SimulatedConnection(
-            clock, server, link, settings.seed, on_up=lambda: None, on_lost=self._on_lost
-        )
-        self.coming: Coming | None = None  # its request on the way to the server
+        self.connections = {
+            name: SimulatedConnection(
+                clock,
+                server,
+                links[name],
+                settings.seed + n,
+                on_up=lambda: None,
+                on_lost=partial(self._on_lost, name),
+            )
+            for n, (name, server) in enumerate(servers.items())
+        }
+        self._coming: Coming | None = None  # its request on the way to a server
         self._name = settings.name
         self._timeout_s = settings.timeout_s
         self._clock = clock
-        self._server = server
+        self._servers = servers
         self._costs = costs
-        self._oracle = Oracle(
-            clock=clock,
-            connection=self.connection,
-            server=server,
-            robot=self.cpu,
-            costs=costs,
-            owner=settings.name,
-        )
+        self._oracles = {
+            name: Oracle(
+                clock=clock,
+                connection=self.connections[name],
+                server=server,
+                robot=self.cpu,
+                costs=costs,
+                owner=settings.name,
+            )
+            for name, server in servers.items()
+        }
         self._number = -1  # of the current task
-        self._working = self._paused = self._in_cloud = False
+        self._working = self._paused = False
+        self._used: str | None = None  # the server that runs the current task
         self._held: Callable[[], None] | None = None  # where a paused robot continues
+
+    def coming_to(self, server: str) -> Coming | None:
+        """Its request on the way to this server."""
+        return self._coming if self._used == server else None
 
     def begin(self) -> None:
         if not self._working:
@@ -70,7 +86,8 @@ class OtherRobot:
 
     def end(self) -> None:
         """Stop working. The server finishes its request, and nobody reads the answer."""
-        self._working = self._paused = self._in_cloud = False
+        self._working = self._paused = False
+        self._used = None
         self._held = None
         self._number += 1
         self.cpu.clear()
@@ -94,7 +111,7 @@ class OtherRobot:
             self._held = partial(self._next, number)
             return
         self._number += 1
-        self._in_cloud = False
+        self._used = None
         self._clock.after(DECIDING_CPU_S / self.cpu.share(1), partial(self._decide, self._number))
 
     def _decide(self, number: int) -> None:
@@ -103,48 +120,52 @@ class OtherRobot:
         if self._paused:
             self._held = partial(self._decide, number)
             return
-        cloud_s = self._oracle.cloud_s(number, coming=())
-        if cloud_s is not None and cloud_s < self._oracle.onboard_s(number):
-            self._send(number)
+        found = {name: oracle.cloud_s(number, coming=()) for name, oracle in self._oracles.items()}
+        times = {name: seconds for name, seconds in found.items() if seconds is not None}
+        fastest = min(times, key=times.__getitem__, default=None)
+        onboard_s = next(iter(self._oracles.values())).onboard_s(number)
+        if fastest is not None and times[fastest] < onboard_s:
+            self._send(fastest, number)
         else:
             self._run(number)
 
     def _run(self, number: int) -> None:
         """Run the task onboard."""
         if number == self._number:
-            self._in_cloud = False
+            self._used = None
             cpu_s = self._costs.seconds(ONBOARD, number)
             self.cpu.add(cpu_s, lambda _: self._next(number), owner=self._name)
 
-    def _send(self, number: int) -> None:
-        """Run the task in the cloud. The CPU time for packing and unpacking is counted at the end."""
-        self._in_cloud = True
+    def _send(self, server: str, number: int) -> None:
+        """Run the task on a server. The CPU time for packing and unpacking is counted at the end."""
+        self._used, connection = server, self.connections[server]
         cpu_s, task = self._costs.seconds(CLOUD, number), self._costs.task(number)
         request = Message(task.bytes_out, f"{TASK}1", number)
-        arrives_s = self.connection.to_cloud.due_s(request, self._clock.now_s())
-        self.coming = None if arrives_s is None else (arrives_s, cpu_s)
-        self.connection.send(request, partial(self._arrive, number, cpu_s))
+        arrives_s = connection.to_cloud.due_s(request, self._clock.now_s())
+        self._coming = None if arrives_s is None else (arrives_s, cpu_s)
+        connection.send(request, partial(self._arrive, server, number, cpu_s))
         self._clock.after(self._timeout_s, partial(self._give_up, number))
 
-    def _arrive(self, number: int, cpu_s: float) -> None:
-        self.coming = None
-        key = (self._name, number)
-        self._server.request(key, cpu_s, self._timeout_s, partial(self._reply, number))
+    def _arrive(self, server: str, number: int, cpu_s: float) -> None:
+        self._coming = None
+        key, answer = (self._name, number), partial(self._reply, server, number)
+        self._servers[server].request(key, cpu_s, self._timeout_s, answer)
 
-    def _reply(self, number: int, reply: Reply) -> None:
+    def _reply(self, server: str, number: int, reply: Reply) -> None:
         then = self._received if reply.status == OK else self._give_up
         message = Message(self._costs.task(number).bytes_in, f"{TASK}1", number)
-        self.connection.reply(message, partial(then, number))
+        self.connections[server].reply(message, partial(then, number))
 
     def _received(self, number: int) -> None:
         sending_s = self._costs.cost.sending_s / self.cpu.share(1)
         self._clock.after(sending_s, partial(self._next, number))
 
     def _give_up(self, number: int) -> None:
-        if self._in_cloud and number == self._number:
-            self._server.cancel((self._name, number))
+        if self._used is not None and number == self._number:
+            self._servers[self._used].cancel((self._name, number))
             self._run(number)
 
-    def _on_lost(self) -> None:
-        self.coming = None
-        self._give_up(self._number)
+    def _on_lost(self, server: str) -> None:
+        if self._used == server:
+            self._coming = None
+            self._give_up(self._number)

@@ -1,4 +1,4 @@
-"""The simulated runner of the site `cloud`: works as `CloudRunner`, with modelled messages and no socket."""
+"""The simulated runner of a server's site: works as `CloudRunner`, with modelled messages and no socket."""
 
 from concurrent.futures import Future
 from dataclasses import dataclass, field
@@ -44,13 +44,12 @@ class _Pending:
 
 
 class SimulatedCloud:
-    """The cloud, as the first robot uses it.
+    """A server, as the first robot uses it.
 
+    - `site`: its name.
     - `cpu`: the CPU of the robot, which packs and unpacks the messages.
     - `heartbeat_s`: time between heartbeats; 0 means none.
     """
-
-    site = CLOUD
 
     def __init__(
         self,
@@ -59,10 +58,12 @@ class SimulatedCloud:
         cpu: SimulatedCpu,
         costs: TrueCosts,
         *,
+        site: str,
         link: Link,
         seed: int,
         heartbeat_s: float,
     ) -> None:
+        self.site = site
         self.connection = SimulatedConnection(
             clock, server, link, seed, on_up=self._start_beating, on_lost=self._fail_all
         )
@@ -160,7 +161,7 @@ class SimulatedCloud:
         seconds = self._clock.now_s() - pending.published_s
         pending.future.set_result(
             Execution(
-                CLOUD,
+                self.site,
                 seconds,
                 self._costs.value(pending.call),
                 queue_s=reply.queue_s,
@@ -197,7 +198,7 @@ class SimulatedCloud:
         seconds = self._clock.now_s() - pending.published_s
         pending.future.set_result(
             Execution(
-                CLOUD,
+                self.site,
                 seconds,
                 failure=failure,
                 censored=censored,

@@ -15,6 +15,7 @@ from offboard.loadgen.robot.workload import CLOSED, due_instants
 from offboard.loadgen.scenario.event_timeline import Timeline
 from offboard.loadgen.scenario.interval_coverage import intervals_of, late_seconds
 from offboard.loadgen.scenario.outcome import Answered, Outcome, Reference
+from offboard.loadgen.scenario.outcome_files import is_probed
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.simulation.model.lockstep_clock import LockstepClock
 from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks
@@ -25,7 +26,7 @@ from offboard.robot_client.policies import BOTH
 from offboard.robot_client.records.trace import Record, as_dict
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites import heartbeat
-from offboard.robot_client.sites.runner import CLOUD
+from offboard.robot_client.sites.runner import ONBOARD
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +92,7 @@ class _Run:
         self._testbed = SimulatedTestbed(scenario, tasks, self._clock, heartbeat_s=heartbeat_s, noise=noise)
         self._own = OwnRecord()
         self.offload = Offloader(
-            [self._testbed.cloud, self._testbed.onboard],
+            [*self._testbed.clouds.values(), self._testbed.onboard],
             policy=settings.make_policy(policy),
             memories=settings.make_memories(policy),
             timeout_s=robot.timeout_s,
@@ -167,6 +168,7 @@ class _Run:
                 both=ended.line["decision"]["both"],
                 sites=tuple(execution["site"] for execution in ended.line["executions"]),
                 intervals=intervals_of(ended.line, late),
+                probed=is_probed(ended.line),
             )
             for ended in self._ended
         ]
@@ -174,13 +176,13 @@ class _Run:
     def _reference(
         self, record: Record, ended: _Ended, deciding_s: float, foreseen: Mapping[str, float]
     ) -> SimulatedReference:
-        """The times of the sites alone. A cloud that would exceed the timeout counts as given up."""
+        """The times of the sites alone. A server that would exceed the timeout counts as given up."""
         timeout_s = self._scenario.robot.timeout_s
         seconds = {site: deciding_s + site_s for site, site_s in foreseen.items()}
-        given_up_s = {}
-        if foreseen.get(CLOUD, 0.0) >= timeout_s:
-            given_up_s[CLOUD] = deciding_s + timeout_s
-            del seconds[CLOUD]
+        late = [site for site, site_s in foreseen.items() if site != ONBOARD and site_s >= timeout_s]
+        given_up_s = dict.fromkeys(late, deciding_s + timeout_s)
+        for site in late:
+            del seconds[site]
         decision, waited_s = record.decision, ended.ended_s - ended.due_s
         return SimulatedReference(
             i=ended.number,

@@ -1,7 +1,7 @@
 """The simulated testbed: the computers and links of a scenario, and what its events do to them."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from offboard.common.errors import ConfigError
@@ -21,7 +21,7 @@ from offboard.loadgen.simulation.oracle import Oracle
 from offboard.loadgen.simulation.other_robots import OtherRobot, RobotSettings
 from offboard.loadgen.simulation.simulated_cloud import SimulatedCloud
 from offboard.loadgen.simulation.simulated_onboard import SimulatedOnboard
-from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN
+from offboard.loadgen.testbed.testbed import ROBOT, WAN, kind_of, servers_behind
 from offboard.robot_client.sites.runner import ONBOARD
 
 ENDS = ("reset_after_ms", "truncate_bytes", "slow_close_ms")  # conditions of connections, not of messages
@@ -45,39 +45,43 @@ class SimulatedTestbed:
         noise: float = 1.0,
     ) -> None:
         seed, cpus = scenario.seed, scenario.robot.cpus
-        self._link = LinkFlags(**scenario.link).link
-        self._server = SimulatedServer(clock, scenario.cloud)
+        self._links = {name: LinkFlags(**link).link for name, link in scenario.links().items()}
+        self._servers = {part.name: SimulatedServer(clock, part) for part in scenario.servers}
         self._cpu = SimulatedCpu(clock, cpus)
         self.costs = TrueCosts(tasks[ROBOT], Noise(seed, noise))
         self.onboard = SimulatedOnboard(clock, self._cpu, self.costs)
-        self.cloud = SimulatedCloud(
-            clock,
-            self._server,
-            self._cpu,
-            self.costs,
-            link=self._link,
-            seed=seed,
-            heartbeat_s=heartbeat_s,
-        )
-        self._oracle = Oracle(
-            clock=clock,
-            connection=self.cloud.connection,
-            server=self._server,
-            robot=self._cpu,
-            costs=self.costs,
-            owner=ROBOT,
-        )
+        self.clouds: dict[str, SimulatedCloud] = {}
+        self._oracles: dict[str, Oracle] = {}
+        for n, (name, server) in enumerate(self._servers.items()):
+            self.clouds[name] = SimulatedCloud(
+                clock,
+                server,
+                self._cpu,
+                self.costs,
+                site=name,
+                link=self._links[name],
+                seed=seed + n * ROBOT_SEED_STEP,
+                heartbeat_s=heartbeat_s,
+            )
+            self._oracles[name] = Oracle(
+                clock=clock,
+                connection=self.clouds[name].connection,
+                server=server,
+                robot=self._cpu,
+                costs=self.costs,
+                owner=ROBOT,
+            )
         self._others: dict[str, OtherRobot] = {}
         for n, name in enumerate(scenario.robots()[1:], 1):
             own_seed = seed + n * ROBOT_SEED_STEP
             costs = TrueCosts(tasks[name], Noise(own_seed, noise))
             settings = RobotSettings(name, cpus, own_seed, scenario.robot.timeout_s)
             self._others[name] = OtherRobot(
-                settings, clock=clock, server=self._server, costs=costs, link=self._link
+                settings, clock=clock, servers=self._servers, costs=costs, links=self._links
             )
         self._absent = absent_at_first(scenario.timeline())
-        if CLOUD in self._absent:
-            self._server.kill()
+        for name in self._absent & self._servers.keys():
+            self._servers[name].kill()
 
     def begin(self) -> None:
         """Let the other robots start their first tasks."""
@@ -95,56 +99,63 @@ class SimulatedTestbed:
 
         They are infinite for a site that would never answer; a site without a connection is left out.
         """
-        found = {ONBOARD: self._oracle.onboard_s(number)}
-        if self.cloud.connection.up:
-            coming = [other.coming for other in self._others.values() if other.coming is not None]
-            seconds = self._oracle.cloud_s(number, coming=coming)
-            found[CLOUD] = math.inf if seconds is None else seconds
+        found = {}
+        for name, oracle in self._oracles.items():
+            found[ONBOARD] = oracle.onboard_s(number)
+            if self.clouds[name].connection.up:
+                coming = [
+                    one for other in self._others.values() if (one := other.coming_to(name)) is not None
+                ]
+                seconds = oracle.cloud_s(number, coming=coming)
+                found[name] = math.inf if seconds is None else seconds
         return found
 
     def happen(self, event: Event) -> None:
         match event.action:
             case "link":
-                self._set_link(event.value)
-            case "cut" | "join":  # as on loopback, where all traffic passes the relay
-                self._set_link({"outage": event.action == "cut"})
+                self._set_link(event.value, self._links if event.on is None else [event.on])
+            case "cut" | "join":  # as on loopback, where all traffic passes the relays
+                self._set_link({"outage": event.action == "cut"}, servers_behind(event.value, self._links))
             case "reset":
-                for connection in self._connections:
-                    connection.lose()
+                for name in self._links if event.on is None else [event.on]:
+                    for connection in self._connections(name):
+                        connection.lose()
             case "cpus":
                 for part, cpus in event.value.items():
                     self._cpu_of(part).change(cpus=cpus)
             case "hogs":
                 for part, count in event.value.items():
                     self._cpu_of(part).change(hogs=count)
-            case action if event.value == CLOUD:
-                self._happen_to_server(action)
+            case action if event.value in self._servers:
+                self._happen_to_server(self._servers[event.value], action)
             case action:
                 self._happen_to_robot(self._others[event.value], action)
 
-    @property
-    def _connections(self) -> list[SimulatedConnection]:
-        return [self.cloud.connection, *(other.connection for other in self._others.values())]
+    def _connections(self, server: str) -> list[SimulatedConnection]:
+        """The connections of all robots to a server."""
+        others = (other.connections[server] for other in self._others.values())
+        return [self.clouds[server].connection, *others]
 
-    def _set_link(self, changes: Mapping[str, Any]) -> None:
-        self._link = self._link.changed(changes)
-        for connection in self._connections:
-            connection.change(self._link)
+    def _set_link(self, changes: Mapping[str, Any], servers: Iterable[str]) -> None:
+        for name in servers:
+            self._links[name] = self._links[name].changed(changes)
+            for connection in self._connections(name):
+                connection.change(self._links[name])
 
     def _cpu_of(self, part: str) -> SimulatedCpu:
-        if part == CLOUD:
-            return self._server.cpu
+        if part in self._servers:
+            return self._servers[part].cpu
         return self._cpu if part == ROBOT else self._others[part].cpu
 
-    def _happen_to_server(self, action: str) -> None:
+    def _happen_to_server(self, server: SimulatedServer, action: str) -> None:
         if action in ("kill", "stop", "restart"):
-            self._server.kill()
+            server.kill()
         if action in ("start", "restart"):
-            self._server.start()
+            server.start()
         if action == "pause":
-            self._server.pause()
+            server.pause()
         if action == "resume":
-            self._server.resume()
+            server.resume()
 
     def _happen_to_robot(self, robot: OtherRobot, action: str) -> None:
         if action in ("kill", "stop", "restart"):
@@ -162,14 +173,16 @@ def check_simulated(scenario: Scenario) -> None:
     prefix = f"scenario {scenario.name} cannot be simulated"
     if scenario.workload.inputs is not None:
         raise ConfigError(f"{prefix}: the costs of task {scenario.workload.task} are not known")
-    link = LinkFlags(**scenario.link).link
-    _check_link(prefix, link)
+    links = {name: LinkFlags(**link).link for name, link in scenario.links().items()}
+    for link in links.values():
+        _check_link(prefix, link)
     for event in scenario.timeline():
         if event.action == "link":
-            link = link.changed(event.value)
-            _check_link(prefix, link)
+            for name in links if event.on is None else [event.on]:
+                links[name] = links[name].changed(event.value)
+                _check_link(prefix, links[name])
         for part in event.parts():
-            if part == WAN or (part == ROBOT and event.action not in FIRST_ROBOT_EVENTS):
+            if kind_of(part) == WAN or (part == ROBOT and event.action not in FIRST_ROBOT_EVENTS):
                 raise ConfigError(f"{prefix}: event {event.action} of {part} needs real processes")
 
 

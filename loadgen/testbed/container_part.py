@@ -5,7 +5,7 @@
 
 import os
 import signal
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,16 @@ from typing import Any
 from offboard.common.command_line import BROKEN_PIPE_EXIT, INTERRUPTED_EXIT
 from offboard.common.errors import ConfigError
 from offboard.loadgen.testbed.cpu_quota import CGROUP_PERIOD_S, CGROUP_QUOTA_S_MIN, check_cpus
-from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, Setup, Usage
+from offboard.loadgen.testbed.testbed import (
+    CLOUD,
+    ROBOT,
+    WAN,
+    Setup,
+    Usage,
+    kind_of,
+    relay_of,
+    servers_among,
+)
 
 NEAR, FAR = "near", "far"
 EXAMPLES = "examples"  # the folder of the applications, and the Compose service of their image
@@ -70,17 +79,26 @@ KINDS: Mapping[str, Kind] = {
     ),
     WAN: Kind(
         "loadgen",
-        ("wan", "--listen", "0.0.0.0:5555", "--to", "cloud:5555", "--http", "0.0.0.0:8001", "--insecure"),
+        ("wan", "--listen", "0.0.0.0:5555", "--http", "0.0.0.0:8001", "--insecure"),
         (NEAR, FAR),
         http=8001,
         ready="/health",
     ),
-    ROBOT: Kind("loadgen", ("--cloud", "tcp://wan:5555"), (NEAR,)),
+    ROBOT: Kind("loadgen", (), (NEAR,)),
 }
 
 
-def kind_of(part: str) -> Kind:
-    return KINDS[part.partition("-")[0]]
+def addresses(part: str, parts: Iterable[str]) -> dict[str, str]:
+    """The flags with which a part finds the others of these parts."""
+    servers = servers_among(parts)
+    if kind_of(part) == WAN:
+        return {"to": f"{next(one for one in servers if relay_of(one) == part)}:5555"}
+    if kind_of(part) == CLOUD:
+        return {}
+    ways = {server: f"tcp://{relay_of(server)}:5555" for server in servers}
+    first = ways.pop(CLOUD)
+    further = ",".join(f"{server}={endpoint}" for server, endpoint in ways.items())
+    return {"cloud": first, **({"site": further} if further else {})}
 
 
 def service_of(part: str, setup: Setup) -> str:
@@ -89,7 +107,7 @@ def service_of(part: str, setup: Setup) -> str:
     Robot and cloud share one image if the task is in `examples/`, because both need its library.
     """
     module = str(setup.flags.get("task") or setup.flags.get("tasks"))  # flags of a robot, and of the cloud
-    return EXAMPLES if module.startswith(f"{EXAMPLES}.") else part.partition("-")[0]
+    return EXAMPLES if module.startswith(f"{EXAMPLES}.") else kind_of(part)
 
 
 def as_seen(part: str, flags: Mapping[str, Any], out: Path) -> tuple[dict[str, Any], dict[Path, Path]]:

@@ -1,6 +1,6 @@
 """The Docker testbed: runs the parts as containers of the checkout's images, and removes them with itself.
 
-    robots --(near)--> wan --(far)--> cloud        wan and cloud --(control)--> 127.0.0.1 of the host
+    robots --(near)--> relays --(far)--> servers       relays, servers --(control)--> 127.0.0.1 of the host
 
 `docker_engine` makes containers and networks; `container_part` says what a part is inside its container.
 """
@@ -19,7 +19,7 @@ from offboard.loadgen.relay.link.link_settings import as_flags
 from offboard.loadgen.relay.relay_client import RelayClient, ask
 from offboard.loadgen.testbed import container_part as inside
 from offboard.loadgen.testbed.container_hogs import ContainerHogs
-from offboard.loadgen.testbed.container_part import FAR, NEAR, kind_of
+from offboard.loadgen.testbed.container_part import FAR, KINDS, NEAR
 from offboard.loadgen.testbed.container_usage import UsageMeter
 from offboard.loadgen.testbed.docker_engine import (
     Container,
@@ -40,7 +40,17 @@ from offboard.loadgen.testbed.part_process import (
     leave,
     uninterrupted,
 )
-from offboard.loadgen.testbed.testbed import CLOUD, PART, WAN, Setup, Usage
+from offboard.loadgen.testbed.testbed import (
+    CLOUD,
+    PART,
+    ROBOT,
+    WAN,
+    Setup,
+    Usage,
+    kind_of,
+    relay_of,
+    servers_among,
+)
 
 CONTROL = "control"
 # The compiled planner, shared by all containers and all runs of this checkout.
@@ -50,10 +60,10 @@ PAUSE_TRIES = 10
 
 
 class DockerTestbed:
-    """Robots --> relay --> cloud, each in its own container; `run` labels everything that the testbed makes.
+    """Robots --> relay --> server, each in its own container; `run` labels everything that the testbed makes.
 
-    Robots can reach only the relay, and only the relay can reach the cloud; these networks have no way out.
-    We control the relay and the cloud over a third network. A part keeps its addresses, and its container
+    Robots can reach only the relays, and only the relays can reach a server; these networks have no way out.
+    We control relays and servers over a third network. A part keeps its addresses, and its container
     when it is started again, so that after a cut the same connections go on.
 
     All containers run as our own user, so that we own the files under `out`, and share one cache of the
@@ -74,7 +84,7 @@ class DockerTestbed:
         self._outputs: dict[str, Output] = {}
         self._hogs: dict[str, ContainerHogs] = {}
         self._meters: dict[str, UsageMeter] = {}
-        self._relay: RelayClient | None = None
+        self._relays: dict[str, RelayClient] = {}  # by the name of the relay, once it was started
         self._terminate_before: Any = None
 
     def __enter__(self) -> Self:
@@ -102,7 +112,7 @@ class DockerTestbed:
             signal.signal(signal.SIGTERM, self._terminate_before)
 
     def start(self, *parts: str) -> None:
-        for name in parts or (CLOUD, WAN):
+        for name in parts or [part for part in self._setups if kind_of(part) != ROBOT]:
             self._start(name)
 
     def container(self, part: str) -> Any:
@@ -172,23 +182,25 @@ class DockerTestbed:
     def set_hogs(self, part: str, count: int) -> None:
         self._hogs[part].set(count)
 
-    def set_link(self, **changes: Any) -> dict[str, Any]:
-        return self._link().set_link(changes)
+    def set_link(self, server: str | None = None, **changes: Any) -> dict[str, Any]:
+        first, *_ = [self._link(one).set_link(changes) for one in self._servers(server)]
+        return first
 
-    def link(self) -> dict[str, Any]:
-        return self._link().link()
+    def link(self, server: str = CLOUD) -> dict[str, Any]:
+        return self._link(server).link()
 
-    def reset(self) -> None:
-        self._link().reset()
+    def reset(self, server: str | None = None) -> None:
+        for one in self._servers(server):
+            self._link(one).reset()
 
     @docker_errors()
     def cut(self, part: str) -> None:
-        for network in kind_of(part).networks:
+        for network in KINDS[kind_of(part)].networks:
             self._networks[network].disconnect(self._containers[part])
 
     @docker_errors()
     def join(self, part: str) -> None:
-        for network in kind_of(part).networks:
+        for network in KINDS[kind_of(part)].networks:
             self._networks[network].connect(self._containers[part], **self._endpoint(network, part))
 
     @docker_errors()
@@ -252,7 +264,7 @@ class DockerTestbed:
             container.start()
             with contextlib.suppress(Refusal):  # the part has ended already
                 self._meters[name] = UsageMeter(self._engine.api, container.id)
-        if kind_of(name).http is not None:
+        if KINDS[kind_of(name)].http is not None:
             self._wait_ready(name)
 
     def _create(self, name: str, setup: Setup) -> Any:
@@ -260,8 +272,9 @@ class DockerTestbed:
 
         The network through which we control the part comes first.
         """
-        kind = kind_of(name)
-        flags, folders = inside.as_seen(name, setup.flags, self.out)
+        kind = KINDS[kind_of(name)]
+        flags = {**inside.addresses(name, self._setups), **setup.flags}
+        flags, folders = inside.as_seen(name, flags, self.out)
         folders[CACHE.resolve()] = inside.COMPILED
         first, *others = kind.networks if kind.http is None else (CONTROL, *kind.networks)
         container = self._engine.create(
@@ -291,14 +304,14 @@ class DockerTestbed:
 
         If it ends before, or takes too long, the error contains its last output.
         """
-        kind, output = kind_of(name), self._outputs[name]
+        kind, output = KINDS[kind_of(name)], self._outputs[name]
         end_s = time.monotonic() + self.ready_s
         while (code := self.exit_code(name)) is None:
             address = self._published(name)
             with contextlib.suppress(OffloadError):
                 if address is not None and ask(address, "GET", kind.ready)[0] == HTTPStatus.OK:
-                    if name == WAN:
-                        self._relay = RelayClient(address)
+                    if kind_of(name) == WAN:
+                        self._relays[name] = RelayClient(address)
                     return
             if time.monotonic() > end_s:
                 raise OffloadError(
@@ -319,12 +332,15 @@ class DockerTestbed:
         None if the part has just ended.
         """
         ports = self._containers[name].attrs["NetworkSettings"]["Ports"]
-        found = ports.get(f"{kind_of(name).http}/tcp")
+        found = ports.get(f"{KINDS[kind_of(name)].http}/tcp")
         return f"{found[0]['HostIp']}:{found[0]['HostPort']}" if found else None
 
-    def _link(self) -> RelayClient:
-        assert self._relay is not None, f"{WAN} was not started"
-        return self._relay
+    def _link(self, server: str) -> RelayClient:
+        assert relay_of(server) in self._relays, f"{relay_of(server)} was not started"
+        return self._relays[relay_of(server)]
+
+    def _servers(self, server: str | None) -> tuple[str, ...]:
+        return servers_among(self._setups) if server is None else (server,)
 
     def _endpoint(self, network: str, part: str) -> dict[str, Any]:
         """The name and the address of a part on a network; the network itself has the first address."""

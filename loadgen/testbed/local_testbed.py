@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -28,7 +29,17 @@ from offboard.loadgen.testbed.part_process import (
     uninterrupted,
     wait_ready,
 )
-from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, Setup, Usage
+from offboard.loadgen.testbed.testbed import (
+    CLOUD,
+    ROBOT,
+    WAN,
+    Setup,
+    Usage,
+    kind_of,
+    relay_of,
+    servers_among,
+    servers_behind,
+)
 
 READY_S = 60.0  # the first compilation of the planner takes most of it
 HOG = "while True: pass"
@@ -40,8 +51,18 @@ COMMANDS: Mapping[str, Sequence[str]] = {
 }
 
 
+@dataclass(frozen=True, slots=True)
+class Addresses:
+    """HOST:PORT of a server, of its relay, and of the HTTP APIs of both."""
+
+    server: str
+    server_http: str
+    relay: str
+    relay_http: str
+
+
 class LocalTestbed:
-    """Robots --> relay --> cloud, on free ports of loopback. Robots find the relay at `endpoint`.
+    """Robots --> relay --> server, on free ports of loopback. Robots find the relay of `cloud` at `endpoint`.
 
     `commands` holds the commands of cloud, relay and robot; a replacement must take the same flags.
 
@@ -60,21 +81,25 @@ class LocalTestbed:
     ) -> None:
         self.out = out
         self.ready_s = ready_s
-        cloud, cloud_http, relay, wan_http = (f"127.0.0.1:{port}" for port in _free_ports(4))
-        self.cloud_http, self.endpoint = cloud_http, f"tcp://{relay}"
+        setups = {CLOUD: Setup(), WAN: Setup()} | dict(setups or {})
+        ports = iter(_free_ports(4 * len(servers_among(setups))))
+        listens = {
+            server: Addresses(*(f"127.0.0.1:{next(ports)}" for _ in range(4)))
+            for server in servers_among(setups)
+        }
+        self.cloud_http, self.endpoint = listens[CLOUD].server_http, f"tcp://{listens[CLOUD].relay}"
         self.parts: dict[str, Part] = {}
-        for name, setup in ({CLOUD: Setup(), WAN: Setup()} | dict(setups or {})).items():
-            flags: dict[str, Any]
-            if name == CLOUD:
-                flags, http, ready = {"listen": f"tcp://{cloud}", "http": cloud_http}, cloud_http, "/ready"
-            elif name == WAN:
-                flags, http, ready = {"listen": relay, "to": cloud, "http": wan_http}, wan_http, "/health"
-            else:
-                flags, http, ready = {"cloud": self.endpoint}, None, ""
-            start = commands[name.partition("-")[0]]
-            command = (*start, *setup.command.split(), *as_flags({**flags, **setup.flags}))
-            self.parts[name] = Part(name, command, http=http, ready=ready, cpus=setup.cpus, shown=setup.shown)
-        self._relay = RelayClient(wan_http)
+        for server, at in listens.items():
+            flags: dict[str, Any] = {"listen": f"tcp://{at.server}", "http": at.server_http}
+            self._add(server, setups, commands, flags, ready="/ready")
+            flags = {"listen": at.relay, "to": at.server, "http": at.relay_http}
+            self._add(relay_of(server), setups, commands, flags, ready="/health")
+        sites = ",".join(f"{name}=tcp://{at.relay}" for name, at in listens.items() if name != CLOUD)
+        flags = {"cloud": self.endpoint, **({"site": sites} if sites else {})}
+        for name in setups:
+            if kind_of(name) == ROBOT:
+                self._add(name, setups, commands, flags)
+        self._relays = {server: RelayClient(at.relay_http) for server, at in listens.items()}
         self._children: dict[str, Child] = {}
         self._cpus: dict[str, float] = {}  # quotas that were changed; they stay when the part starts again
         self._hogs: dict[str, list[Child]] = {}
@@ -91,7 +116,7 @@ class LocalTestbed:
             signal.signal(signal.SIGTERM, self._terminate_before)
 
     def start(self, *parts: str) -> None:
-        for name in parts or (CLOUD, WAN):
+        for name in parts or [part for part in self.parts if kind_of(part) != ROBOT]:
             self.start_part(self.parts[name])
 
     def start_part(self, part: Part) -> Child:
@@ -195,20 +220,24 @@ class LocalTestbed:
             if quota is not None:
                 quota.add(hogs[-1].process.pid)
 
-    def set_link(self, **changes: Any) -> dict[str, Any]:
-        return self._relay.set_link(changes)
+    def set_link(self, server: str | None = None, **changes: Any) -> dict[str, Any]:
+        first, *_ = [self._relays[one].set_link(changes) for one in self._servers(server)]
+        return first
 
-    def link(self) -> dict[str, Any]:
-        return self._relay.link()
+    def link(self, server: str = CLOUD) -> dict[str, Any]:
+        return self._relays[server].link()
 
-    def reset(self) -> None:
-        self._relay.reset()
+    def reset(self, server: str | None = None) -> None:
+        for one in self._servers(server):
+            self._relays[one].reset()
 
-    def cut(self, part: str) -> None:  # noqa: ARG002 - on loopback all traffic passes through the relay
-        self.set_link(outage=True)
+    def cut(self, part: str) -> None:  # on loopback all traffic passes through the relays
+        for server in servers_behind(part, self._relays):
+            self.set_link(server, outage=True)
 
-    def join(self, part: str) -> None:  # noqa: ARG002
-        self.set_link(outage=False)
+    def join(self, part: str) -> None:
+        for server in servers_behind(part, self._relays):
+            self.set_link(server, outage=False)
 
     def usage(self, part: str) -> Usage:
         leader = self._children[part].process.pid
@@ -235,6 +264,25 @@ class LocalTestbed:
             for child in reversed(self._children.values()):
                 end(child)
             self._children.clear()
+
+    def _add(
+        self,
+        name: str,
+        setups: Mapping[str, Setup],
+        commands: Mapping[str, Sequence[str]],
+        flags: Mapping[str, Any],
+        *,
+        ready: str = "",
+    ) -> None:
+        """Add a part; `flags` are those of the testbed, `ready` is the path that says it is up."""
+        setup = setups[name]
+        command = (*commands[kind_of(name)], *setup.command.split(), *as_flags({**flags, **setup.flags}))
+        self.parts[name] = Part(
+            name, command, http=flags.get("http"), ready=ready, cpus=setup.cpus, shown=setup.shown
+        )
+
+    def _servers(self, server: str | None) -> list[str]:
+        return list(self._relays) if server is None else [server]
 
     def _log(self, name: str) -> Path:
         return self.out / "logs" / f"{name}.log"

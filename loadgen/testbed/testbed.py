@@ -1,15 +1,37 @@
-"""The contract of a testbed, which starts, changes and ends the *parts* of a run: cloud, relay and robots.
+"""The contract of a testbed, which starts, changes and ends the *parts* of a run: servers, relays, robots.
 
+Each server has a relay of its own: the server `cloud` has `wan`, a server `edge` has `wan-edge`.
 `local_testbed` and `docker_testbed` implement it. The player decides what happens to the parts, and when.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, Self
 
 CLOUD, WAN, ROBOT = "cloud", "wan", "robot"
 PART = "OFFBOARD_PART"  # environment variable of each part that holds its name
+
+
+def kind_of(part: str) -> str:
+    """`cloud`, `wan` or `robot`: a part that is neither relay nor robot is a server, whatever its name."""
+    kind = part.partition("-")[0]
+    return kind if kind in (WAN, ROBOT) else CLOUD
+
+
+def relay_of(server: str) -> str:
+    """The name of the relay that leads to a server."""
+    return WAN if server == CLOUD else f"{WAN}-{server}"
+
+
+def servers_among(parts: Iterable[str]) -> tuple[str, ...]:
+    """The names of the servers, in their order."""
+    return tuple(part for part in parts if kind_of(part) == CLOUD)
+
+
+def servers_behind(part: str, servers: Iterable[str]) -> tuple[str, ...]:
+    """The servers that a cut of this part cuts off: a server or relay its own, a robot all of them."""
+    return tuple(server for server in servers if part in (server, relay_of(server)) or kind_of(part) == ROBOT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +63,7 @@ class Usage:
 class Testbed(Protocol):
     """A context manager: when the block ends, for whatever reason, nothing of the testbed is left.
 
-    `part` is the name of one of its setups: cloud, wan, robot, robot-2, ...
+    `part` is the name of one of its setups: cloud, wan, wan-edge, robot, robot-2, ...
     """
 
     out: Path
@@ -51,9 +73,9 @@ class Testbed(Protocol):
     def __exit__(self, *_: object) -> None: ...
 
     def start(self, *parts: str) -> None:
-        """Start these parts, or cloud and relay; a part that has ended is started again.
+        """Start these parts, or all servers and relays; a part that has ended is started again.
 
-        On return, cloud and relay are ready.
+        On return, the servers and relays among them are ready.
         """
 
     def exit_code(self, part: str) -> int | None:
@@ -82,14 +104,17 @@ class Testbed(Protocol):
         They end with the part.
         """
 
-    def set_link(self, **changes: Any) -> dict[str, Any]:
-        """Change conditions of the link, named as in PUT /link of the relay; returns the whole link."""
+    def set_link(self, server: str | None = None, **changes: Any) -> dict[str, Any]:
+        """Change conditions of the link to a server, or of all links, named as in PUT /link of the relay.
 
-    def link(self) -> dict[str, Any]:
-        """The link as it is now, with its counts of connections and bytes."""
+        Returns the whole link; that of the first server if all were changed.
+        """
 
-    def reset(self) -> None:
-        """Reset every connection through the relay."""
+    def link(self, server: str = CLOUD) -> dict[str, Any]:
+        """The link to a server as it is now, with its counts of connections and bytes."""
+
+    def reset(self, server: str | None = None) -> None:
+        """Reset every connection through the relay of a server, or through all relays."""
 
     def cut(self, part: str) -> None:
         """Cut the network of a part: what it sends, and what is sent to it, is silently lost until `join`."""

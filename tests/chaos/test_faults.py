@@ -106,7 +106,7 @@ def scenario(fault: Fault | None, times: int) -> Scenario:
     )
     robot = RobotPart(cpus=1.0, policy="cloud", timeout_s=TIMEOUT_S)
     events = () if fault is None else tuple(fault.events(times))
-    return Scenario("fault", 7, workload, "", robot, CloudPart(), {"delay_ms": 5.0}, events)
+    return Scenario("fault", 7, workload, "", robot, (CloudPart(),), {"delay_ms": 5.0}, events)
 
 
 def check(played: Played) -> None:

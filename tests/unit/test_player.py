@@ -19,7 +19,7 @@ from offboard.loadgen.robot.config import CallConfig, DriveConfig
 from offboard.loadgen.robot_files import alone_path, reference_path
 from offboard.loadgen.scenario.scenario import CloudPart, Scenario, Workload
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario, shipped
-from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN
+from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, kind_of
 
 CONFIGS = {CLOUD: ServerConfig, WAN: WanConfig, "drive": DriveConfig, "call": CallConfig}
 
@@ -35,8 +35,8 @@ def test_the_parts_accept_every_flag_of_a_scenario(name: str, tmp_path: Path) ->
     made = setups(read, tmp_path)
     configs = {
         part: load(
-            CONFIGS[setup.command or part],
-            [*as_flags(setup.flags), *(["--cloud=tcp://wan:5555"] if part not in (CLOUD, WAN) else [])],
+            CONFIGS[setup.command or kind_of(part)],
+            [*as_flags(setup.flags), *(["--cloud=tcp://wan:5555"] if kind_of(part) == ROBOT else [])],
             prog="",
             description="",
             environ={},
@@ -53,7 +53,7 @@ def test_the_parts_accept_every_flag_of_a_scenario(name: str, tmp_path: Path) ->
         assert (robot.map, robot.resolution) == (read.workload.map, 0.025)
     assert (robot.trace, robot.answers) == (tmp_path / "trace.jsonl", tmp_path / "answers.jsonl")
     assert (wan.delay_ms, wan.seed) == (read.link["delay_ms"], read.seed)
-    assert len(configs) == 2 + read.workload.robots
+    assert len(configs) == 2 * len(read.servers) + read.workload.robots
 
 
 def test_every_key_of_a_shipped_scenario_is_read() -> None:

@@ -163,7 +163,7 @@ def race(tmp_path: Path) -> Callable[..., tuple[list[Record], float]]:
         records: list[Record] = []
         policy = Scripted(Decision("cloud", "", "test"))
         offload = Offloader(
-            [testbed.cloud, testbed.onboard],
+            [testbed.clouds["cloud"], testbed.onboard],
             policy=policy,
             memories=Memories(lambda: predictors.make("least-squares", 5)),
             observers=[records.append],
