@@ -362,7 +362,10 @@ class Offloader:
 
     def _finish(self, pending: PendingTask) -> tuple[Execution, Record]:
         """Execute, learn, record."""
-        task, executions = pending.task, self._runs.execute(pending)
+        return self._end(pending, self._runs.execute(pending))
+
+    def _end(self, pending: PendingTask, executions: tuple[Execution, ...]) -> tuple[Execution, Record]:
+        task = pending.task
         answer = answer_of(executions, task.kind)
         with self._lock:
             self._runs.learn(pending, executions)

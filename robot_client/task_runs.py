@@ -10,7 +10,7 @@ from functools import partial
 
 from offboard.common.errors import Overtaken
 from offboard.robot_client.execution.choice import plan_of
-from offboard.robot_client.execution.race import Race, result_of
+from offboard.robot_client.execution.race import Plan, Race, result_of
 from offboard.robot_client.learning.learner import Learner, PendingTask
 from offboard.robot_client.learning.runs_in_flight import Flights
 from offboard.robot_client.lifetime import Lifetime
@@ -52,6 +52,16 @@ class TaskRuns:
 
     def execute(self, pending: PendingTask) -> tuple[Execution, ...]:
         """Run the task on the sites of its decision."""
+        race, plan = self.race(pending)
+        try:
+            return race.run(plan)
+        except BaseException:  # closed during the task, or Ctrl-C: nobody waits for what still runs
+            with self._lock:
+                self._flights.end_all(pending.task.id)
+            raise
+
+    def race(self, pending: PendingTask) -> tuple[Race, Plan]:
+        """The runs of the task, before the first one starts."""
         decision = pending.decision
         race = Race(
             pending.task,
@@ -67,12 +77,7 @@ class TaskRuns:
         plan = plan_of(decision, pending.forecast, pending.call, hurried=hurried)
         if decision.both and decision.policy != PINNED:  # not if the caller measures all sites
             self._take_duplicates(len(plan.first) - 1)
-        try:
-            return race.run(plan)
-        except BaseException:  # closed during the task, or Ctrl-C: nobody waits for what still runs
-            with self._lock:
-                self._flights.end_all(pending.task.id)
-            raise
+        return race, plan
 
     def measure(self, pending: PendingTask, site: str) -> None:
         """Run a task that was answered on another site too, if a second run may start, and learn its time."""

@@ -3,10 +3,10 @@
 The sites are chosen in `policies`; what comes of the runs is learnt in `learning`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Generator, Mapping
 from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 from offboard.common.errors import CloudBroken, CloudError, Overtaken, TaskError
 from offboard.common.tasks import Kind, Task
@@ -14,6 +14,10 @@ from offboard.robot_client.policies import Hedge, Probe
 from offboard.robot_client.sites.clock import Clock
 from offboard.robot_client.sites.onboard import OnboardAnswer
 from offboard.robot_client.sites.runner import ONBOARD, Execution, Runner
+
+
+Wait: TypeAlias = tuple[Collection[Future[Any]], float | None]  # until one is done, or at most these seconds
+Steps: TypeAlias = Generator[Wait, None, tuple[Execution, ...]]
 
 
 @dataclass(slots=True)
@@ -68,22 +72,33 @@ class Race:
 
     def run(self, plan: Plan) -> tuple[Execution, ...]:
         """All executions in the order of their start; runs that are still under way count as overtaken."""
+        steps = self.steps(plan)
+        while True:
+            try:
+                pending, timeout_s = next(steps)
+            except StopIteration as ended:
+                executions: tuple[Execution, ...] = ended.value
+                return executions
+            self._clock.wait(pending, timeout_s)
+
+    def steps(self, plan: Plan) -> Steps:
+        """The same, for a caller that waits itself: yields each wait, and goes on when it is over."""
         for site in plan.first:
             self._start(site)
         if plan.all:
-            self._wait_for_all()
+            yield from self._wait_for_all()
         else:
             if plan.second is not None:
-                self._start_second(plan.second)
-            self._wait_for_answer(plan.call)
+                yield from self._start_second(plan.second)
+            yield from self._wait_for_answer(plan.call)
             if plan.patience_s > 0:
-                self._wait_for_better(plan)
+                yield from self._wait_for_better(plan)
         executions = {site: result_of(site, run) for site, (run, _) in self._runs.items() if run.done()}
         if ONBOARD not in self._runs and all(
             _may_fall_back(one, self._task.kind) for one in executions.values()
         ):
             self._start(ONBOARD)
-            self._wait_for_all()
+            yield from self._wait_for_all()
             executions[ONBOARD] = result_of(ONBOARD, self._runs[ONBOARD][0])
         for site, (run, began_s) in self._runs.items():
             if site not in executions:
@@ -97,12 +112,12 @@ class Race:
         began_s = self._clock.now_s()
         self._runs[site] = self._runners[site].submit(task, self._timeout_s), began_s
 
-    def _start_second(self, second: Probe | Hedge) -> None:
+    def _start_second(self, second: Probe | Hedge) -> Generator[Wait, None, None]:
         late: list[str] = []
         if isinstance(second, Hedge):
             late, runs = list(self._runs), [run for run, _ in self._runs.values()]
             if not any(run.done() for run in runs):
-                self._clock.wait(runs, second.after_s)
+                yield runs, second.after_s
             if any(run.done() for run in runs):
                 return
         if self._allowed():
@@ -110,7 +125,7 @@ class Race:
         for first in late:  # after the start: the robot itself may be late because its CPU is busy
             self._runners[first].hurry()
 
-    def _wait_for_answer(self, call: "Future[str] | None") -> None:
+    def _wait_for_answer(self, call: "Future[str] | None") -> Generator[Wait, None, None]:
         while True:
             pending: list[Future[Any]] = []
             for site, (run, _) in self._runs.items():
@@ -124,21 +139,21 @@ class Race:
                 self._answer_call(call.result())
                 call = None
             else:
-                self._clock.wait(pending if call is None else [*pending, call])
+                yield pending if call is None else [*pending, call], None
 
-    def _wait_for_better(self, plan: Plan) -> None:
+    def _wait_for_better(self, plan: Plan) -> Generator[Wait, None, None]:
         """Wait on for the first site, if the second one has answered before it."""
         run, _ = self._runs[plan.first[0]]
         if not run.done():
-            self._clock.wait([run], plan.patience_s)
+            yield [run], plan.patience_s
 
     def _answer_call(self, site: str) -> None:
         if site not in self._runs and self._allowed():
             self._start(site)
 
-    def _wait_for_all(self) -> None:
+    def _wait_for_all(self) -> Generator[Wait, None, None]:
         while pending := [run for run, _ in self._runs.values() if not run.done()]:
-            self._clock.wait(pending)
+            yield pending, None
 
     def _leave(self, site: str, run: "Future[Execution]", began_s: float, *, keep: bool) -> Execution:
         """Leave a run that lost the race; it is cancelled, unless its whole time is wanted (`keep`)."""

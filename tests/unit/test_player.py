@@ -58,7 +58,7 @@ def test_the_parts_accept_every_flag_of_a_scenario(name: str, tmp_path: Path) ->
 
 def test_every_key_of_a_shipped_scenario_is_read() -> None:
     """Every key in a shipped scenario is a field of `Scenario`, so that none is silently ignored."""
-    known = {"event", "check", *(field.name for field in fields(Scenario))}
+    known = {"event", "check", "cloud", *(field.name for field in fields(Scenario))}
     for name in shipped():
         assert tomllib.loads(find_scenario(name).read_text()).keys() <= known
 

@@ -1,0 +1,1 @@
+"""Simulates a fleet: thousands of robots, each with its own `Offloader`, and the servers that they share."""

@@ -1,0 +1,204 @@
+"""One robot of a simulated fleet: its own `Offloader`, which waits for nothing but virtual time.
+
+Its sites are modelled in `fleet_site` and `simulation`.
+"""
+
+from collections.abc import Callable, Collection, Generator, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from functools import partial
+from random import Random
+from typing import Any
+
+from offboard.common.tasks import kind_of
+from offboard.loadgen import rivals
+from offboard.loadgen.fleet.fleet_messages import ASK, ToRobot, ToServer
+from offboard.loadgen.fleet.fleet_settings import FleetConfig
+from offboard.loadgen.fleet.fleet_site import FleetSite, Place
+from offboard.loadgen.play.run_files import ROBOT_SEED_STEP
+from offboard.loadgen.simulation.model.simulated_cpu import SimulatedCpu
+from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks
+from offboard.loadgen.simulation.model.task_costs import (
+    DECIDING_CPU_S,
+    SITE_NOISE,
+    TASK_NOISE,
+    Noise,
+)
+from offboard.loadgen.simulation.model.true_costs import TrueCosts
+from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
+from offboard.loadgen.simulation.simulated_onboard import SimulatedOnboard
+from offboard.robot_client.execution.race import Wait
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import Probe
+from offboard.robot_client.records.trace import Record
+from offboard.robot_client.settings import Settings
+from offboard.robot_client.sites import heartbeat
+from offboard.robot_client.sites.heartbeat import Heartbeat
+from offboard.robot_client.sites.outgoing import new_task
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
+
+NOISES = 65_537  # a prime, so that the noise has another period than the tasks
+FIRST_MAX = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """One answered task. `server`: where the policy sent it; -1: onboard. `runs`: on how many sites it ran."""
+
+    started_s: float
+    waited_s: float
+    server: int
+    runs: int
+    probed: bool
+
+
+class SteppedOffloader(Offloader):
+    """An offloader whose caller waits itself, so that thousands of them need no thread."""
+
+    def steps(self, function: Callable[..., Any], *args: Any) -> Generator[Wait, None, Record]:
+        """The same as a call: yields each wait, and goes on when it is over."""
+        kind = kind_of(function)
+        pending = self._begin(new_task(kind, kind.bind(args, {})), None, self._timeout_s)
+        race, plan = self._runs.race(pending)
+        executions = yield from race.steps(plan)
+        return self._end(pending, executions)[1]
+
+
+class FleetNoise(Noise):
+    """The same noise on the CPU seconds of tasks, from a table that all robots share: they draw it often."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        random = Random(seed)
+        self._of_task, self._of_site = (
+            [random.lognormvariate(0.0, sigma) for _ in range(NOISES)] for sigma in (TASK_NOISE, SITE_NOISE)
+        )
+
+    def factor(self, site: str, task: int) -> float:
+        place = 2 * task + (site == ONBOARD)
+        return self._of_task[task % NOISES] * self._of_site[place % NOISES]
+
+
+class FleetRobot:
+    """Asks for its tasks one after the other: each is due some time after the one before, or when that ends.
+
+    - `noise`: on the costs of its tasks. `known`: the servers that it may use. `period_s`: the mean time from task to task.
+    - `post`: sends a message to the servers. `answered` is called after each task.
+    """
+
+    def __init__(
+        self,
+        number: int,
+        config: FleetConfig,
+        clock: VirtualClock,
+        tasks: RobotTasks,
+        *,
+        noise: Noise,
+        known: Sequence[int],
+        period_s: float,
+        post: Callable[[ToServer], object],
+        answered: Callable[[], object],
+    ) -> None:
+        seed = config.seed + number * ROBOT_SEED_STEP
+        self.done: list[Done] = []
+        self.ended = False
+        self._number = number
+        self._config = config
+        self._clock = clock
+        self._period_s = period_s
+        self._post = post
+        self._answered = answered
+        self._random = Random(seed)
+        self._cpu = SimulatedCpu(clock, config.robot_cpus)
+        self._first = self._random.randrange(FIRST_MAX)  # so that robots have other tasks and other noise
+        self._costs = TrueCosts(tasks, noise)
+        self._known, self._seed = known, seed
+        self._sites: dict[int, FleetSite] = {}
+        self._turn = 0  # of the wait that goes on; what belongs to an earlier one wakes nobody
+        self._steps = self._life()
+
+    def begin(self) -> None:
+        self._go_on(self._turn)
+
+    def receive(self, message: ToRobot) -> None:
+        if not self.ended:
+            self._sites[message.server].receive(message)
+
+    def _life(self) -> Generator[Wait, None, None]:
+        yield (), self._random.uniform(0.0, self._config.start_s)
+        with self._connect() as offload:
+            due_s = self._clock.now_s()
+            for number in range(self._config.tasks):
+                yield (), due_s - self._clock.now_s()
+                yield from self._run(offload, self._first + number, number)
+                due_s = max(due_s + self._random.expovariate(1 / self._period_s), self._clock.now_s())
+        self.ended = True
+
+    def _run(self, offload: SteppedOffloader, task: int, number: int) -> Generator[Wait, None, None]:
+        """One task, from when it is due to its answer."""
+        began_s, costs = self._clock.now_s(), self._costs
+        yield (), DECIDING_CPU_S / self._cpu.share_of_one_more
+        self._tell_oracle(task, number, began_s)
+        record = yield from offload.steps(costs.function, costs.task(task).size, task)
+        decision, runs = record.decision, len(record.executions)
+        self.done.append(
+            Done(
+                began_s,
+                self._clock.now_s() - began_s,
+                server=-1 if decision.site == ONBOARD else int(decision.site.rpartition("_")[2]),
+                runs=runs,
+                probed=isinstance(decision.second, Probe) and runs > 1,
+            )
+        )
+        self._answered()
+
+    def _tell_oracle(self, task: int, number: int, began_s: float) -> None:
+        """Ask what the task would take from `began_s` on if the best site were known."""
+        now_s, delay_s, costs = self._clock.now_s(), self._config.delay_ms / 1e3, self._costs
+        deciding_s, sending_s = now_s - began_s, costs.cost.sending_s / self._cpu.share_of_one_more
+        onboard_s = deciding_s + costs.seconds(ONBOARD, task) / self._cpu.share(1)
+        # It arrives with the request, and the rest of the robot's own time is added to that on the server.
+        cpu_s = deciding_s + sending_s + costs.seconds(CLOUD, task)
+        arrives_s = now_s + sending_s / 2 + delay_s
+        self._post(ToServer(arrives_s, ASK, self._number, -1, number, cpu_s=cpu_s, limit_s=onboard_s))
+
+    def _connect(self) -> SteppedOffloader:
+        config = self._config
+        settings = Settings(heartbeats=config.heartbeats, seed=self._seed)
+        policy = rivals.policy(config.policy)
+        every_s = heartbeat.EVERY_S if settings.beats(policy) else 0.0
+        for server in self._known:
+            self._sites[server] = FleetSite(
+                Place(self._number, server, config.delay_ms / 1e3),
+                self._clock,
+                self._cpu,
+                self._costs,
+                post=self._post,
+                heartbeat=Heartbeat(every_s, self._seed + server),
+            )
+        return SteppedOffloader(
+            [*self._sites.values(), SimulatedOnboard(self._clock, self._cpu, self._costs)],
+            policy=settings.make_policy(policy),
+            memories=settings.make_memories(policy),
+            timeout_s=config.timeout_s,
+            clock=self._clock,
+        )
+
+    def _go_on(self, turn: int) -> None:
+        """Continue after the wait of this turn, up to the next wait."""
+        if turn != self._turn:
+            return
+        self._turn += 1
+        try:
+            pending, timeout_s = next(self._steps)
+            while any(one.done() for one in pending):
+                pending, timeout_s = next(self._steps)
+        except StopIteration:
+            return
+        self._wait(pending, timeout_s, self._turn)
+
+    def _wait(self, pending: "Collection[Future[Any]]", timeout_s: float | None, turn: int) -> None:
+        for one in pending:
+            one.add_done_callback(lambda _: self._go_on(turn))
+        if timeout_s is not None:
+            self._clock.after(max(0.0, timeout_s), partial(self._go_on, turn))
