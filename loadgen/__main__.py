@@ -181,6 +181,14 @@ def _export(argv: Sequence[str]) -> int:
     return run_export(flags.run, resolve(ExportConfig, flags, environ=os.environ, prefix=PREFIX))
 
 
+def _fleet(argv: Sequence[str]) -> int:
+    from offboard.loadgen.fleet.fleet import run_fleets
+    from offboard.loadgen.fleet.fleet_settings import FleetConfig
+
+    _find_modules_here()
+    return run_fleets(_config("fleet", FleetConfig, argv))
+
+
 def _drive(argv: Sequence[str]) -> int:
     from offboard.loadgen.robot.config import DriveConfig
 
@@ -256,6 +264,9 @@ COMMANDS = {
     "replay": Command("show what each policy would have done with the tasks of a trace or CSV file", _replay),
     "report": Command(
         "make an HTML page and PNG charts of a run, or a page that compares several runs", _report
+    ),
+    "fleet": Command(
+        "simulate thousands of robots that share servers, with their real decision code", _fleet
     ),
     "dataset": Command(
         "measure the plans of a scenario on both sites, and write them as a CSV file", _dataset

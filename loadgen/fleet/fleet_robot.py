@@ -43,7 +43,7 @@ FIRST_MAX = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """One answered task. `server`: where the policy sent it; -1: onboard. `runs`: on how many sites it ran."""
+    """One answered task. `server`: where the policy sent it (-1: onboard). `runs`: on how many sites it ran."""
 
     started_s: float
     waited_s: float
@@ -80,7 +80,7 @@ class FleetNoise(Noise):
 
 
 class FleetRobot:
-    """Asks for its tasks one after the other: each is due some time after the one before, or when that ends.
+    """Asks for its tasks one after the other: each is due some time after the last one, or when that ends.
 
     - `noise`: on the costs of its tasks. `known`: the servers that it may use. `period_s`: the mean time from task to task.
     - `post`: sends a message to the servers. `answered` is called after each task.

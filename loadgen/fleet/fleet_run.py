@@ -19,10 +19,10 @@ from offboard.loadgen.fleet.fleet_servers import Servers
 from offboard.loadgen.fleet.fleet_settings import FleetConfig, FleetSize
 from offboard.loadgen.fleet.fleet_shard import Robots, Shard, ShardProcess, ShardSettings
 from offboard.loadgen.progress import Progress
-from offboard.loadgen.scenario.hash_tasks import __name__ as HASHES
 from offboard.loadgen.scenario.scenario import Workload
 from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks, find_tasks
 
+TASK = "offboard.loadgen.scenario.hash_tasks:hash_rounds"
 TASKS = 1000  # different tasks; each robot starts at another one and repeats them
 SPREAD = 0.5  # sizes are within this share of their mean
 LIMIT_S = 24 * 3600.0  # virtual time after which a fleet that still works has hung
@@ -47,7 +47,7 @@ class Fleet:
 def make_tasks(config: FleetConfig) -> RobotTasks:
     """The tasks that the robots repeat."""
     low, high = (1 - SPREAD) * config.rounds, (1 + SPREAD) * config.rounds
-    workload = Workload(task=f"{HASHES}:hash_rounds", sizes=(f"uniform:{low:g}:{high:g}",), tasks=TASKS)
+    workload = Workload(task=TASK, sizes=(f"uniform:{low:g}:{high:g}",), tasks=TASKS)
     return find_tasks(workload, config.seed, TASKS)
 
 
@@ -57,7 +57,9 @@ def known_servers(size: FleetSize, known: int, seed: int) -> list[tuple[int, ...
     return [tuple(random.sample(range(size.servers), min(known, size.servers))) for _ in range(size.robots)]
 
 
-def run_fleet(config: FleetConfig, size: FleetSize, tasks: RobotTasks, *, jobs: int, shown: Progress) -> Fleet:
+def run_fleet(
+    config: FleetConfig, size: FleetSize, tasks: RobotTasks, *, jobs: int, shown: Progress
+) -> Fleet:
     """Simulate one fleet. `shown` gets the answered tasks."""
     delay_s, known = config.delay_ms / 1e3, known_servers(size, config.known, config.seed)
     period_s = size.period_s(tasks.cost.cpu_s(config.rounds), config.load)

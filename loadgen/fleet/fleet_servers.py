@@ -29,7 +29,7 @@ QUEUE_MAX = 100_000  # requests that wait at one server; a simulation with more 
 
 @dataclass(eq=False, slots=True)
 class Run:
-    """A request at a server. `life` changes with its place in the queue; events of an earlier life are void."""
+    """A request at a server. `life` changes with its place in the queue: earlier events are then void."""
 
     robot: int
     number: int
@@ -103,7 +103,7 @@ class Servers:
         self._servers = [Server(size.workers) for _ in range(size.servers)]
         self._known = known
         self._delay_s = delay_s
-        self._events: list[tuple[ToServer, int, Run | None]] = []  # with the life of the run that they are about
+        self._events: list[tuple[ToServer, int, Run | None]] = []  # with a life
 
     @property
     def busy_s(self) -> NDArray[np.float64]:

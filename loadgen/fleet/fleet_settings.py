@@ -7,24 +7,41 @@ from pathlib import Path
 from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError
 from offboard.loadgen import rivals
-from offboard.loadgen.table.table_columns import MARKDOWN
+from offboard.loadgen.table.table_columns import MARKDOWN, ColumnSettings
+from offboard.loadgen.table.table_formats import Heading
 from offboard.robot_client import policies
+from offboard.robot_client.sites.runner import CLOUD
 
+HEADINGS = {
+    "robots": Heading("robots", "robots", 0),
+    "servers": Heading("servers", "servers", 0),
+    "workers": Heading("workers", "workers", 0),
+    "mean_ms": Heading("mean ms", "mean ms", 1),
+    "p99_ms": Heading("P99 ms", "P99 ms", 0),
+    "regret_ms": Heading("regret ms", "regret ms", 1),
+    "settled_ms": Heading("settled ms", "settled ms", 1),
+    "busiest": Heading("busiest", "busiest", 2),
+    "idlest": Heading("idlest", "idlest", 2),
+    "uneven": Heading("uneven", "uneven", 2),
+    "repeats": Heading("repeats", "repeats", 2),
+    "onboard_percent": Heading("onboard %", r"onboard \%", 1),
+    "probe_percent": Heading("probes %", r"probes \%", 1),
+}
 ROBOTS_MAX, SERVERS_MAX, TASKS_MAX = 100_000, 1_000, 100_000
 FLEET, TASKS = "fleet", "tasks"
 
 
 @dataclass(frozen=True)
-class FleetConfig:
+class FleetConfig(ColumnSettings):
     """Which fleets are simulated."""
 
     robots: tuple[int, ...] = setting(
         (10, 100, 1000), "number of robots; several numbers simulate several fleets", group=FLEET,
-        minimum=1, maximum=ROBOTS_MAX, metavar="K,K,..",
+        minimum=1, maximum=ROBOTS_MAX, metavar="K,..",
     )  # fmt: skip
     servers: tuple[int, ...] = setting(
         (), "number of servers of each fleet (default: one for 100 robots, and at least four)", group=FLEET,
-        minimum=1, maximum=SERVERS_MAX, metavar="S,S,..",
+        minimum=1, maximum=SERVERS_MAX, metavar="S,..",
     )  # fmt: skip
     known: int = setting(4, "servers that each robot knows, drawn from all of them", group=FLEET, minimum=1)
     workers_per_robot: float = setting(
@@ -53,12 +70,15 @@ class FleetConfig:
     heartbeats: bool | None = setting(None, "whether robots send heartbeats, if not as the policy needs it")
     seed: int = setting(1, "random seed", minimum=0)
     jobs: int | None = setting(None, "number of processes (default: one for each CPU)", minimum=1, maximum=64)
-    out: Path = setting(Path("out/fleet"), "folder for fleet.json, fleet.png and shares.png", metavar="DIR")
+    out: Path = setting(Path("out/fleet"), "folder for fleet.json and fleet.png", metavar="DIR")
     format: str = setting(MARKDOWN, "format of the table", choices=(MARKDOWN, "csv", "json", "latex"))
 
     def __post_init__(self) -> None:
         check(self)
         rivals.policy(self.policy, "--policy")
+        if self.policy.rpartition(":")[2] == CLOUD:
+            raise ConfigError(f"--policy: {self.policy!r} needs a server named {CLOUD}; a fleet has none")
+        self.check_columns(HEADINGS, self.format)
         if self.servers and len(self.servers) not in (1, len(self.robots)):
             raise ConfigError(
                 f"--servers: {len(self.servers)} numbers for {len(self.robots)} of --robots; "
@@ -85,5 +105,5 @@ class FleetSize:
     workers: int
 
     def period_s(self, task_s: float, load: float) -> float:
-        """The mean time between two tasks of a robot, if tasks of `task_s` shall take this share of all workers."""
+        """The mean time between two tasks of a robot, if they shall take this share of all workers."""
         return task_s * self.robots / (load * self.servers * self.workers)

@@ -15,8 +15,7 @@ from offboard.robot_client.sites.clock import Clock
 from offboard.robot_client.sites.onboard import OnboardAnswer
 from offboard.robot_client.sites.runner import ONBOARD, Execution, Runner
 
-
-Wait: TypeAlias = tuple[Collection[Future[Any]], float | None]  # until one is done, or at most these seconds
+Wait: TypeAlias = tuple[Collection[Future[Any]], float | None]  # for one to be done, in seconds
 Steps: TypeAlias = Generator[Wait, None, tuple[Execution, ...]]
 
 

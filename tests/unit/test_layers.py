@@ -89,6 +89,16 @@ FOLDERS: dict[str, set[str]] = {
         "loadgen/simulation",
         "loadgen/table",
     },
+    "loadgen/fleet": {
+        "loadgen",
+        "loadgen/play",
+        "loadgen/report",
+        "loadgen/rivals",
+        "loadgen/scenario",
+        "loadgen/simulation",
+        "loadgen/simulation/model",
+        "loadgen/table",
+    },
     "loadgen/report": {"loadgen", "loadgen/play", "loadgen/rivals", "loadgen/table"},
     "offboard/ros2": set(),
 }
