@@ -3,14 +3,10 @@
 Its sites are modelled in `fleet_site` and `simulation`.
 """
 
-from collections.abc import Callable, Collection, Generator, Sequence
-from concurrent.futures import Future
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from random import Random
-from typing import Any
 
-from offboard.common.tasks import kind_of
 from offboard.loadgen import rivals
 from offboard.loadgen.fleet.fleet_messages import ASK, ToRobot, ToServer
 from offboard.loadgen.fleet.fleet_settings import FleetConfig
@@ -26,15 +22,13 @@ from offboard.loadgen.simulation.model.task_costs import (
 )
 from offboard.loadgen.simulation.model.true_costs import TrueCosts
 from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
+from offboard.loadgen.simulation.model.walker import Walk, Walker
 from offboard.loadgen.simulation.simulated_onboard import SimulatedOnboard
-from offboard.robot_client.execution.race import Wait
-from offboard.robot_client.offloader import Offloader
+from offboard.loadgen.simulation.stepped_offloader import SteppedOffloader
 from offboard.robot_client.policies import Probe
-from offboard.robot_client.records.trace import Record
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites import heartbeat
 from offboard.robot_client.sites.heartbeat import Heartbeat
-from offboard.robot_client.sites.outgoing import new_task
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 NOISES = 65_537  # a prime, so that the noise has another period than the tasks
@@ -43,25 +37,13 @@ FIRST_MAX = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """One answered task. `server`: where the policy sent it (-1: onboard). `runs`: on how many sites it ran."""
+    """One answered task. `server`: where the policy sent it (-1: onboard); `runs`: on how many sites."""
 
     started_s: float
     waited_s: float
     server: int
     runs: int
     probed: bool
-
-
-class SteppedOffloader(Offloader):
-    """An offloader whose caller waits itself, so that thousands of them need no thread."""
-
-    def steps(self, function: Callable[..., Any], *args: Any) -> Generator[Wait, None, Record]:
-        """The same as a call: yields each wait, and goes on when it is over."""
-        kind = kind_of(function)
-        pending = self._begin(new_task(kind, kind.bind(args, {})), None, self._timeout_s)
-        race, plan = self._runs.race(pending)
-        executions = yield from race.steps(plan)
-        return self._end(pending, executions)[1]
 
 
 class FleetNoise(Noise):
@@ -82,7 +64,8 @@ class FleetNoise(Noise):
 class FleetRobot:
     """Asks for its tasks one after the other: each is due some time after the last one, or when that ends.
 
-    - `noise`: on the costs of its tasks. `known`: the servers that it may use. `period_s`: the mean time from task to task.
+    - `noise`: on the costs of its tasks. `known`: the servers that it may use.
+    - `period_s`: the mean time from task to task.
     - `post`: sends a message to the servers. `answered` is called after each task.
     """
 
@@ -114,17 +97,16 @@ class FleetRobot:
         self._costs = TrueCosts(tasks, noise)
         self._known, self._seed = known, seed
         self._sites: dict[int, FleetSite] = {}
-        self._turn = 0  # of the wait that goes on; what belongs to an earlier one wakes nobody
-        self._steps = self._life()
+        self._walker = Walker(clock, self._life())
 
     def begin(self) -> None:
-        self._go_on(self._turn)
+        self._walker.begin()
 
     def receive(self, message: ToRobot) -> None:
         if not self.ended:
             self._sites[message.server].receive(message)
 
-    def _life(self) -> Generator[Wait, None, None]:
+    def _life(self) -> Walk:
         yield (), self._random.uniform(0.0, self._config.start_s)
         with self._connect() as offload:
             due_s = self._clock.now_s()
@@ -134,7 +116,7 @@ class FleetRobot:
                 due_s = max(due_s + self._random.expovariate(1 / self._period_s), self._clock.now_s())
         self.ended = True
 
-    def _run(self, offload: SteppedOffloader, task: int, number: int) -> Generator[Wait, None, None]:
+    def _run(self, offload: SteppedOffloader, task: int, number: int) -> Walk:
         """One task, from when it is due to its answer."""
         began_s, costs = self._clock.now_s(), self._costs
         yield (), DECIDING_CPU_S / self._cpu.share_of_one_more
@@ -183,22 +165,3 @@ class FleetRobot:
             timeout_s=config.timeout_s,
             clock=self._clock,
         )
-
-    def _go_on(self, turn: int) -> None:
-        """Continue after the wait of this turn, up to the next wait."""
-        if turn != self._turn:
-            return
-        self._turn += 1
-        try:
-            pending, timeout_s = next(self._steps)
-            while any(one.done() for one in pending):
-                pending, timeout_s = next(self._steps)
-        except StopIteration:
-            return
-        self._wait(pending, timeout_s, self._turn)
-
-    def _wait(self, pending: "Collection[Future[Any]]", timeout_s: float | None, turn: int) -> None:
-        for one in pending:
-            one.add_done_callback(lambda _: self._go_on(turn))
-        if timeout_s is not None:
-            self._clock.after(max(0.0, timeout_s), partial(self._go_on, turn))

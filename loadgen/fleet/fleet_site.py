@@ -20,7 +20,7 @@ from offboard.robot_client.sites.runner import CLOUD, Condition, Execution, Send
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Which robot a runner belongs to, the server that it stands for, and the delay of the link between them."""
+    """Which robot a runner belongs to, the server that it stands for, and the delay between them."""
 
     robot: int
     server: int

@@ -7,7 +7,6 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 from offboard.loadgen.robot.run import OwnRecord
@@ -17,11 +16,12 @@ from offboard.loadgen.scenario.interval_coverage import intervals_of, late_secon
 from offboard.loadgen.scenario.outcome import Answered, Outcome, Reference
 from offboard.loadgen.scenario.outcome_files import is_probed
 from offboard.loadgen.scenario.scenario import Scenario
-from offboard.loadgen.simulation.model.lockstep_clock import LockstepClock
 from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks
+from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
+from offboard.loadgen.simulation.model.walker import Walk, Walker
 from offboard.loadgen.simulation.simulated_testbed import SimulatedTestbed
+from offboard.loadgen.simulation.stepped_offloader import SteppedOffloader
 from offboard.loadgen.testbed.testbed import ROBOT
-from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import BOTH
 from offboard.robot_client.records.trace import Record, as_dict
 from offboard.robot_client.settings import Settings
@@ -79,7 +79,7 @@ class _Run:
         self._ended: list[_Ended] = []
         self.references: list[Reference] = []
         self._scenario = scenario
-        self._clock = LockstepClock()
+        self._clock = VirtualClock()
         self._timeline = Timeline(scenario.timeline())
         self._in_flight = 0
         self._queue: deque[tuple[int, float]] = deque()  # tasks that are due, while too many are in flight
@@ -91,7 +91,7 @@ class _Run:
         heartbeat_s = heartbeat.EVERY_S if settings.beats(policy) else 0.0
         self._testbed = SimulatedTestbed(scenario, tasks, self._clock, heartbeat_s=heartbeat_s, noise=noise)
         self._own = OwnRecord()
-        self.offload = Offloader(
+        self.offload = SteppedOffloader(
             [*self._testbed.clouds.values(), self._testbed.onboard],
             policy=settings.make_policy(policy),
             memories=settings.make_memories(policy),
@@ -127,11 +127,15 @@ class _Run:
         while self._queue and self._in_flight < self._scenario.workload.in_flight:
             number, due_s = self._queue.popleft()
             self._in_flight += 1
-            self._clock.begin(partial(self._offload_open, number, due_s))
+            Walker(self._clock, self._offload_open(number, due_s)).begin()
 
-    def _offload_open(self, number: int, due_s: float) -> None:
-        self._offload(number, due_s)
+    def _offload_open(self, number: int, due_s: float) -> Walk:
+        costs = self._testbed.costs
+        yield (), self._testbed.deciding_s
+        record = yield from self.offload.steps(costs.function, costs.task(number).size, number)
+        self._ended.append(_Ended(number, due_s, self._clock.now_s(), as_dict(record)))
         self._in_flight -= 1
+        self._play_events()
         self._clock.at(self._clock.now_s(), self._begin)
 
     def _play_events(self) -> None:
@@ -140,6 +144,7 @@ class _Run:
             self._testbed.happen(event)
 
     def _offload(self, number: int, due_s: float) -> None:
+        """Run one of closed arrivals, with its reference."""
         costs, workload = self._testbed.costs, self._scenario.workload
         self._clock.pass_by(self._testbed.deciding_s)
         began_s, foreseen = self._clock.now_s(), self._testbed.foresee(number)
@@ -149,8 +154,7 @@ class _Run:
         assert record is not None, "the offloader passes every record to its observers"
         ended = _Ended(number, due_s, self._clock.now_s(), as_dict(record))
         self._ended.append(ended)
-        if workload.arrivals == CLOSED:
-            self.references.append(self._reference(record, ended, began_s - due_s, foreseen))
+        self.references.append(self._reference(record, ended, began_s - due_s, foreseen))
         self._play_events()
 
     def answered(self) -> list[Answered]:

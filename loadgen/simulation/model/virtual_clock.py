@@ -1,6 +1,6 @@
 """The virtual clock: events in order of time, and a clock that jumps to the next event while a caller waits.
 
-Several tasks at once need the clock of `lockstep_clock.py`.
+Several callers at once are in `walker.py`.
 """
 
 import heapq

@@ -1,0 +1,22 @@
+"""The robot's `Offloader` for a caller that waits itself, so that many calls at once need no thread."""
+
+from collections.abc import Callable, Generator
+from typing import Any
+
+from offboard.common.tasks import kind_of
+from offboard.robot_client.execution.race import Wait
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.records.trace import Record
+from offboard.robot_client.sites.outgoing import new_task
+
+
+class SteppedOffloader(Offloader):
+    """Predicts, decides, executes, learns and records as every offloader; `clock` only tells the time."""
+
+    def steps(self, function: Callable[..., Any], *args: Any) -> Generator[Wait, None, Record]:
+        """The same as a call: yields each wait, and goes on when it is over."""
+        kind = kind_of(function)
+        pending = self._begin(new_task(kind, kind.bind(args, {})), None, self._timeout_s)
+        race, plan = self._runs.race(pending)
+        executions = yield from race.steps(plan)
+        return self._end(pending, executions)[1]
