@@ -1,6 +1,6 @@
 """Several callers in virtual time without threads: each is a generator that yields what it waits for."""
 
-from collections.abc import Callable, Collection, Generator
+from collections.abc import Collection, Generator
 from concurrent.futures import Future
 from functools import partial
 from typing import Any
