@@ -40,6 +40,7 @@ from offboard.loadgen.scenario.outcome_files import read_answered, read_readings
 from offboard.loadgen.scenario.pass_fail_check import Verdict
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
+from offboard.loadgen.scenario.site_shares import share_lines, site_shares
 from offboard.loadgen.table.measured_rows import write_whole
 from offboard.loadgen.table.table_formats import render
 from offboard.loadgen.table.table_settings import TableConfig
@@ -148,6 +149,8 @@ def _servers_of(scenario: Scenario) -> str:
 def _ending(played: Played, out: Path) -> Iterator[str]:
     """What a run says at its end: figures, verdicts and the files that it wrote."""
     yield f"\n{run_table(played.scenario.name, played.outcome)}"
+    if len(played.scenario.servers) > 1:
+        yield from share_lines(site_shares(played.outcome, played.scenario.sites()))
     yield from _findings(played.outcome)
     yield from map(str, played.verdicts)
     stolen_percent = played.stolen_percent
@@ -195,6 +198,7 @@ def write_summary(out: Path, played: Played, about: Mapping[str, Any]) -> None:
         "exit_codes": dict(played.exit_codes),
         "stolen_percent": played.stolen_percent,
         "figures": figures(played.outcome, scenario),
+        "site_shares": site_shares(played.outcome, scenario.sites()),
         "checks": [verdict.as_dict() for verdict in played.verdicts],
     }
     write_whole(out / SUMMARY, json.dumps(summary, indent=2, ensure_ascii=False) + "\n")

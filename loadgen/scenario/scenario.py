@@ -180,6 +180,10 @@ class Scenario:
         """The names of all parts of the run: servers, relays and robots."""
         return parts_of([server.name for server in self.servers], self.workload)
 
+    def sites(self) -> tuple[str, ...]:
+        """The sites of each robot."""
+        return (ONBOARD, *(server.name for server in self.servers))
+
     def links(self) -> dict[str, Mapping[str, Any]]:
         """The conditions of the link to each server."""
         return {server.name: {**self.link, **server.link} for server in self.servers}
