@@ -1,8 +1,12 @@
-"""Tasks that take no time, so that only the way to the server and back is measured."""
+"""Tasks that take no time, so that only the way to the server and back is measured, and one that does."""
 
+import hashlib
 from typing import Any
 
 from offboard.common.tasks import task
+from offboard.common.variants import CLOUD, ONBOARD
+
+ONBOARD_FACTOR = 5
 
 
 @task("nothing", size=lambda: 0.0)
@@ -13,3 +17,14 @@ def nothing() -> None:
 @task("length", size=lambda array: array.nbytes)
 def length(array: Any) -> int:
     return int(array.nbytes)
+
+
+def _hash_slowly(rounds: int) -> bytes:
+    """What the small computer of a robot would take, on the same CPU."""
+    return hashlib.pbkdf2_hmac("sha256", b"offboard", b"benchmark", ONBOARD_FACTOR * rounds)
+
+
+@task("hash_near_or_far", size=float, variants={ONBOARD: _hash_slowly}, quality={ONBOARD: 1.0, CLOUD: 1.0})
+def hash_near_or_far(rounds: int) -> bytes:
+    """PBKDF2 with this many rounds; onboard it takes ONBOARD_FACTOR times as long."""
+    return hashlib.pbkdf2_hmac("sha256", b"offboard", b"benchmark", rounds)
