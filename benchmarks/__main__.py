@@ -15,6 +15,7 @@ TABLES = (
     "lower_bounds",
     "round_trip",
     "server_load",
+    "hundred_robots",
     "attacks",
     "footprint",
     "page_cost",
