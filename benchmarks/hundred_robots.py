@@ -28,8 +28,8 @@ from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import ONBOARD
 
 ROBOTS, SERVERS, PROCESSES = 100, 4, 4
-TASKS, PERIOD_S, START_S = 120, 1.0, 10.0  # of each robot, from task to task, and over which the robots start
-ROUNDS = 30_000
+TASKS, PERIOD_S, START_S = 120, 1.0, 20.0  # of each robot, from task to task, and over which the robots start
+ROUNDS = 6_000
 SEED = 1
 
 Done = tuple[float, str, int]  # seconds from when it was due, where it was sent, on how many sites it ran
