@@ -41,7 +41,7 @@ from offboard.robot_client.policies.observe import Observe
 from offboard.robot_client.records.recording import Recording, record_of, tell
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.settings import Settings, check_types
-from offboard.robot_client.sites.absence import Absent, absent_sites, present, wait_for_sites
+from offboard.robot_client.sites.absence import Absent, absent_sites, present_sites, wait_for_sites
 from offboard.robot_client.sites.clock import Clock, SystemClock
 from offboard.robot_client.sites.outgoing import new_task
 from offboard.robot_client.sites.runner import ONBOARD, TIMEOUT_S, Execution, Runner, checked_timeout
@@ -107,7 +107,7 @@ class Offloader:
         cls,
         endpoint: str | None = None,
         *,
-        sites: Mapping[str, str] | None = None,
+        sites: Mapping[str, str] | Path | str | None = None,
         policy: str = policies.DEFAULT,
         timeout_s: float = TIMEOUT_S,
         keys: Path | str | None = None,
@@ -119,8 +119,9 @@ class Offloader:
     ) -> Self:
         """An offloader for onboard, a server `cloud` at `endpoint` (tcp://HOST:PORT), and further servers.
 
-        `sites`: the endpoint of each further server, by name; that of a policy server is ws://HOST:PORT or
-        wss://HOST:PORT.
+        `sites`: the endpoint of each further server, by name: tcp://HOST:PORT; ws:// or wss://HOST:PORT, a
+        policy server; dns://HOST:PORT, a server at each address of HOST. Or the TOML file that lists servers.
+        File and addresses are read again and again.
         `policy`: the name of a policy; caps in the settings add the wrapper `budget` to it.
         `timeout_s`: how long a server has for a task before the task runs onboard, in seconds.
         `keys`: the folder of `robot-client keys`, with the public key of each server in NAME.key or
@@ -129,7 +130,7 @@ class Offloader:
         `metrics`: HOST:PORT where Prometheus reads `/metrics`. `trace`: the file that gets every record.
         `observe`: answer every task onboard, and estimate what the policy would save (`savings`).
         """
-        from offboard.robot_client.make_runners import make_runners  # zmq is loaded only for a connection
+        from offboard.robot_client.servers import connect_sites  # zmq is loaded only for a connection
 
         check_types(cls.connect, locals())
         rare = settings or Settings()
@@ -137,11 +138,10 @@ class Offloader:
         with ExitStack() as opened:
             recording = Recording(trace=trace, metrics=metrics)
             opened.callback(recording.close)
-            runners = make_runners(endpoint, sites or {}, keys=keys, policy=policy, settings=rare)
-            for runner in runners:
-                opened.callback(runner.close)
+            present = connect_sites(endpoint, sites or {}, keys=keys, policy=policy, settings=rare)
+            opened.callback(present.close)
             offload = cls(
-                runners,
+                present,
                 policy=Observe(chosen) if observe else chosen,
                 memories=memories,
                 allowance=rare.allowance(),
@@ -248,7 +248,7 @@ class Offloader:
         absent = absent_sites(runners, kind)
         with self._lock:
             memory, now_s = self._memories.of(kind, runners), self._clock.now_s()
-            sites = present(runners, absent)
+            sites = present_sites(runners, absent)
             forecast = self._forecaster.forecast(memory, task, sites, timeout_s=self._timeout_s, now_s=now_s)
         return expectations(forecast, absent, deadline_s)
 
@@ -317,7 +317,7 @@ class Offloader:
         with self._lock:
             self._allowance.begin(started_s)
             memory = self._memories.of(task.kind, runners)
-            sites = present(runners, absent)
+            sites = present_sites(runners, absent)
             forecast = self._forecaster.forecast(
                 memory, task, sites, timeout_s=budget_s, now_s=self._clock.now_s()
             )

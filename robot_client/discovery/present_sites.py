@@ -54,6 +54,7 @@ class PresentSites(Mapping[str, Runner]):
         self._leaving: list[tuple[Runner, float]] = []  # with the latest time to close it
         self._failed: set[Server] = set()
         self._closed = False
+        self._on_close: list[Callable[[], None]] = []
         self.refresh()
 
     def follow(self, listed: Iterable[Server], source: str = "") -> None:
@@ -94,8 +95,14 @@ class PresentSites(Mapping[str, Runner]):
         for runner, _ in ended:
             runner.close()
 
+    def on_close(self, act: Callable[[], None]) -> None:
+        """Call this when the sites are closed."""
+        self._on_close.append(act)
+
     def close(self) -> None:
         """Close all runners. Safe to call twice."""
+        for act in self._on_close:
+            act()
         with self._lock:
             self._closed = True
             runners = [*self.now.values(), *(runner for runner, _ in self._leaving)]

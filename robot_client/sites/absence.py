@@ -84,7 +84,7 @@ def absent_sites(runners: Mapping[str, Runner], kind: Kind) -> Absent:
     return Absent({site: why for site, runner in runners.items() if (why := runner.unavailable(kind))})
 
 
-def present(runners: Mapping[str, Runner], absent: Mapping[str, str]) -> Mapping[str, Runner]:
+def present_sites(runners: Mapping[str, Runner], absent: Mapping[str, str]) -> Mapping[str, Runner]:
     """The runners of the sites that are not absent."""
     return {site: one for site, one in runners.items() if site not in absent} if absent else runners
 
