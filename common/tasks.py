@@ -25,7 +25,7 @@ from offboard.common.task_functions import (
     source_hash,
     without_state,
 )
-from offboard.common.variants import AT, CLOUD, ONBOARD, Variant, elsewhere, variants_of
+from offboard.common.variants import AT, CLOUD, ONBOARD, Variant, elsewhere, group_of, variants_of
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -86,10 +86,13 @@ class Kind:
         return without_state(inspect.signature(self.function), self.setup)
 
     def at(self, site: str) -> "Kind":
-        """What this site runs: the kind itself or its variant. `cloud` stands for servers without one."""
+        """What this site runs: the kind itself or its variant. `cloud` stands for servers without one.
+
+        Equal servers run the variant of their group.
+        """
         if not self.variants:
             return self
-        return self.variants.get(site) or self.variants[CLOUD]
+        return self.variants.get(group_of(site)) or self.variants[CLOUD]
 
     def on_servers(self) -> "tuple[Kind, ...]":
         """What servers run: the kind itself, or those of its variants that this computer has."""

@@ -13,14 +13,22 @@ from offboard.common.errors import DataError
 
 def read_toml(path: Path) -> dict[str, Any]:
     """The tables of the file, or a DataError that names the file and the line."""
+    try:
+        return parse_toml(path, path.read_bytes())
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file") from None
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror or error}") from error
+
+
+def parse_toml(path: Path, text: bytes) -> dict[str, Any]:
+    """The tables of this text of a file."""
     import tomllib  # not for --help
 
     try:
-        return tomllib.loads(path.read_text())
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise DataError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+        return tomllib.loads(text.decode())
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise DataError(f"{path}: {error}") from error
 
 
 def unknown_key(path: Path, key: str, known: Sequence[str]) -> DataError:

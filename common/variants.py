@@ -13,6 +13,7 @@ from offboard.common.errors import ConfigError, UnknownTask
 ONBOARD = "onboard"
 CLOUD = "cloud"  # it stands for each server that has no variant of its own
 AT = "@"  # between the task and the site in the name of a variant
+IN_GROUP = "/"  # between the group of a site and its own name: planners/10.0.0.7
 SITE_LENGTH_MAX = 32
 
 
@@ -23,6 +24,11 @@ class Variant:
     function: Callable[..., Any] | None
     setup: Callable[[], Any] | None
     quality: float
+
+
+def group_of(site: str) -> str:
+    """The group of equal servers that a site belongs to; a site without one is a group of its own."""
+    return site.partition(IN_GROUP)[0]
 
 
 def elsewhere(*_: object) -> NoReturn:

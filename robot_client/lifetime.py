@@ -7,16 +7,16 @@ import os
 import threading
 import warnings
 import weakref
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any, TypeVar
 
 from offboard.common.errors import OffloadError
+from offboard.robot_client.discovery.present_sites import PresentSites
 from offboard.robot_client.execution.call_threads import CallThreads
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.records.recording import Recording
 from offboard.robot_client.sites.onboard import inside_a_task
-from offboard.robot_client.sites.runner import Runner
 
 ASYNC_NAME = "run"
 ASYNC_CALLS_MAX = 32  # calls of `submit` and `run` at a time; each has a thread while it waits for its answer
@@ -32,13 +32,13 @@ class Lifetime:
     process that was forked from that of the offloader, and has neither its threads nor its connections.
     """
 
-    def __init__(self, runners: Collection[Runner], memories: Memories, lock: threading.Lock) -> None:
+    def __init__(self, sites: PresentSites, memories: Memories, lock: threading.Lock) -> None:
         self.closed = False
         self.forked = False
         self.recording: Recording | None = None
         self._async_calls = CallThreads(ASYNC_CALLS_MAX, ASYNC_NAME)
         self._late_calls = CallThreads(ASYNC_CALLS_MAX, LATE_NAME)
-        self._runners = runners
+        self._sites = sites
         self._memories = memories
         self._lock = lock
         _lifetimes.add(self)
@@ -72,8 +72,7 @@ class Lifetime:
         with self._lock:
             first, self.closed = not self.closed, True
             last = self._memories.snapshot() if first else None
-        for runner in self._runners:
-            runner.close()
+        self._sites.close()
         for calls in (self._async_calls, self._late_calls):
             calls.close(wait=False)
         if last is not None:
@@ -96,7 +95,7 @@ class Lifetime:
         if self.closed or self.forked:
             return
         threading.Thread(target=self.close, name="dropped", daemon=True).start()
-        sites = ", ".join(runner.site for runner in self._runners)
+        sites = ", ".join(self._sites)
         warnings.warn(f"an offloader was dropped without close(); its sites: {sites}", ResourceWarning, 2)
 
     def _fork(self) -> None:

@@ -20,8 +20,9 @@ from offboard.common.errors import ConfigError
 from offboard.common.live.robot_live import RobotLive
 from offboard.common.tasks import Task, kind_of
 from offboard.robot_client import policies
+from offboard.robot_client.discovery.present_sites import PresentSites
 from offboard.robot_client.execution.batch import Batch, Placed, arguments
-from offboard.robot_client.execution.choice import check_where, decided, pinned
+from offboard.robot_client.execution.choice import check_where, decided, pinned, sites_at
 from offboard.robot_client.execution.crossing_check import CrossingCheck
 from offboard.robot_client.execution.race import answer_of
 from offboard.robot_client.learning.forecaster import Forecaster
@@ -34,12 +35,13 @@ from offboard.robot_client.lifetime import Lifetime
 from offboard.robot_client.policies import BOTH, Decision, Forecast, Policy
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.policies.expectation import Expectation, expectations, missed
+from offboard.robot_client.policies.forecast import finishes_of
 from offboard.robot_client.policies.objectives import by_deadline
 from offboard.robot_client.policies.observe import Observe
 from offboard.robot_client.records.recording import Recording, record_of, tell
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.settings import Settings, check_types
-from offboard.robot_client.sites.absence import Absent, absent_sites, wait_for_sites
+from offboard.robot_client.sites.absence import Absent, absent_sites, present_sites, wait_for_sites
 from offboard.robot_client.sites.clock import Clock, SystemClock
 from offboard.robot_client.sites.outgoing import new_task
 from offboard.robot_client.sites.runner import ONBOARD, TIMEOUT_S, Execution, Runner, checked_timeout
@@ -51,7 +53,7 @@ R = TypeVar("R")
 class Offloader:
     """Runs each task where its policy says, always gets an answer, and learns from what happened.
 
-    `runners`: one runner for each site, with onboard among them.
+    `runners`: one runner for each site, with onboard among them; or sites that change.
     `memories`: what is known of each kind of task, and the predictors that it is learnt with.
     `allowance`: second runs, bytes and joules that tasks may spend.
     `timeout_s`: how long a remote site has for a task before the task runs onboard.
@@ -64,7 +66,7 @@ class Offloader:
 
     def __init__(
         self,
-        runners: Sequence[Runner],
+        runners: Sequence[Runner] | PresentSites,
         *,
         policy: Policy,
         memories: Memories,
@@ -73,11 +75,8 @@ class Offloader:
         observers: Iterable[Callable[[Record], None]] = (),
         clock: Clock | None = None,
     ) -> None:
-        self._runners = {runner.site: runner for runner in runners}
-        if ONBOARD not in self._runners or len(self._runners) != len(runners):
-            given = [runner.site for runner in runners]
-            raise ConfigError(f"sites {given}: each site once, and {ONBOARD!r} among them")
-        if BOTH in self._runners:
+        sites = self._sites = runners if isinstance(runners, PresentSites) else PresentSites(runners)
+        if BOTH in sites:
             raise ConfigError(f"a site cannot be named {BOTH!r}: where={BOTH!r} means all sites")
         self._policy, self._memories = policy, memories
         self._observes = isinstance(policy, Observe)
@@ -85,14 +84,14 @@ class Offloader:
         self._timeout_s = checked_timeout(timeout_s)
         self._observers = tuple(observers)
         self._clock = clock or SystemClock()
-        self._flights = Flights(self._runners)
-        self._forecaster = Forecaster(self._runners, self._flights, self._allowance)
-        self._learner = Learner(self._runners, self._allowance)
+        self._flights = Flights()
+        sites.in_flight = self._flights.count
+        self._forecaster = Forecaster(self._flights, self._allowance)
+        self._learner = Learner(self._allowance)
         self._crossing = CrossingCheck()
         self._lock = threading.Lock()
-        self._life = Lifetime(self._runners.values(), memories, self._lock)
+        self._life = Lifetime(sites, memories, self._lock)
         self._runs = TaskRuns(
-            self._runners,
             self._clock,
             self._lock,
             flights=self._flights,
@@ -108,7 +107,7 @@ class Offloader:
         cls,
         endpoint: str | None = None,
         *,
-        sites: Mapping[str, str] | None = None,
+        sites: Mapping[str, str] | Path | str | None = None,
         policy: str = policies.DEFAULT,
         timeout_s: float = TIMEOUT_S,
         keys: Path | str | None = None,
@@ -120,8 +119,9 @@ class Offloader:
     ) -> Self:
         """An offloader for onboard, a server `cloud` at `endpoint` (tcp://HOST:PORT), and further servers.
 
-        `sites`: the endpoint of each further server, by name; that of a policy server is ws://HOST:PORT or
-        wss://HOST:PORT.
+        `sites`: the endpoint of each further server, by name: tcp://HOST:PORT; ws:// or wss://HOST:PORT, a
+        policy server; dns://HOST:PORT, a server at each address of HOST. Or the TOML file that lists servers.
+        File and addresses are read again and again.
         `policy`: the name of a policy; caps in the settings add the wrapper `budget` to it.
         `timeout_s`: how long a server has for a task before the task runs onboard, in seconds.
         `keys`: the folder of `robot-client keys`, with the public key of each server in NAME.key or
@@ -130,7 +130,7 @@ class Offloader:
         `metrics`: HOST:PORT where Prometheus reads `/metrics`. `trace`: the file that gets every record.
         `observe`: answer every task onboard, and estimate what the policy would save (`savings`).
         """
-        from offboard.robot_client.make_runners import make_runners  # zmq is loaded only for a connection
+        from offboard.robot_client.servers import connect_sites  # zmq is loaded only for a connection
 
         check_types(cls.connect, locals())
         rare = settings or Settings()
@@ -138,11 +138,10 @@ class Offloader:
         with ExitStack() as opened:
             recording = Recording(trace=trace, metrics=metrics)
             opened.callback(recording.close)
-            runners = make_runners(endpoint, sites or {}, keys=keys, policy=policy, settings=rare)
-            for runner in runners:
-                opened.callback(runner.close)
+            present = connect_sites(endpoint, sites or {}, keys=keys, policy=policy, settings=rare)
+            opened.callback(present.close)
             offload = cls(
-                runners,
+                present,
                 policy=Observe(chosen) if observe else chosen,
                 memories=memories,
                 allowance=rare.allowance(),
@@ -203,16 +202,17 @@ class Offloader:
         budget_s = self._timeout_s if timeout_s is None else checked_timeout(timeout_s)
         kind = kind_of(function)
         tasks = [new_task(kind, args) for args in arguments(kind, items)]
-        sites = tuple(self._runners)
+        runners = self._sites.now
+        sites = tuple(runners)
         if self._observes:
             where = where or ONBOARD
         if where is not None:
-            check_where(where, kind, self._runners)
-            sites = (ONBOARD if where == BOTH else where,)
+            check_where(where, kind, runners, changing=self._sites.changing)
+            sites = (*sites_at(where, runners), ONBOARD)[:1]
         batch = Batch(
             tasks,
             sites,
-            predict=partial(self._expect_in_batch, budget_s),
+            predict=partial(self._expect_in_batch, budget_s, runners),
             run=partial(self._answer, where, budget_s),
             clock=self._clock,
             timeout_s=budget_s,
@@ -244,9 +244,12 @@ class Offloader:
             checked_timeout(deadline_s, "deadline_s")
         kind = kind_of(function)
         args = kind.bind(args, kwargs)
-        task, absent = new_task(kind, args), absent_sites(self._runners, kind)
+        task, runners = new_task(kind, args), self._sites.now
+        absent = absent_sites(runners, kind)
         with self._lock:
-            _, forecast = self._forecast(task, absent, self._timeout_s)
+            memory, now_s = self._memories.of(kind, runners), self._clock.now_s()
+            sites = present_sites(runners, absent)
+            forecast = self._forecaster.forecast(memory, task, sites, timeout_s=self._timeout_s, now_s=now_s)
         return expectations(forecast, absent, deadline_s)
 
     def savings(self) -> dict[str, Savings | None]:
@@ -262,11 +265,11 @@ class Offloader:
         once if waiting changes nothing, as for a server that has other source.
         """
         self._life.refuse_in_fork()
-        return wait_for_sites(self._runners, kind_of(function), timeout_s)
+        return wait_for_sites(self._sites, kind_of(function), timeout_s)
 
     def show_on(self, live: RobotLive[Record]) -> None:
         """Show these sites and this allowance on a live page, next to the records that it gets."""
-        live.show(self._runners, self._allowance)
+        live.show(self._sites, self._allowance)
 
     def close(self) -> None:
         """Close all runners, trace and metrics, and save what was learnt. Safe to call twice."""
@@ -305,18 +308,28 @@ class Offloader:
         deadline_s: float | None = None,
     ) -> PendingTask:
         """Predict and decide."""
-        if len(self._runners) > 1:
+        runners = self._sites.now
+        if len(runners) > 1:
             self._crossing.check_arguments(task)
         started_at, started_s = datetime.now(UTC), self._clock.now_s()
         number = next(self._numbers)
-        absent = absent_sites(self._runners, task.kind)
+        absent = absent_sites(runners, task.kind)
         with self._lock:
             self._allowance.begin(started_s)
-            memory, forecast = self._forecast(task, absent, budget_s, deadline_s)
+            memory = self._memories.of(task.kind, runners)
+            sites = present_sites(runners, absent)
+            forecast = self._forecaster.forecast(
+                memory, task, sites, timeout_s=budget_s, now_s=self._clock.now_s()
+            )
+            if self._sites.count_task(started_s):
+                self._sites.look(finishes_of(forecast), started_s)
+            if deadline_s is not None:
+                forecast = by_deadline(forecast, deadline_s)
             decision = self._decide(memory, forecast, where, absent=absent, placed=placed)
             amount = memory.amount(task.size)
         return PendingTask(
             task=task,
+            runners=runners,
             i=number,
             id=f"{self._session}-{number}",
             memory=memory,
@@ -331,16 +344,6 @@ class Offloader:
             deadline_s=deadline_s,
         )
 
-    def _forecast(
-        self, task: Task, absent: Mapping[str, str], timeout_s: float, deadline_s: float | None = None
-    ) -> tuple[KindMemory, Forecast]:
-        """The forecast of a task, with the memory of its kind; a deadline sets the costs."""
-        memory = self._memories.of(task.kind, self._runners)
-        sites = [site for site in self._runners if site not in absent] if absent else self._runners
-        now_s = self._clock.now_s()
-        forecast = self._forecaster.forecast(memory, task, sites, timeout_s=timeout_s, now_s=now_s)
-        return memory, forecast if deadline_s is None else by_deadline(forecast, deadline_s)
-
     def _decide(
         self,
         memory: KindMemory,
@@ -351,7 +354,7 @@ class Offloader:
         placed: Placed | None,
     ) -> Decision:
         if where is not None:
-            check_where(where, memory.kind, self._runners)
+            check_where(where, memory.kind, self._sites, changing=self._sites.changing)
             return pinned(where, forecast)
         decision = decided(
             placed or self._policy, forecast, memory.kind, absent=absent, known=memory.observations
@@ -381,16 +384,18 @@ class Offloader:
         tell(self._observers, record)
         if len(executions) > 1:
             self._crossing.hear(task.kind, executions)
-        if len(self._runners) > 1 and answer.failure is None:
+        if len(pending.runners) > 1 and answer.failure is None:
             self._crossing.check_result(task.kind, answer.value)
             if self._observes and (site := pending.decision.measured) is not None:
                 self._life.call_beside(partial(self._runs.measure, pending, site))
         return answer, record
 
-    def _expect_in_batch(self, timeout_s: float, task: Task, own: Mapping[str, int]) -> Forecast:
+    def _expect_in_batch(
+        self, timeout_s: float, runners: Mapping[str, Runner], task: Task, own: Mapping[str, int]
+    ) -> Forecast:
         """What a batch is placed by; `own` holds how many of its tasks each site has."""
-        absent = absent_sites(self._runners, task.kind) if len(own) > 1 else {}
-        present = {site: count for site, count in own.items() if site not in absent}
+        absent = absent_sites(runners, task.kind) if len(own) > 1 else {}
+        counts = {runners[site]: count for site, count in own.items() if site not in absent}
         with self._lock:
-            memory = self._memories.of(task.kind, self._runners)
-            return self._forecaster.forecast_in_batch(memory, task, present, timeout_s=timeout_s)
+            memory = self._memories.of(task.kind, runners)
+            return self._forecaster.forecast_in_batch(memory, task, counts, timeout_s=timeout_s)

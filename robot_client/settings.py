@@ -16,6 +16,7 @@ from typing import Any
 from offboard.common.errors import ConfigError
 from offboard.common.task_states import TaskStates
 from offboard.robot_client import policies, predictors
+from offboard.robot_client.discovery.roster import KNOWN_MAX
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.learning.store import Store
 from offboard.robot_client.policies import Policy
@@ -24,6 +25,7 @@ from offboard.robot_client.policies.decision import Named
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.objectives import S_PER_QUALITY, Mean, Objective
 from offboard.robot_client.predictors.window import WINDOW, checked_length
+from offboard.robot_client.sites.runner import checked_timeout
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +44,10 @@ class Settings:
     `memory`: the file in which what was learnt outlives the process (None: a new process knows nothing).
     `compress`: whether large arguments are compressed where that should save time.
     `states`: what setups make; offloaders of one process that share it load each model once (None: its own).
-    `insecure`: whether a policy server beyond this computer may be used by ws://, which is not encrypted.
+    `insecure`: whether a policy server beyond this computer may be used by ws://, which is not encrypted, and
+        servers of lists without keys.
+    `known`: how many servers of a group of equal ones the robot uses at a time, 2 or more.
+    `reread_s`: seconds between two reads of a list of servers.
     `seed`: for policies and predictors that draw; the same seed draws the same numbers.
     """
 
@@ -59,12 +64,15 @@ class Settings:
     compress: bool = True
     states: TaskStates | None = None
     insecure: bool = False
+    known: int = KNOWN_MAX
+    reread_s: float = 2.0
     seed: int = 0
 
     def __post_init__(self) -> None:
         check_types(Settings, {name: getattr(self, name) for name in self.__slots__})
         if not 0 <= self.s_per_quality < math.inf:
             raise ConfigError(f"s_per_quality {self.s_per_quality}: must be a time of 0 s or more")
+        checked_timeout(self.reread_s, "reread_s")
 
     def allowance(self) -> Allowance:
         """A fresh allowance: what tasks may spend from now on."""

@@ -5,7 +5,7 @@ What is decided is in `policies`; when each run of one task starts is in `execut
 
 import threading
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 from offboard.common.errors import Overtaken
@@ -18,7 +18,7 @@ from offboard.robot_client.policies import PINNED
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.records.trace import Late
 from offboard.robot_client.sites.clock import Clock
-from offboard.robot_client.sites.runner import ONBOARD, Execution, Runner
+from offboard.robot_client.sites.runner import ONBOARD, Execution
 
 LATE_MAX = 64  # executions that ended after their task was answered, kept for the next record
 
@@ -31,7 +31,6 @@ class TaskRuns:
 
     def __init__(
         self,
-        runners: Mapping[str, Runner],
         clock: Clock,
         lock: threading.Lock,
         *,
@@ -40,7 +39,6 @@ class TaskRuns:
         learner: Learner,
         life: Lifetime,
     ) -> None:
-        self._runners = runners
         self._clock = clock
         self._lock = lock
         self._flights = flights
@@ -65,7 +63,7 @@ class TaskRuns:
         decision = pending.decision
         race = Race(
             pending.task,
-            self._runners,
+            pending.runners,
             self._clock,
             pending.timeout_s,
             begun=partial(self._begun, pending),
@@ -86,7 +84,7 @@ class TaskRuns:
         before = self._begun_onboard
         busy = self._flights.count(ONBOARD) > 0
         self._begun(pending, site)
-        run = self._runners[site].submit(pending.task_for(site), pending.timeout_s)
+        run = pending.runners[site].submit(pending.task_for(site), pending.timeout_s)
         self._clock.wait([run])
         beside = busy or self._begun_onboard != before
         self._ended_late(pending, site, result_of(site, run), beside=beside)

@@ -99,12 +99,17 @@ def server_keys(folder: Path) -> KeyPair:
     return _read_pair("--keys", folder / f"{SERVER}{PRIVATE}")
 
 
+def own_keys(folder: Path) -> KeyPair:
+    """The robot's own keys in the folder of its --keys."""
+    return _read_pair("--keys", folder / f"{ROBOT}{PRIVATE}")
+
+
 def robot_keys(folder: Path, site: str) -> RobotKeys:
     """The keys in the folder of a robot's --keys, for one site.
 
     The key of the site's server is in SITE.key, or else in server.key.
     """
-    own = _read_pair("--keys", folder / f"{ROBOT}{PRIVATE}")
+    own = own_keys(folder)
     path = folder / f"{site}{PUBLIC}"
     if site == ROBOT or not path.exists():
         path = folder / f"{SERVER}{PUBLIC}"
@@ -163,14 +168,14 @@ def _parse(path: Path, text: str) -> dict[str, bytes]:
             name, _, value = (part.strip() for part in line.partition("="))
             if name not in ITEMS or name in found:
                 raise ConfigError(f"{path}:{number}: {name!r}: allowed are {', '.join(ITEMS)}, each once")
-            found[name] = _key(f"{path}:{number}: {name}", value.strip("\"'"))
+            found[name] = checked_key(f"{path}:{number}: {name}", value.strip("\"'"))
     if "public-key" not in found:
         raise ConfigError(f"{path}: no public-key under `curve`; the command `keys` makes such files")
     return found
 
 
-def _key(where: str, text: str) -> bytes:
-    """The checked key. The error does not show the value: it may be secret."""
+def checked_key(where: str, text: str) -> bytes:
+    """The key in this text. The error does not show the value: it may be secret."""
     with contextlib.suppress(ValueError, struct.error):
         if _KEY.fullmatch(text) and len(z85.decode(text.encode())) == 32:
             return text.encode()

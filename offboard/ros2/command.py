@@ -48,6 +48,7 @@ def run_ros2(argv: Sequence[str]) -> int:
         offload = stack.enter_context(
             connect(
                 config.cloud,
+                sites=config.sites,
                 policy=config.policy,
                 timeout_s=config.timeout_s,
                 keys=config.keys,

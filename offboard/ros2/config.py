@@ -21,6 +21,9 @@ class Ros2Config:
     cloud: str | None = setting(
         None, "server to use; without it, all goals are planned onboard", metavar="tcp://HOST:PORT"
     )
+    sites: Path | None = setting(
+        None, "TOML file of further servers, which is read again every 2 s", metavar="FILE"
+    )
     bridge: bool = setting(
         False, "speak DDS without ROS, by cyclonedds: topics only, and no action (extra dds)"
     )

@@ -12,9 +12,9 @@ from typing import Any
 
 from offboard.common.errors import Unwanted
 from offboard.common.tasks import Kind, Task
-from offboard.robot_client.make_runners import make_runners
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.records.trace import Record
+from offboard.robot_client.servers import connect_sites
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.clock import SystemClock
 from offboard.robot_client.sites.runner import Condition, Execution, Runner, Sending
@@ -100,6 +100,7 @@ class StoppableRunner:
 def connect(
     endpoint: str | None,
     *,
+    sites: Path | None,
     policy: str,
     timeout_s: float,
     keys: Path | None,
@@ -108,9 +109,11 @@ def connect(
 ) -> Offloader:
     """An offloader as `Offloader.connect` makes it, whose calls can be stopped."""
     chosen, memories = settings.make_policy(policy), settings.make_memories(policy)
-    runners = make_runners(endpoint, {}, keys=keys, policy=policy, settings=settings)
+    present = connect_sites(
+        endpoint, sites or {}, keys=keys, policy=policy, settings=settings, wrap=StoppableRunner
+    )
     return Offloader(
-        [StoppableRunner(runner) for runner in runners],
+        present,
         policy=chosen,
         memories=memories,
         allowance=settings.allowance(),

@@ -3,19 +3,26 @@
 What a policy compares is in `policies`; `race` carries the plan out.
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import Future
 
 from offboard.common.errors import ConfigError
 from offboard.common.tasks import Kind
+from offboard.common.variants import group_of
 from offboard.robot_client.execution.race import Plan
 from offboard.robot_client.policies import ALONE, BOTH, PINNED, Decision, Forecast, Policy, Probe
+from offboard.robot_client.policies.forecast import cheapest, costs_of
 from offboard.robot_client.sites.runner import ONBOARD
 
 
-def check_where(where: str, kind: Kind, sites: Collection[str]) -> None:
-    """ConfigError unless a task of this kind may be pinned there."""
-    if where != BOTH and where not in list(sites):
+def sites_at(where: str, sites: Iterable[str]) -> list[str]:
+    """The site of this name, or the sites of this group."""
+    return [site for site in sites if where in (site, group_of(site))]
+
+
+def check_where(where: str, kind: Kind, sites: Collection[str], *, changing: bool) -> None:
+    """ConfigError unless a task of this kind may be pinned there; a site may come if the sites change."""
+    if where != BOTH and not changing and not sites_at(where, sites):
         raise ConfigError(f"where={where!r} is not one of {', '.join([*sites, BOTH])}")
     if where == BOTH and not kind.duplicate:
         raise ConfigError(f"where='both': task {kind.name} is declared duplicate=False")
@@ -27,9 +34,10 @@ def pinned(where: str, forecast: Forecast) -> Decision:
         both = len(forecast.sites) > 1
         why = "measured on both" if both else "only onboard was there"
         return Decision(ONBOARD, why, PINNED, both=both)
-    if where not in forecast.sites:
+    sites = sites_at(where, forecast.sites)
+    if not sites:
         return Decision(ONBOARD, f"pinned to {where}, which cannot take it", PINNED)
-    return Decision(where, "pinned by the caller", PINNED)
+    return Decision(cheapest(costs_of(forecast.only(sites))), "pinned by the caller", PINNED)
 
 
 def decided(

@@ -147,7 +147,7 @@ class Race:
             yield [run], plan.patience_s
 
     def _answer_call(self, site: str) -> None:
-        if site not in self._runs and self._allowed():
+        if site not in self._runs and site in self._runners and self._allowed():
             self._start(site)
 
     def _wait_for_all(self) -> Generator[Wait, None, None]:

@@ -3,7 +3,7 @@
 The times come from the memories; what is measured of the sites comes from the runners in `sites`.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 
 from offboard.common.tasks import Size, Task
 from offboard.robot_client.learning.kind import KindMemory
@@ -16,20 +16,19 @@ from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, R
 class Forecaster:
     """Makes forecasts. Called under the offloader's lock."""
 
-    def __init__(self, runners: Mapping[str, Runner], flights: Flights, allowance: Allowance) -> None:
-        self._runners = runners
+    def __init__(self, flights: Flights, allowance: Allowance) -> None:
         self._flights = flights
         self._allowance = allowance
 
     def forecast(
-        self, memory: KindMemory, task: Task, sites: Collection[str], *, timeout_s: float, now_s: float
+        self, memory: KindMemory, task: Task, sites: Mapping[str, Runner], *, timeout_s: float, now_s: float
     ) -> Forecast:
         """The forecast of one task on these sites, behind all runs that are under way."""
         amount, outlooks, packs = memory.amount(task.size), {}, task.kind.pack is not None
-        for site in sites:
+        for site, runner in sites.items():
             known, in_flight = memory.site(site), self._flights.count(site)
-            condition = self._behind(site, in_flight, now_s) if known.measured else UNMEASURED
-            sending = self._runners[site].to_send(task)
+            condition = self._behind(runner, in_flight, now_s) if known.measured else UNMEASURED
+            sending = runner.to_send(task)
             outlooks[site] = known.outlook(
                 amount,
                 condition,
@@ -42,18 +41,18 @@ class Forecaster:
         return self._with_allowance(memory, task.size, outlooks)
 
     def forecast_in_batch(
-        self, memory: KindMemory, task: Task, own: Mapping[str, int], *, timeout_s: float
+        self, memory: KindMemory, task: Task, own: Mapping[Runner, int], *, timeout_s: float
     ) -> Forecast:
         """The forecast of a task in a batch, without the wait for the batch's own tasks.
 
-        `own` holds the sites that may be used, and how many tasks of the batch each of them has.
+        `own` holds the runners that may be used, and how many tasks of the batch each of them has.
         """
         amount, outlooks, packs = memory.amount(task.size), {}, task.kind.pack is not None
-        for site, count in own.items():
-            known = memory.site(site)
-            condition = self._apart_from(site, count) if known.measured else UNMEASURED
-            sending = self._runners[site].to_send(task)
-            outlooks[site] = known.outlook(
+        for runner, count in own.items():
+            known = memory.site(runner.site)
+            condition = _apart_from(runner, count) if known.measured else UNMEASURED
+            sending = runner.to_send(task)
+            outlooks[runner.site] = known.outlook(
                 amount,
                 condition,
                 in_flight=count,
@@ -71,18 +70,19 @@ class Forecaster:
             return forecast
         return forecast._replace(bytes_left=allowance.bytes_left, joules_left=allowance.joules_left)
 
-    def _behind(self, site: str, in_flight: int, now_s: float) -> Condition:
+    def _behind(self, runner: Runner, in_flight: int, now_s: float) -> Condition:
         """The condition of a site behind the runs under way there.
 
         Onboard runs one task at a time. The queue of a server may not yet count what was sent to it.
         """
-        condition = self._runners[site].condition()
+        condition = runner.condition()
         if not in_flight:
             return condition
-        if site != ONBOARD:
+        if runner.site != ONBOARD:
             return condition._replace(queue=max(condition.queue, in_flight))
-        return condition._replace(wait_s=self._flights.left_s(site, now_s))
+        return condition._replace(wait_s=self._flights.left_s(runner.site, now_s))
 
-    def _apart_from(self, site: str, own: int) -> Condition:
-        condition = self._runners[site].condition()
-        return condition._replace(queue=max(0, condition.queue - own))
+
+def _apart_from(runner: Runner, own: int) -> Condition:
+    condition = runner.condition()
+    return condition._replace(queue=max(0, condition.queue - own))

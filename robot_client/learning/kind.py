@@ -9,15 +9,16 @@ from collections.abc import Callable, Iterable
 
 from offboard.common.errors import is_interrupt
 from offboard.common.tasks import Kind, Size, first_number
+from offboard.common.variants import IN_GROUP, group_of
 from offboard.robot_client.learning.packing import PackingMemory
 from offboard.robot_client.learning.shared_work import SharedWork
 from offboard.robot_client.learning.site import SiteMemory
 from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.forecast import WHOLE, Quality
+from offboard.robot_client.policies.forecast import ERRORS_MIN, WHOLE, Quality
 from offboard.robot_client.policies.objectives import Objective
 from offboard.robot_client.predictors import Predictor
-from offboard.robot_client.predictors.base import REMEMBERED
-from offboard.robot_client.sites.runner import Execution
+from offboard.robot_client.predictors.base import REMEMBERED, WARM_UP
+from offboard.robot_client.sites.runner import ONBOARD, Execution
 
 log = logging.getLogger(__name__)
 
@@ -59,8 +60,13 @@ class KindMemory:
         return self._work is not None
 
     def site(self, name: str) -> SiteMemory:
-        if name not in self.sites:
-            self.sites[name] = SiteMemory(
+        """The memory of a site, which is kept when the site leaves; a new server learns from an equal one."""
+        found = self.sites.get(name)
+        if found is None:
+            if len(self.sites) >= REMEMBERED:
+                servers = self.sites.keys() - {ONBOARD}
+                del self.sites[max(servers, key=lambda site: self.sites[site].age)]
+            found = self.sites[name] = SiteMemory(
                 name,
                 self._make,
                 self._objective,
@@ -68,7 +74,21 @@ class KindMemory:
                 measured=self._measured,
                 quality=self._quality(name),
             )
-        return self.sites[name]
+        if IN_GROUP in name and not found.observations:
+            self._learn_from_equal(name, found)
+        return found
+
+    def _learn_from_equal(self, name: str, found: SiteMemory) -> None:
+        """Recall what was last learnt of an equal server: their times differ by what heartbeats measure."""
+        equal = [
+            one
+            for site, one in self.sites.items()
+            if group_of(site) == group_of(name) and len(one.observations) >= WARM_UP
+        ]
+        if equal:
+            freshest = min(equal, key=lambda one: one.age)
+            last = [one for one in freshest.observations if one.ok][-2 * ERRORS_MIN :]
+            found.recall(last, age=freshest.age)
 
     def _quality(self, site: str) -> Quality:
         if not self.kind.variants:

@@ -22,12 +22,14 @@ from offboard.robot_client.sites.runner import ONBOARD, Execution, Runner
 class PendingTask:
     """A task that is under way, and what was known when it was decided.
 
-    `amount`: what the predictors were asked for. `absent`: why sites are not in the forecast.
+    `runners`: those of the sites that were present then. `absent`: why some are not in the forecast.
+    `amount`: what the predictors were asked for.
     `started_s`: by the clock of the offloader. `call`: may name one more site while the task runs.
     `ended`: the runs that a probe is compared by.
     """
 
     task: Task
+    runners: Mapping[str, Runner]
     i: int
     id: str
     memory: KindMemory
@@ -53,10 +55,9 @@ class PendingTask:
 class Learner:
     """Teaches the memories of all kinds. Called under the offloader's lock."""
 
-    def __init__(self, runners: Mapping[str, Runner], allowance: Allowance) -> None:
+    def __init__(self, allowance: Allowance) -> None:
         self.regret = RegretEstimate()
         self._savings: dict[str, SavingsEstimate] = {}  # by kind; empty unless the policy only observes
-        self._runners = runners
         self._allowance = allowance
 
     def learn(self, pending: PendingTask, executions: Sequence[Execution]) -> None:
@@ -91,7 +92,7 @@ class Learner:
             pending.amount if work is None else work,
             execution,
             pending.forecast.sites.get(site),
-            silent=not execution.ok and memory.measured and self._held_up(site),
+            silent=not execution.ok and memory.measured and _held_up(pending.runners[site]),
             size=pending.task.size,
             work=work,
             beside=beside,
@@ -134,16 +135,17 @@ class Learner:
         """The present estimate for each kind."""
         return {kind: one.estimate() for kind, one in self._savings.items()}
 
-    def _held_up(self, site: str) -> bool:
-        """Whether the site does not answer heartbeats, or may be about to."""
-        condition = self._runners[site].condition()
-        return condition.silent or condition.wait_s > 0
-
     def _spend(self, pending: PendingTask, execution: Execution) -> None:
         if self._allowance.capped:
             site = execution.site
             moved = 0 if site == ONBOARD else execution.bytes_out + execution.bytes_in
             self._allowance.spend(moved, pending.memory.site(site).joules(execution))
+
+
+def _held_up(runner: Runner) -> bool:
+    """Whether the site does not answer heartbeats, or may be about to."""
+    condition = runner.condition()
+    return condition.silent or condition.wait_s > 0
 
 
 def _advised_s(pending: PendingTask) -> float | None:

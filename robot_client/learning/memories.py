@@ -50,7 +50,7 @@ class Memories:
         self._kinds: dict[str, KindMemory] = {}
 
     def of(self, kind: Kind, sites: Collection[str]) -> KindMemory:
-        """The memory of this kind; a new one recalls what the file holds for `sites`."""
+        """The memory of this kind; a new one, or a new site, recalls what the file holds."""
         found = self._kinds.get(kind.name)
         if found is None:
             found = self._kinds[kind.name] = KindMemory(
@@ -62,8 +62,8 @@ class Memories:
                 measured=self._measured,
                 s_per_quality=self._s_per_quality,
             )
-            if self._store is not None:
-                self._store.recall(found, sites)
+        if self._store is not None:
+            self._store.recall(found, sites)
         return found
 
     def due(self, now_s: float) -> bool:

@@ -42,7 +42,7 @@ class KeptKind:
     source: str
     per: str
     worked: tuple[tuple[float, float], ...]
-    sites: Mapping[str, KeptSite]
+    sites: dict[str, KeptSite]
 
 
 class Unreadable(Exception):

@@ -3,7 +3,7 @@
 They are started and ended by the offloader.
 """
 
-from collections.abc import Iterable
+from collections import defaultdict
 from dataclasses import dataclass
 
 OVERDUE = 0.5  # of its time so far: an overdue run should still need this long
@@ -22,8 +22,8 @@ class _Flight:
 class Flights:
     """The runs under way, by site and task. Called under the offloader's lock."""
 
-    def __init__(self, sites: Iterable[str]) -> None:
-        self._flights: dict[str, dict[int, _Flight]] = {site: {} for site in sites}
+    def __init__(self) -> None:
+        self._flights: defaultdict[str, dict[int, _Flight]] = defaultdict(dict)
 
     def begin(self, site: str, task: int, *, predicted_s: float, now_s: float) -> None:
         """A run of the task with this id starts."""

@@ -35,7 +35,8 @@ class Store:
     """The memory of one robot, in the file at `path`; `now` returns the Unix time in seconds.
 
     If the file cannot be read, the robot starts cold; if it cannot be written, tasks go on. Both are logged.
-    `recall`, `due` and `snapshot` are called under the offloader's lock. A thread writes the file.
+    A thread writes the file.
+    All but `save_soon` and `save_last` is called under the offloader's lock.
     """
 
     def __init__(self, path: Path, *, now: Callable[[], float] = time.time) -> None:
@@ -50,14 +51,27 @@ class Store:
         except OSError as error:
             raise ConfigError(f"memory {path}: {error.strerror}") from error
         self._kept = self._read()  # kinds that this process has not run yet
-        self._away: dict[str, dict[str, KeptSite]] = {}  # sites that this robot does not have now, by kind
+        self._away: dict[str, KeptKind] = {}  # sites that this robot has not had yet, by kind
 
     def recall(self, memory: KindMemory, sites: Collection[str]) -> None:
-        """Teach a new memory what is kept of its kind and these sites."""
+        """Teach a memory what is kept of its kind and of those of these sites that it did not have yet."""
         kind = memory.kind
-        kept = self._kept.pop(kind.name, None)
+        if kind.name in self._kept:
+            self._begin(memory, self._kept.pop(kind.name))
+        kept = self._away.get(kind.name)
         if kept is None:
             return
+        for name in [name for name in kept.sites if name in sites]:
+            site = kept.sites.pop(name)
+            if not site.source == kind.at(name).source_hash != "":
+                text = "memory %s: %s on %s starts cold: the source of its variant has changed or is not here"
+                log.info(text, self.path, kind.name, name)
+            elif observations := _as_learnt(self._believed(site), kept.per, memory.per_work):
+                memory.site(name).recall(observations, age=PROBE_EVERY)
+                log.info("%s on %s: %d observations recalled", kind.name, name, len(observations))
+
+    def _begin(self, memory: KindMemory, kept: KeptKind) -> None:
+        kind = memory.kind
         if not kind.source_hash or kept.source != kind.source_hash:
             log.info("memory %s: task %s starts cold because its source has changed", self.path, kind.name)
             return
@@ -66,15 +80,7 @@ class Store:
             return
         for size, work in kept.worked:
             memory.learn_size(size, work)
-        for name, site in kept.sites.items():
-            if name not in sites:
-                self._away.setdefault(kind.name, {})[name] = site
-            elif not site.source == kind.at(name).source_hash != "":
-                text = "memory %s: %s on %s starts cold: the source of its variant has changed or is not here"
-                log.info(text, self.path, kind.name, name)
-            elif observations := _as_learnt(self._believed(site), kept.per, memory.per_work):
-                memory.site(name).recall(observations, age=PROBE_EVERY)
-                log.info("%s on %s: %d observations recalled", kind.name, name, len(observations))
+        self._away[kind.name] = kept
 
     def due(self, now_s: float) -> bool:
         """Whether to save now: SAVE_EVERY_S after the last save, unless that one is still being written."""
@@ -89,7 +95,7 @@ class Store:
         """What the file should contain now."""
         now, live = self._now(), dict[str, KeptKind]()
         for name, memory in memories.items():
-            sites = dict(self._away.get(name, {}))
+            sites = dict(self._away[name].sites) if name in self._away else {}
             for site, learnt in memory.sites.items():
                 if learnt.observations:
                     source = memory.kind.at(site).source_hash

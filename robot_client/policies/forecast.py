@@ -223,6 +223,15 @@ def costs_of(forecast: Forecast) -> dict[str, float]:
     }
 
 
+def finishes_of(forecast: Forecast) -> dict[str, float]:
+    """How long the task should take on each site that should answer, in seconds; 0 while it is unknown."""
+    return {
+        site: max(0.0, one.predicted_s or 0.0)
+        for site, one in forecast.sites.items()
+        if not (one.condition.silent or one.given_up)
+    }
+
+
 def home(forecast: Forecast) -> str:
     """Onboard, or the cheapest site where a wrapper has left onboard out."""
     return ONBOARD if ONBOARD in forecast.sites else cheapest(costs_of(forecast))

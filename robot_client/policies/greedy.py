@@ -6,6 +6,7 @@ The costs come from `objectives`.
 from functools import partial
 
 from offboard.common.tasks import show_size
+from offboard.common.variants import group_of
 from offboard.robot_client.policies.decision import Decision
 from offboard.robot_client.policies.forecast import WHOLE, Forecast, Outlook, cheapest, costs_of, home
 from offboard.robot_client.predictors.base import WARM_UP
@@ -30,9 +31,11 @@ class Greedy:
         cold = [site for site, one in heard.items() if _is_cold(one)]
         if not cold or len(heard) == 1:
             return None
-        reason = f"warm-up: too little is known of {' and '.join(sorted(cold))}"
-        silent = tuple(site for site in forecast.sites if site not in heard)
-        return Decision(home(forecast.only(heard)), reason, "greedy", both=True, spared=silent)
+        taught = {group_of(site): site for site in cold}.values()  # equal servers learn from one of them
+        reason = f"warm-up: too little is known of {' and '.join(sorted(taught))}"
+        hearing = [site for site in heard if site in taught or site not in cold]
+        spared = [site for site in forecast.sites if site not in hearing]
+        return Decision(home(forecast.only(heard)), reason, "greedy", both=True, spared=tuple(spared))
 
 
 def explain(forecast: Forecast, site: str) -> str:

@@ -84,6 +84,11 @@ def absent_sites(runners: Mapping[str, Runner], kind: Kind) -> Absent:
     return Absent({site: why for site, runner in runners.items() if (why := runner.unavailable(kind))})
 
 
+def present_sites(runners: Mapping[str, Runner], absent: Mapping[str, str]) -> Mapping[str, Runner]:
+    """The runners of the sites that are not absent."""
+    return {site: one for site, one in runners.items() if site not in absent} if absent else runners
+
+
 def wait_for_sites(runners: Mapping[str, Runner], kind: Kind, timeout_s: float) -> Absent:
     """Begin the setup of the kind onboard, and wait until it is made and every site can take the kind.
 

@@ -28,6 +28,7 @@ FOLDERS: dict[str, set[str]] = {
     "common/live": {"common", "common/security"},
     "robot_client/sites": set(),
     "robot_client/openpi": {"robot_client/sites"},
+    "robot_client/discovery": {"robot_client/sites"},
     "robot_client/predictors": {"robot_client/sites"},
     "robot_client/policies": {"robot_client/predictors", "robot_client/sites"},
     "robot_client/learning": {"robot_client/policies", "robot_client/predictors", "robot_client/sites"},
@@ -39,6 +40,7 @@ FOLDERS: dict[str, set[str]] = {
         "robot_client/sites",
     },
     "robot_client": {  # the offloader
+        "robot_client/discovery",
         "robot_client/execution",
         "robot_client/learning",
         "robot_client/openpi",

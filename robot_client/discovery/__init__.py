@@ -1,0 +1,1 @@
+"""Which servers a robot knows and uses, while lists of servers change."""

@@ -1,0 +1,61 @@
+"""The thread that reads a list of servers again and again.
+
+How a list is read is in `sites_file` and `dns_name`; what it changes is in `present_sites`.
+"""
+
+import logging
+import threading
+from typing import Protocol
+
+from offboard.common.errors import OffloadError
+from offboard.robot_client.discovery.present_sites import PresentSites
+from offboard.robot_client.discovery.roster import Server
+
+SETTLE = 0.2  # of the usual pause: until a list that has just changed is read again
+
+log = logging.getLogger(__name__)
+
+
+class Source(Protocol):
+    """A list of servers. `settling`: it has just changed, and should be read again soon."""
+
+    name: str
+    settling: bool
+
+    def read(self) -> list[Server] | None:
+        """The servers now; None if nothing is new. OffloadError if the list cannot be used."""
+
+
+class Following:
+    """Reads `source` every `every_s` seconds; a list that cannot be used leaves the last one as it is."""
+
+    def __init__(self, source: Source, sites: PresentSites, every_s: float) -> None:
+        self._source = source
+        self._sites = sites
+        self._every_s = every_s
+        self._stop = threading.Event()
+        self._warned = ""
+        self._thread = threading.Thread(target=self._run, name=source.name, daemon=True)
+        sites.on_close(self._stop.set)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def read(self) -> None:
+        """Read the list once. A problem is logged once, until the list can be used again."""
+        try:
+            listed = self._source.read()
+        except OffloadError as error:
+            if str(error) != self._warned:
+                self._warned = str(error)
+                said = "%s: %s; the last servers stay in use; remedy: correct it, it is read again"
+                log.warning(said, self._source.name, error)
+            return
+        if listed is not None:
+            self._warned = ""
+            self._sites.follow(listed, self._source.name)
+
+    def _run(self) -> None:
+        while not self._stop.wait(self._every_s * (SETTLE if self._source.settling else 1.0)):
+            self.read()
+            self._sites.refresh()

@@ -1,0 +1,139 @@
+"""The runners of the sites that tasks can use now: those that stay, and those of the servers in use.
+
+Which servers are in use is decided in `roster`; the threads that read lists are in `following`.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, ItemsView, Iterable, Iterator, Mapping, Sequence
+
+from offboard.common.errors import ConfigError, OffloadError
+from offboard.robot_client.discovery.roster import Roster, Server
+from offboard.robot_client.sites.runner import ONBOARD, Runner
+
+LEAVING_MAX_S = 300.0  # for which a server that is no longer used may still answer the tasks that it has
+
+log = logging.getLogger(__name__)
+
+
+class PresentSites(Mapping[str, Runner]):
+    """The runner of each site now, by its name.
+
+    `now` is replaced and never changed, so a task keeps the sites that were present when it began.
+    A server that leaves gets no more tasks; its runner is closed once its tasks have ended.
+
+    `staying`: the runners of the sites that no list changes.
+    `roster`: chooses the servers in use. `connect`: makes the runner of one of them.
+    `tended`: a thread calls `refresh` at least every few seconds. Otherwise it is called whenever the
+    servers in use change, as in a simulation.
+    """
+
+    def __init__(
+        self,
+        staying: Sequence[Runner],
+        *,
+        roster: Roster | None = None,
+        connect: Callable[[Server], Runner] | None = None,
+        tended: bool = False,
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.now: Mapping[str, Runner] = {runner.site: runner for runner in staying}
+        if ONBOARD not in self.now or len(self.now) != len(staying):
+            given = [runner.site for runner in staying]
+            raise ConfigError(f"sites {given}: each site once, and {ONBOARD!r} among them")
+        self.staying = tuple(staying)
+        self.changing = roster is not None
+        self.in_flight: Callable[[str], int] = lambda _: 0  # tasks on a site; the offloader says it
+        self._roster = roster or Roster()
+        self._connect = connect
+        self._tended = tended
+        self._clock_s = clock_s
+        self._lock = threading.Lock()
+        self._connected: dict[str, tuple[Server, Runner]] = {}
+        self._leaving: list[tuple[Runner, float]] = []  # with the latest time to close it
+        self._failed: set[Server] = set()
+        self._closed = False
+        self._on_close: list[Callable[[], None]] = []
+        self.refresh()
+
+    def follow(self, listed: Iterable[Server], source: str = "") -> None:
+        """This is the list of this source from now on."""
+        with self._lock:
+            self._roster.follow(listed, source)
+        self.refresh()
+
+    def count_task(self, now_s: float) -> bool:
+        """Count a task; returns whether `look` should now be called. Called under the offloader's lock."""
+        return self.changing and self._roster.count_task(now_s)
+
+    def look(self, finish_s: Mapping[str, float], now_s: float) -> None:
+        """Keep the servers that finish soonest; see `Roster.look`."""
+        with self._lock:
+            self._roster.look(finish_s, now_s)
+        if not self._tended:
+            self.refresh()
+
+    def refresh(self) -> None:
+        """Connect to the servers in use, and close what has left and has no more tasks."""
+        with self._lock:
+            if self._closed:
+                return
+            ended = [one for one in self._leaving if self._may_close(*one)]
+            self._leaving = [one for one in self._leaving if one not in ended]
+            wanted = self._roster.in_use
+            for site, (server, runner) in list(self._connected.items()):
+                if wanted.get(site) != server:
+                    del self._connected[site]
+                    self._leaving.append((runner, self._clock_s() + LEAVING_MAX_S))
+                    log.info("%s: %s is no longer used", site, server.endpoint)
+            for site in wanted.keys() - self._connected.keys():
+                self._open(wanted[site])
+            self.now = {one.site: one for one in self.staying} | {
+                site: self._connected[site][1] for site in wanted if site in self._connected
+            }
+        for runner, _ in ended:
+            runner.close()
+
+    def on_close(self, act: Callable[[], None]) -> None:
+        """Call this when the sites are closed."""
+        self._on_close.append(act)
+
+    def close(self) -> None:
+        """Close all runners. Safe to call twice."""
+        for act in self._on_close:
+            act()
+        with self._lock:
+            self._closed = True
+            runners = [*self.now.values(), *(runner for runner, _ in self._leaving)]
+        for runner in runners:
+            runner.close()
+
+    def _open(self, server: Server) -> None:
+        """Connect to a server; one that cannot be connected to is left out, and the log says so once."""
+        assert self._connect is not None, "only a roster with servers needs it"
+        try:
+            self._connected[server.site] = server, self._connect(server)
+        except OffloadError as error:
+            if server not in self._failed:
+                said = "%s: %s; it is not used; remedy: correct its entry, or close other files"
+                log.warning(said, server.site, error)
+            self._failed.add(server)
+        else:
+            self._failed.discard(server)
+            log.info("%s: %s is used from now on", server.site, server.endpoint)
+
+    def _may_close(self, runner: Runner, until_s: float) -> bool:
+        return not self.in_flight(runner.site) or self._clock_s() >= until_s
+
+    def items(self) -> ItemsView[str, Runner]:
+        return self.now.items()
+
+    def __getitem__(self, site: str) -> Runner:
+        return self.now[site]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.now)
+
+    def __len__(self) -> int:
+        return len(self.now)

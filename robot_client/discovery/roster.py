@@ -1,0 +1,91 @@
+"""Which of the listed servers a robot uses now. Pure: no clock, socket or thread.
+
+Lists come from `sites_file`, `dns_name` or a simulation; `present_sites` connects to the servers in use.
+"""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from random import Random
+
+from offboard.common.errors import ConfigError
+from offboard.common.variants import group_of
+
+KNOWN_MAX = 4  # servers of one group that a robot uses at a time
+LOOK_EVERY, LOOK_S = 20, 2.0  # tasks and seconds, both at least, between two looks at the servers in use
+TRY_EVERY = 10  # looks, of which the last one lets the robot try another server
+
+
+@dataclass(frozen=True, slots=True)
+class Server:
+    """A server of a list. Servers with a site GROUP/NAME are equal to the others of their group.
+
+    `key`: its public key (None: the connection is not encrypted).
+    """
+
+    site: str
+    endpoint: str
+    key: bytes | None = None
+
+
+class Roster:
+    """Chooses the servers in use: all of a small group, and `known` of a larger one.
+
+    Of a larger group, the robot keeps the servers that finish its tasks soonest, and rarely tries another
+    one in the place of one of them. Robots of a fleet need different seeds, so that they spread out.
+    """
+
+    def __init__(self, known: int = KNOWN_MAX, seed: int | str = 0) -> None:
+        if known < 2:
+            raise ConfigError(f"known {known}: must be at least 2 servers of each group")
+        self.in_use: Mapping[str, Server] = {}  # by site; replaced and never changed
+        self._known = known
+        self._random = Random(seed)
+        self._lists: dict[str, dict[str, Server]] = {}  # by source
+        self._tasks = self._looks = 0
+        self._looked_s = -math.inf
+
+    def follow(self, listed: Iterable[Server], source: str = "") -> None:
+        """This is the list of this source from now on: servers that it does not name are left."""
+        self._lists[source] = {one.site: one for one in listed}
+        self._use(self.in_use)
+
+    def count_task(self, now_s: float) -> bool:
+        """Count a task; returns whether the robot should now `look`."""
+        self._tasks += 1
+        return self._tasks >= LOOK_EVERY and now_s - self._looked_s >= LOOK_S
+
+    def look(self, finish_s: Mapping[str, float], now_s: float) -> None:
+        """Replace servers of larger groups: those that cannot take tasks, and rarely one more.
+
+        `finish_s`: how long a task should take on each site that can take it, in seconds. The site that is
+        left for a trial is the later one of two drawn ones: the best one always stays.
+        """
+        self._tasks, self._looked_s = 0, now_s
+        self._looks += 1
+        kept = {site for site in self.in_use if site in finish_s}
+        if self._looks % TRY_EVERY == 0:
+            for members in _groups(kept).values():
+                if len(members) >= self._known:
+                    kept.remove(max(self._random.sample(members, 2), key=finish_s.__getitem__))
+        self._use(kept)
+
+    def _use(self, kept: Iterable[str]) -> None:
+        """Use the listed ones of these, and in their groups others where there is room, new ones first."""
+        listed = {site: one for servers in self._lists.values() for site, one in servers.items()}
+        kept, in_use = set(kept), dict[str, Server]()
+        for members in _groups(listed).values():
+            stay = [site for site in members if site in kept]
+            self._random.shuffle(members)
+            members.sort(key=lambda site: site in self.in_use)  # one that was just left comes last
+            room = [site for site in members if site not in kept][: max(0, self._known - len(stay))]
+            in_use |= {site: listed[site] for site in sorted(stay + room)}
+        self.in_use = in_use
+
+
+def _groups(sites: Iterable[str]) -> dict[str, list[str]]:
+    """The sites of each group, sorted."""
+    groups: dict[str, list[str]] = {}
+    for site in sorted(sites):
+        groups.setdefault(group_of(site), []).append(site)
+    return groups

@@ -1,0 +1,160 @@
+"""Connects an offloader to its servers: those with an endpoint, and those of lists that change.
+
+What a runner does is in `sites` and, for policy servers, in `openpi`; how lists are followed is in
+`discovery`.
+"""
+
+import os
+import socket
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+
+from offboard.common.errors import ConfigError, OffloadError
+from offboard.common.security.keys import RobotKeys, checked_key, own_keys, robot_keys
+from offboard.common.variants import group_of
+from offboard.robot_client.discovery.dns_name import DnsName, is_dns
+from offboard.robot_client.discovery.following import Following, Source
+from offboard.robot_client.discovery.present_sites import PresentSites
+from offboard.robot_client.discovery.roster import Roster, Server
+from offboard.robot_client.discovery.sites_file import SitesFile
+from offboard.robot_client.openpi.endpoint import is_policy_server
+from offboard.robot_client.policies import BOTH
+from offboard.robot_client.settings import Settings
+from offboard.robot_client.sites import heartbeat
+from offboard.robot_client.sites.background import Background
+from offboard.robot_client.sites.cloud import CloudRunner
+from offboard.robot_client.sites.onboard import OnboardRunner
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Runner
+
+Sites = Mapping[str, str] | Path | str
+
+
+def connect_sites(
+    endpoint: str | None,
+    sites: Sites,
+    *,
+    keys: Path | str | None,
+    policy: str,
+    settings: Settings,
+    wrap: Callable[[Runner], Runner] = lambda runner: runner,
+) -> PresentSites:
+    """The server at `endpoint`, the further ones in `sites`, and onboard.
+
+    `sites`: the endpoint of each by its name, or the file that lists them.
+    `keys`: the folder with the keys (None: no encryption). `policy`: the name of the policy.
+    `wrap`: makes of each runner the one that is used.
+    """
+    named = {} if isinstance(sites, Path | str) else dict(sites)
+    if endpoint is not None and CLOUD in named:
+        raise ConfigError(f"sites: {CLOUD!r} is the name of the server at {endpoint}; choose another one")
+    servers = ({} if endpoint is None else {CLOUD: endpoint}) | named
+    if keys is not None and not (servers or sites):
+        raise ConfigError(f"keys: {keys} needs an endpoint, the server to use")
+    folder = None if keys is None else Path(keys)
+    key_of = partial(_key_of, folder, insecure=settings.insecure)
+    fixed = {site: one for site, one in servers.items() if not is_dns(one)}
+    sources: list[Source] = [
+        DnsName(site, one, key_of(site, None)) for site, one in servers.items() if is_dns(one)
+    ]
+    if isinstance(sites, Path | str):
+        sources.append(SitesFile(Path(sites), key_of, {ONBOARD, BOTH, *fixed}))
+    make = _Make(folder, settings.beats(policy), settings, wrap)
+    runners: list[Runner] = []
+    try:
+        for site, one in fixed.items():
+            runners.append(make.server(Server(site, one)))
+        runners.append(make.onboard())
+        return _followed(runners, sources, make, settings)
+    except BaseException:  # also after Ctrl-C, no thread or socket of the others is left
+        for runner in runners:
+            runner.close()
+        raise
+
+
+def _followed(
+    runners: list[Runner], sources: list[Source], make: "_Make", settings: Settings
+) -> PresentSites:
+    """These sites, and the servers of the sources as they are from now on."""
+    if not sources:
+        return PresentSites(runners)
+    seed = f"{settings.seed} {socket.gethostname()} {os.getpid()}"  # the robots of a fleet spread out
+    sites = PresentSites(runners, roster=Roster(settings.known, seed), connect=make.server, tended=True)
+    try:
+        for source in sources:
+            following = Following(source, sites, settings.reread_s)
+            if isinstance(source, SitesFile):
+                sites.follow(source.read() or [], source.name)  # a mistake in the file is an error at start
+            else:
+                following.read()
+            following.start()
+    except BaseException as error:
+        sites.close()
+        if isinstance(error, RuntimeError):
+            raise OffloadError(f"{error}; free some threads") from error
+        raise
+    return sites
+
+
+class _Make:
+    """Makes the runners of one offloader."""
+
+    def __init__(
+        self, keys: Path | None, beats: bool, settings: Settings, wrap: Callable[[Runner], Runner]
+    ) -> None:
+        self._keys = keys
+        self._heartbeat_s = heartbeat.EVERY_S if beats else 0.0
+        self._settings = settings
+        self._wrap = wrap
+        self._background = Background()
+
+    def onboard(self) -> Runner:
+        return self._wrap(OnboardRunner(states=self._settings.states, background=self._background))
+
+    def server(self, server: Server) -> Runner:
+        settings = self._settings
+        if is_policy_server(server.endpoint):
+            from offboard.robot_client.openpi.policy_server import (
+                PolicyServerRunner,  # its library is an extra
+            )
+
+            return self._wrap(
+                PolicyServerRunner(
+                    server.endpoint,
+                    site=server.site,
+                    heartbeat_s=self._heartbeat_s,
+                    seed=settings.seed,
+                    insecure=settings.insecure,
+                    background=self._background,
+                )
+            )
+        return self._wrap(
+            CloudRunner(
+                server.endpoint,
+                site=server.site,
+                heartbeat_s=self._heartbeat_s,
+                seed=settings.seed,
+                keys=self._keys_for(server),
+                background=self._background,
+                compress=settings.compress,
+            )
+        )
+
+    def _keys_for(self, server: Server) -> RobotKeys | None:
+        if self._keys is None:
+            return None
+        if server.key is None:
+            return robot_keys(self._keys, server.site)
+        return RobotKeys(own_keys(self._keys), server.key)
+
+
+def _key_of(folder: Path | None, site: str, given: str | None, *, insecure: bool) -> bytes | None:
+    """The public key that a listed server must have: its own one, or that of its group."""
+    if folder is not None:
+        return robot_keys(folder, group_of(site)).server if given is None else checked_key("key", given)
+    if insecure and given is None:
+        return None
+    raise ConfigError(
+        f"sites: {site} is found in a list that changes, so it needs keys (keys=, --keys), which prove that "
+        "it is the right server; or allow others with --insecure (in a program: Settings(insecure=True))"
+    )

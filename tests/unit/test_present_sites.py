@@ -1,0 +1,147 @@
+"""Sites that come and go while tasks run, with an offloader in virtual time and no thread."""
+
+import pytest
+
+from offboard.common.errors import ConfigError, OffloadError
+from offboard.common.tasks import task
+from offboard.robot_client import policies
+from offboard.robot_client.discovery.present_sites import PresentSites
+from offboard.robot_client.discovery.roster import LOOK_EVERY, LOOK_S, Roster, Server
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.settings import Settings
+from offboard.robot_client.sites.runner import ONBOARD
+from tests.virtual import VirtualClock, VirtualRunner
+
+
+@task("carried", size=float)
+def carried(number: int) -> int:
+    return number
+
+
+class World:
+    """A robot whose servers are virtual: GPU is fast, all others are as slow as asked."""
+
+    def __init__(self, *listed: str, known: int = 4, takes_s: float = 0.1) -> None:
+        self.clock = VirtualClock()
+        self.runners: dict[str, VirtualRunner] = {}
+        self.takes_s = takes_s
+        onboard = VirtualRunner(ONBOARD, self.clock, 1.0)
+        self.sites = PresentSites(
+            [onboard], roster=Roster(known), connect=self.connect, clock_s=self.clock.now_s
+        )
+        self.list(*listed)
+        self.offload = Offloader(
+            self.sites,
+            policy=policies.make("greedy"),
+            memories=Settings().make_memories("greedy"),
+            clock=self.clock,
+        )
+
+    def list(self, *sites: str) -> None:
+        self.sites.follow([Server(site, f"tcp://{n}.test:5555") for n, site in enumerate(sites)])
+
+    def connect(self, server: Server) -> VirtualRunner:
+        if server.site == "broken":
+            raise OffloadError("no file is left")
+        self.runners[server.site] = VirtualRunner(server.site, self.clock, self.takes_s)
+        return self.runners[server.site]
+
+
+def test_a_listed_server_is_used_and_one_that_left_is_not() -> None:
+    """Tasks follow the list, and the runner of a server that left is closed at the next change."""
+    world = World("a")
+    for _ in range(10):
+        world.offload(carried, 1)
+    assert world.offload.last is not None
+    assert world.offload.last.used == "a"
+    gone = world.runners["a"]
+    asked = len(gone.tasks)
+    world.list("b")
+    for _ in range(10):
+        world.offload(carried, 1)
+    assert world.offload.last.used == "b"
+    assert len(gone.tasks) == asked
+    world.sites.refresh()
+    assert gone.closed
+
+
+def test_a_task_keeps_the_sites_that_were_present_when_it_began() -> None:
+    """The server leaves while its task runs: the answer still comes from there."""
+    world = World("a")
+    for _ in range(10):
+        world.offload(carried, 1)
+    world.clock.after(0.05, world.list)
+    assert world.offload(carried, 7) == 7
+    assert world.offload.last is not None
+    assert world.offload.last.used == "a"
+    assert world.offload(carried, 8) == 8
+    assert world.offload.last.used == ONBOARD
+
+
+def test_a_server_that_returns_is_known() -> None:
+    """Its memory was kept, so there is no second warm-up."""
+    world = World("a")
+    for _ in range(10):
+        world.offload(carried, 1)
+    world.list()
+    world.offload(carried, 1)
+    world.list("a")
+    expected = world.offload.expect(carried, 1)
+    assert expected["a"].seconds == pytest.approx(0.1, rel=0.1)
+
+
+def test_of_a_large_group_the_dead_servers_are_left() -> None:
+    """Of 20 servers 4 are in use; those that fail are replaced by others, and closed."""
+    world = World(*(f"planners/{n:02}" for n in range(20)))
+    assert len(world.sites) == 5
+    dead = [site for site in world.sites if site != ONBOARD]
+    for site in dead:
+        world.runners[site].takes = None
+    for _ in range(20 * LOOK_EVERY):
+        world.offload(carried, 1)
+        world.clock.after(LOOK_S, lambda: None)
+        world.clock.run_out()
+    assert world.offload.last is not None
+    assert world.offload.last.used not in (ONBOARD, *dead)
+    assert world.offload.last.waited_s < 0.2
+
+
+def test_a_call_pinned_to_a_group_or_to_a_site_that_left() -> None:
+    """A group stands for its best server; without any server there, onboard answers."""
+    world = World("planners/a", "planners/b")
+    for _ in range(10):
+        world.offload(carried, 1)
+    assert world.offload.map(carried, [1, 2, 3], where="planners") == [1, 2, 3]
+    world.offload(carried, 1, where="planners")
+    assert world.offload.last is not None
+    assert str(world.offload.last.used).startswith("planners/")
+    world.list()
+    assert world.offload(carried, 1, where="planners") == 1
+    assert world.offload.map(carried, [1, 2, 3], where="planners/a") == [1, 2, 3]
+    assert world.offload.last.used == ONBOARD
+    assert "pinned to planners/a, which cannot take it" in world.offload.last.decision.reason
+
+
+def test_a_batch_goes_on_when_its_servers_leave() -> None:
+    """All items are answered, those of the servers that left onboard."""
+    world = World("a", "b")
+    for _ in range(10):
+        world.offload(carried, 1)
+    world.clock.after(0.3, world.list)
+    assert world.offload.map(carried, range(40)) == list(range(40))
+
+
+def test_a_server_that_cannot_be_connected_to_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    """The others are used; it is tried again at each refresh without a further line."""
+    world = World("broken", "a")
+    world.sites.refresh()
+    assert set(world.sites) == {ONBOARD, "a"}
+    assert caplog.text.count("broken: no file is left") == 1
+
+
+def test_each_site_has_one_name() -> None:
+    """Two runners of one site, or none of onboard, are refused."""
+    clock = VirtualClock()
+    for names in ([ONBOARD, "a", "a"], ["a"]):
+        with pytest.raises(ConfigError, match="each site once, and 'onboard' among them"):
+            PresentSites([VirtualRunner(name, clock) for name in names])

@@ -1,0 +1,116 @@
+"""The list of servers in a file: what is taken, what is refused, and when a change counts."""
+
+import logging
+from pathlib import Path
+
+import pytest
+
+from offboard.common.errors import ConfigError, DataError
+from offboard.robot_client.discovery.following import Following
+from offboard.robot_client.discovery.present_sites import PresentSites
+from offboard.robot_client.discovery.roster import Roster, Server
+from offboard.robot_client.discovery.sites_file import GROUPS_MAX, SitesFile
+from offboard.robot_client.sites.runner import ONBOARD
+from tests.virtual import VirtualClock, VirtualRunner
+
+GPU = '[gpu]\nendpoint = "tcp://10.0.0.7:5555"\n'
+EQUAL = '[a]\nendpoint = "tcp://10.0.0.8:5555"\ngroup = "planners"\n'
+
+
+def key_of(site: str, given: str | None) -> bytes | None:
+    if site == "nokey":
+        raise ConfigError("it needs keys")
+    return None if given is None else given.encode()
+
+
+@pytest.fixture
+def listed(tmp_path: Path) -> SitesFile:
+    (tmp_path / "sites.toml").write_text(GPU)
+    return SitesFile(tmp_path / "sites.toml", key_of, {ONBOARD})
+
+
+def test_a_file_lists_servers_by_name(listed: SitesFile, tmp_path: Path) -> None:
+    """A server of a group has the name GROUP/NAME, and each may have its own key."""
+    (tmp_path / "sites.toml").write_text(f'{GPU}key = "k"\n{EQUAL}')
+    assert listed.read() == [
+        Server("gpu", "tcp://10.0.0.7:5555", b"k"),
+        Server("planners/a", "tcp://10.0.0.8:5555"),
+    ]
+
+
+def test_a_change_counts_once_two_reads_agree(listed: SitesFile, tmp_path: Path) -> None:
+    """A list that is being written, even one that is whole so far, is not used before it stands still."""
+    path = tmp_path / "sites.toml"
+    assert listed.read() == [Server("gpu", "tcp://10.0.0.7:5555")]
+    assert listed.read() is None
+    path.write_text(EQUAL)
+    assert listed.read() is None
+    assert listed.settling
+    path.write_text(EQUAL + GPU)
+    assert listed.read() is None
+    assert [one.site for one in listed.read() or []] == ["planners/a", "gpu"]
+    assert not listed.settling
+    assert listed.read() is None
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "0 servers; allowed are 1 to 1000"),
+        ("[gpu", "line 1"),
+        ("gpu = 1", r"\[gpu\]: must be a table with `endpoint`"),
+        ("[gpu]", r"\[gpu\]: `endpoint` is missing"),
+        ("[gpu]\nendpoint = 5", r"\[gpu\]: endpoint 5 must be a string"),
+        ('[gpu]\nendpoint = "tcp://a"', r"\[gpu\]: endpoint: 'tcp://a' is not tcp://HOST:PORT"),
+        (f'{GPU}keys = "a"', r"\[gpu\]: unknown key 'keys'; did you mean 'key'\?"),
+        (f'{GPU}group = "a b"', r"\[gpu\]: 'a b' is not a free name"),
+        (GPU.replace("gpu", "onboard"), r"\[onboard\]: 'onboard' is not a free name"),
+        (GPU.replace("gpu", "nokey"), r"\[nokey\]: it needs keys"),
+        ("\ufffe".join(GPU), "sites.toml: "),
+        (
+            "".join(GPU.replace("gpu", f"gpu{n}") for n in range(GROUPS_MAX + 1)),
+            "33 groups and servers without a group; at most 32",
+        ),
+        (GPU + "#" * 1_000_000, "over 1000000 bytes"),
+    ],
+)
+def test_a_mistake_is_named(listed: SitesFile, tmp_path: Path, text: str, said: str) -> None:
+    """Each mistake is one line with the file, the server, the value and what is allowed."""
+    (tmp_path / "sites.toml").write_text(text)
+    with pytest.raises(DataError, match=said) as raised:
+        listed.read()
+    assert "\n" not in str(raised.value)
+    assert str(raised.value).startswith(str(tmp_path / "sites.toml"))
+
+
+def test_a_problem_is_logged_once_and_the_servers_stay(
+    listed: SitesFile, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A broken or missing file changes nothing; a corrected one is used, and the next problem is logged."""
+    clock, path = VirtualClock(), tmp_path / "sites.toml"
+    sites = PresentSites(
+        [VirtualRunner(ONBOARD, clock)],
+        roster=Roster(),
+        connect=lambda server: VirtualRunner(server.site, clock),
+    )
+    following = Following(listed, sites, 1.0)
+    following.read()
+    with caplog.at_level(logging.WARNING):
+        for _ in range(2):
+            caplog.clear()
+            path.write_text("[gpu")
+            for _ in range(5):
+                following.read()
+            path.unlink()
+            for _ in range(5):
+                following.read()
+            assert set(sites) == {ONBOARD, "gpu"}
+            assert len(caplog.records) == 2
+            assert "no such file" in caplog.records[1].getMessage().lower()
+            path.write_text(EQUAL)
+            for _ in range(3):
+                following.read()
+            assert set(sites) == {ONBOARD, "planners/a"}
+            path.write_text(GPU)
+            for _ in range(3):
+                following.read()
