@@ -20,7 +20,7 @@ from offboard.loadgen.table.table_formats import Table
 FIGURES, CHART = "fleet.json", "fleet.png"
 CAPTION = "Robots that share servers; times from when a task is due to its answer, in simulation:"
 NOTES = (
-    "regret: beyond the best site that the robot knows; settled: in the second half of its tasks",
+    "regret: beyond the best site that the robot uses; settled: in the second half of its tasks",
     "busiest, idlest: the used time of a server over the mean of all servers",
     "uneven: spread of the servers' requests at one moment, over their mean",
     f"repeats: how much of that is left after {LAG_S:g} s, from -1 to 1; below 0, robots herd",

@@ -20,7 +20,7 @@ SAMPLES_MIN = 20  # with fewer samples while all robots work, nothing is said ab
 class FleetLine:
     """One fleet. None: undefined.
 
-    - `regret_ms`: mean time beyond the best site that the robot knows; `settled_ms`: that of the second half
+    - `regret_ms`: mean time beyond the best site that the robot uses; `settled_ms`: that of the second half
       of each robot's tasks.
     - `busiest`, `idlest`: the used time of the busiest and of the idlest server, over the mean of all.
     - `uneven`: standard deviation of the requests at the servers at one moment, over their mean.

@@ -14,7 +14,8 @@ class ToServer(NamedTuple):
 
     `number` counts the tasks of the robot (ASK), its requests, or its heartbeats to this server.
     `cpu_s`: what the task takes on a server. `limit_s`: for a REQUEST, when the robot gives up; for an ASK,
-    what the task would take onboard. ASK asks no server: it is how the oracle hears of a task.
+    what the task would take onboard. ASK asks no server: it is how the oracle hears of a task, and of the
+    servers that the robot uses (`ways`).
     """
 
     arrives_s: float
@@ -24,6 +25,7 @@ class ToServer(NamedTuple):
     number: int
     cpu_s: float = 0.0
     limit_s: float = 0.0
+    ways: tuple[int, ...] = ()
 
 
 class ToRobot(NamedTuple):

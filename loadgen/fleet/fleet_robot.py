@@ -5,8 +5,10 @@ Its sites are modelled in `fleet_site` and `simulation`.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from random import Random
 
+from offboard.common.variants import IN_GROUP
 from offboard.loadgen import rivals
 from offboard.loadgen.fleet.fleet_messages import ASK, ToRobot, ToServer
 from offboard.loadgen.fleet.fleet_settings import FleetConfig
@@ -25,6 +27,8 @@ from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
 from offboard.loadgen.simulation.model.walker import Walk, Walker
 from offboard.loadgen.simulation.simulated_onboard import SimulatedOnboard
 from offboard.loadgen.simulation.stepped_offloader import SteppedOffloader
+from offboard.robot_client.discovery.present_sites import PresentSites
+from offboard.robot_client.discovery.roster import Roster, Server
 from offboard.robot_client.policies import Probe
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites import heartbeat
@@ -33,6 +37,7 @@ from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 NOISES = 65_537  # a prime, so that the noise has another period than the tasks
 FIRST_MAX = 1_000_000_000
+GROUP = "server"
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +69,7 @@ class FleetNoise(Noise):
 class FleetRobot:
     """Asks for its tasks one after the other: each is due some time after the last one, or when that ends.
 
-    - `noise`: on the costs of its tasks. `known`: the servers that it may use.
+    - `noise`: on the costs of its tasks. `listed`: the servers of the fleet, of which it uses a few.
     - `period_s`: the mean time from task to task.
     - `post`: sends a message to the servers. `answered` is called after each task.
     """
@@ -77,7 +82,7 @@ class FleetRobot:
         tasks: RobotTasks,
         *,
         noise: Noise,
-        known: Sequence[int],
+        listed: Sequence[Server],
         period_s: float,
         post: Callable[[ToServer], object],
         answered: Callable[[], object],
@@ -95,8 +100,9 @@ class FleetRobot:
         self._cpu = SimulatedCpu(clock, config.robot_cpus)
         self._first = self._random.randrange(FIRST_MAX)  # so that robots have other tasks and other noise
         self._costs = TrueCosts(tasks, noise)
-        self._known, self._seed = known, seed
-        self._sites: dict[int, FleetSite] = {}
+        self._listed, self._seed = listed, seed
+        self._sites: dict[int, FleetSite] = {}  # every server that it has ever used, by number
+        self._present: PresentSites
         self._walker = Walker(clock, self._life())
 
     def begin(self) -> None:
@@ -127,7 +133,7 @@ class FleetRobot:
             Done(
                 began_s,
                 self._clock.now_s() - began_s,
-                server=-1 if decision.site == ONBOARD else int(decision.site.rpartition("_")[2]),
+                server=-1 if decision.site == ONBOARD else number_of(decision.site),
                 runs=runs,
                 probed=isinstance(decision.second, Probe) and runs > 1,
             )
@@ -142,26 +148,48 @@ class FleetRobot:
         # It arrives with the request, and the rest of the robot's own time is added to that on the server.
         cpu_s = deciding_s + sending_s + costs.seconds(CLOUD, task)
         arrives_s = now_s + sending_s / 2 + delay_s
-        self._post(ToServer(arrives_s, ASK, self._number, -1, number, cpu_s=cpu_s, limit_s=onboard_s))
+        ways = tuple(number_of(site) for site in self._present if site != ONBOARD)
+        ask = ToServer(arrives_s, ASK, self._number, -1, number, cpu_s=cpu_s, limit_s=onboard_s, ways=ways)
+        self._post(ask)
 
     def _connect(self) -> SteppedOffloader:
         config = self._config
         settings = Settings(heartbeats=config.heartbeats, seed=self._seed)
         policy = rivals.policy(config.policy)
         every_s = heartbeat.EVERY_S if settings.beats(policy) else 0.0
-        for server in self._known:
-            self._sites[server] = FleetSite(
-                Place(self._number, server, config.delay_ms / 1e3),
-                self._clock,
-                self._cpu,
-                self._costs,
-                post=self._post,
-                heartbeat=Heartbeat(every_s, self._seed + server),
-            )
+        self._present = PresentSites(
+            [SimulatedOnboard(self._clock, self._cpu, self._costs)],
+            roster=Roster(config.known, self._seed),
+            connect=partial(self._use, every_s),
+            clock_s=self._clock.now_s,
+        )
+        self._present.follow(self._listed)
         return SteppedOffloader(
-            [*self._sites.values(), SimulatedOnboard(self._clock, self._cpu, self._costs)],
+            self._present,
             policy=settings.make_policy(policy),
             memories=settings.make_memories(policy),
             timeout_s=config.timeout_s,
             clock=self._clock,
         )
+
+    def _use(self, every_s: float, server: Server) -> FleetSite:
+        """Connect to a server, with a heartbeat after this time."""
+        number = number_of(server.site)
+        self._sites[number] = FleetSite(
+            Place(self._number, number, server.site, self._config.delay_ms / 1e3),
+            self._clock,
+            self._cpu,
+            self._costs,
+            post=self._post,
+            heartbeat=Heartbeat(every_s, self._seed + number),
+        )
+        return self._sites[number]
+
+
+def server_of(number: int) -> Server:
+    """A server of the fleet, as robots know it: all are equal."""
+    return Server(f"{GROUP}{IN_GROUP}{number}", f"simulated://{number}")
+
+
+def number_of(site: str) -> int:
+    return int(site.rpartition(IN_GROUP)[2])

@@ -7,7 +7,6 @@ servers need to exchange messages only between windows, and the number of proces
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from random import Random
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +32,7 @@ FEW_ROBOTS = 50  # so few robots are simulated by one process
 class Fleet:
     """A fleet that has answered all its tasks.
 
-    - `done`: the tasks of each robot. `oracle_s`: what they would have taken on the best known site.
+    - `done`: the tasks of each robot. `oracle_s`: what they would have taken on the best site that it used.
     - `samples`: the requests at each server over time. `busy_s`: how long the workers of each server ran.
     """
 
@@ -51,25 +50,19 @@ def make_tasks(config: FleetConfig) -> RobotTasks:
     return find_tasks(workload, config.seed, TASKS)
 
 
-def known_servers(size: FleetSize, known: int, seed: int) -> list[tuple[int, ...]]:
-    """The servers that each robot knows: drawn anew for each robot."""
-    random = Random(seed)
-    return [tuple(random.sample(range(size.servers), min(known, size.servers))) for _ in range(size.robots)]
-
-
 def run_fleet(
     config: FleetConfig, size: FleetSize, tasks: RobotTasks, *, jobs: int, shown: Progress
 ) -> Fleet:
     """Simulate one fleet. `shown` gets the answered tasks."""
-    delay_s, known = config.delay_ms / 1e3, known_servers(size, config.known, config.seed)
+    delay_s = config.delay_ms / 1e3
     period_s = size.period_s(tasks.cost.cpu_s(config.rounds), config.load)
-    servers = Servers(size, known, config.tasks, delay_s)
+    servers = Servers(size, config.tasks, delay_s)
     jobs = 1 if size.robots <= FEW_ROBOTS else jobs
     shards: list[Robots] = []
     try:
         for job in range(jobs):
-            mine = {number: known[number] for number in range(job, size.robots, jobs)}
-            settings = ShardSettings(config, tasks, mine, period_s)
+            mine = range(job, size.robots, jobs)
+            settings = ShardSettings(config, tasks, mine, size.servers, period_s)
             shards.append(Shard(settings) if jobs == 1 else ShardProcess(settings))
         _play(shards, servers, size.robots * config.tasks, delay_s, shown=shown)
         found = {number: done for shard in shards for number, done in shard.done().items()}

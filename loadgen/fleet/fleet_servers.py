@@ -5,7 +5,7 @@ All servers are equal. They live in one process and are moved on in windows of t
 
 import heapq
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -93,15 +93,14 @@ class Server:
 class Servers:
     """All servers, and the oracle, which knows them as they are.
 
-    - `delay_s`: of the link, in each direction. `known`: the servers that each robot may use.
-    - `oracle_s`: what each task of each robot would have taken on the best site that the robot knows.
+    - `delay_s`: of the link, in each direction.
+    - `oracle_s`: what each task of each robot would have taken on the best site that the robot uses.
     """
 
-    def __init__(self, size: FleetSize, known: Sequence[Sequence[int]], tasks: int, delay_s: float) -> None:
+    def __init__(self, size: FleetSize, tasks: int, delay_s: float) -> None:
         self.oracle_s: NDArray[np.float64] = np.full((size.robots, tasks), np.nan)
         self.samples: list[NDArray[np.int32]] = []  # requests at each server, every SAMPLE_S
         self._servers = [Server(size.workers) for _ in range(size.servers)]
-        self._known = known
         self._delay_s = delay_s
         self._events: list[tuple[ToServer, int, Run | None]] = []  # with a life
 
@@ -125,10 +124,10 @@ class Servers:
         return sent
 
     def _receive(self, message: ToServer) -> list[ToRobot]:
-        now_s, sort, robot, index, number, cpu_s, limit_s = message
+        now_s, sort, robot, index, number, cpu_s, limit_s, ways = message
         if sort == ASK:
-            ways = [self._servers[one].begins_s(now_s) for one in self._known[robot]]
-            self.oracle_s[robot, number] = min(limit_s, min(ways) - now_s + cpu_s + 2 * self._delay_s)
+            begins_s = min(self._servers[one].begins_s(now_s) for one in ways)
+            self.oracle_s[robot, number] = min(limit_s, begins_s - now_s + cpu_s + 2 * self._delay_s)
             return []
         server = self._servers[index]
         if sort == BEAT:

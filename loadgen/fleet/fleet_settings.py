@@ -43,7 +43,7 @@ class FleetConfig(ColumnSettings):
         (), "number of servers of each fleet (default: one for 100 robots, and at least four)", group=FLEET,
         minimum=1, maximum=SERVERS_MAX, metavar="S,..",
     )  # fmt: skip
-    known: int = setting(4, "servers that each robot knows, drawn from all of them", group=FLEET, minimum=1)
+    known: int = setting(4, "servers that each robot uses at a time", group=FLEET, minimum=2)
     workers_per_robot: float = setting(
         0.4, "size of the fleet's servers, in workers for each robot", group=FLEET, rare=True, minimum=0.001
     )

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 from offboard.common.errors import OffloadError
 from offboard.loadgen.fleet.fleet_messages import ToRobot, ToServer
-from offboard.loadgen.fleet.fleet_robot import Done, FleetNoise, FleetRobot
+from offboard.loadgen.fleet.fleet_robot import Done, FleetNoise, FleetRobot, server_of
 from offboard.loadgen.fleet.fleet_settings import FleetConfig
 from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks
 from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
@@ -26,11 +26,12 @@ END_S = 5.0
 
 @dataclass(frozen=True, slots=True)
 class ShardSettings:
-    """What the robots of a shard need: their numbers, the servers that each knows, and the tasks of all."""
+    """What the robots of a shard need: the tasks of all, their numbers, and the number of servers."""
 
     config: FleetConfig
     tasks: RobotTasks
-    known: dict[int, tuple[int, ...]]
+    robots: range
+    servers: int
     period_s: float
 
 
@@ -56,6 +57,7 @@ class Shard:
         # Millions of objects that live on are looked through again and again otherwise; none are in circles.
         gc.disable()
         noise = FleetNoise(settings.config.seed)
+        listed = [server_of(number) for number in range(settings.servers)]
         self._clock = VirtualClock()
         self._sent: list[ToServer] = []
         self._answered = 0
@@ -66,12 +68,12 @@ class Shard:
                 self._clock,
                 settings.tasks,
                 noise=noise,
-                known=known,
+                listed=listed,
                 period_s=settings.period_s,
                 post=self._post,
                 answered=self._count,
             )
-            for number, known in settings.known.items()
+            for number in settings.robots
         }
         for robot in self._robots.values():
             robot.begin()

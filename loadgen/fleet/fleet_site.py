@@ -20,10 +20,11 @@ from offboard.robot_client.sites.runner import CLOUD, Condition, Execution, Send
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Which robot a runner belongs to, the server that it stands for, and the delay between them."""
+    """Which robot a runner belongs to, the server and the site that it stands for, and the delay."""
 
     robot: int
     server: int
+    site: str
     delay_s: float
 
 
@@ -47,7 +48,7 @@ class FleetSite:
         post: Callable[[ToServer], object],
         heartbeat: Heartbeat,
     ) -> None:
-        self.site = f"server_{place.server}"
+        self.site = place.site
         self._place = place
         self._clock = clock
         self._cpu = cpu
