@@ -368,8 +368,7 @@ class Offloader:
         return self._end(pending, self._runs.execute(pending))
 
     def _end(self, pending: PendingTask, executions: tuple[Execution, ...]) -> tuple[Execution, Record]:
-        task = pending.task
-        answer = answer_of(executions, task.kind)
+        task, answer = pending.task, answer_of(executions, pending.task.kind)
         with self._lock:
             self._runs.learn(pending, executions)
             if not self._life.closed and self._memories.due(self._clock.now_s()):

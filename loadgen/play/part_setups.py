@@ -26,7 +26,7 @@ def setups(scenario: Scenario, out: Path, *, shown: bool = True) -> dict[str, Se
     parts = {}
     for n, cloud in enumerate(scenario.servers):
         flags = {"executor": cloud.executor, "workers": cloud.workers, "tasks": module}
-        parts[cloud.name] = Setup(flags, cloud.cpus)
+        parts[cloud.name] = Setup(flags, cloud.cpus, site=cloud.site)
         relay, seed = relay_of(cloud.name), scenario.seed + n * ROBOT_SEED_STEP
         parts[relay] = Setup({**links[cloud.name], "seed": seed, "truth": link_file(out, relay)})
     for files in RobotFiles.of(scenario, out):

@@ -7,6 +7,7 @@ from offboard.common.config import REQUIRED, check, setting
 from offboard.common.errors import ConfigError
 from offboard.common.planning.planner_names import DIJKSTRA, PLANNERS
 from offboard.common.security.address import address
+from offboard.common.variants import IN_GROUP
 from offboard.loadgen.robot.decision_settings import DecisionSettings
 from offboard.loadgen.robot.run_settings import RunSettings
 from offboard.loadgen.robot.workload import CLOSED, SIZES_ALLOWED, parse_sizes
@@ -28,7 +29,8 @@ class ServerSettings:
     )
     site: tuple[str, ...] = setting(
         (),
-        "a further server, with a name; ws:// or wss:// is a policy server; repeat the flag for more",
+        "a further server, with a name; ws:// or wss:// is a policy server; GROUP/NAME are equal servers; "
+        "repeat the flag for more",
         group=SERVERS,
         rare=True,
         metavar="NAME=ENDPOINT",
@@ -77,8 +79,10 @@ class ServerSettings:
         found: dict[str, str] = {}
         for entry in self.site:
             name, equals, endpoint = entry.partition("=")
-            if not (equals and name.isidentifier()):
-                raise ConfigError(f"--site: {entry!r} is not NAME=tcp://HOST:PORT or NAME=ws://HOST:PORT")
+            parts = name.split(IN_GROUP)
+            if not (equals and len(parts) <= 2 and all(part.isidentifier() for part in parts)):
+                allowed = "NAME=tcp://HOST:PORT or NAME=ws://HOST:PORT, where NAME may be GROUP/NAME"
+                raise ConfigError(f"--site: {entry!r} is not {allowed}")
             if name in (ONBOARD, CLOUD, *found):
                 raise ConfigError(f"--site: {entry!r}: the name {name!r} is already taken")
             check_site(f"--site {name}", endpoint, insecure=self.insecure)

@@ -11,6 +11,7 @@ from typing import Any
 from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError
 from offboard.common.planning.planner_names import DIJKSTRA, PLANNERS
+from offboard.common.variants import IN_GROUP
 from offboard.loadgen import rivals
 from offboard.loadgen.relay.link.link_settings import LinkFlags
 from offboard.loadgen.robot.config import CallConfig, DriveConfig, RobotConfig
@@ -139,6 +140,7 @@ class CloudPart:
     """
 
     name: str = setting(CLOUD, "name of the server and of its site; one server is named cloud")
+    group: str | None = setting(None, "group of equal servers; what is learnt of one holds for the others")
     cpus: float = setting(1.0, "CPU quota, in CPUs", minimum=CPUS_MIN, maximum=CPUS_MAX)
     executor: str = setting("threads", "kind of workers", choices=("threads", "processes"))
     workers: int = setting(1, "number of tasks that run at the same time", minimum=1)
@@ -149,6 +151,17 @@ class CloudPart:
         if not self.name.isidentifier() or self.name in (ONBOARD, BOTH, WAN, ROBOT):
             taken = f"other than {ONBOARD}, {BOTH}, {WAN} and {ROBOT}"
             raise ConfigError(f"cloud.name: {self.name!r} is not a name of letters, digits and _, {taken}")
+        if self.group is not None and not self.group.isidentifier():
+            raise ConfigError(f"cloud.group: {self.group!r} is not a name of letters, digits and _")
+        if self.group is not None and self.name == CLOUD and self.group != CLOUD:
+            raise ConfigError(
+                f"cloud.group: {self.group!r}: the server {CLOUD} can only be in the group {CLOUD}"
+            )
+
+    @property
+    def site(self) -> str:
+        """The name of its site: NAME, or GROUP/NAME; robots know the server `cloud` by this name alone."""
+        return self.name if self.group is None or self.name == CLOUD else f"{self.group}{IN_GROUP}{self.name}"
 
 
 @dataclass(frozen=True)
@@ -182,7 +195,7 @@ class Scenario:
 
     def sites(self) -> tuple[str, ...]:
         """The sites of each robot."""
-        return (ONBOARD, *(server.name for server in self.servers))
+        return (ONBOARD, *(server.site for server in self.servers))
 
     def links(self) -> dict[str, Mapping[str, Any]]:
         """The conditions of the link to each server."""

@@ -62,7 +62,11 @@ def read_scenario(path: Path) -> Scenario:
         link=link,
         events=parse_events(table, path, parts=parts_of(list(links), workload), links=links),
         checks=parse_checks(
-            table, path, tasks=workload.tasks, known=workload.known(), sites=(ONBOARD, *links)
+            table,
+            path,
+            tasks=workload.tasks,
+            known=workload.known(),
+            sites=(ONBOARD, *(one.site for one in servers)),
         ),
         chaos=_chaos(table, workload, path, servers=len(servers)),
     )

@@ -52,13 +52,16 @@ class SimulatedTestbed:
         self.onboard = SimulatedOnboard(clock, self._cpu, self.costs)
         self.clouds: dict[str, SimulatedCloud] = {}
         self._oracles: dict[str, Oracle] = {}
-        for n, (name, server) in enumerate(self._servers.items()):
+        self._sites: dict[str, str] = {}  # of each server
+        for n, part in enumerate(scenario.servers):
+            name, server = part.name, self._servers[part.name]
+            self._sites[name] = part.site
             self.clouds[name] = SimulatedCloud(
                 clock,
                 server,
                 self._cpu,
                 self.costs,
-                site=name,
+                site=part.site,
                 link=self._links[name],
                 seed=seed + n * ROBOT_SEED_STEP,
                 heartbeat_s=heartbeat_s,
@@ -107,7 +110,7 @@ class SimulatedTestbed:
                     one for other in self._others.values() if (one := other.coming_to(name)) is not None
                 ]
                 seconds = oracle.cloud_s(number, coming=coming)
-                found[name] = math.inf if seconds is None else seconds
+                found[self._sites[name]] = math.inf if seconds is None else seconds
         return found
 
     def happen(self, event: Event) -> None:

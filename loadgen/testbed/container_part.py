@@ -5,7 +5,7 @@
 
 import os
 import signal
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -88,16 +88,16 @@ KINDS: Mapping[str, Kind] = {
 }
 
 
-def addresses(part: str, parts: Iterable[str]) -> dict[str, str]:
+def addresses(part: str, setups: Mapping[str, Setup]) -> dict[str, str]:
     """The flags with which a part finds the others of these parts."""
-    servers = servers_among(parts)
+    servers = servers_among(setups)
     if kind_of(part) == WAN:
         return {"to": f"{next(one for one in servers if relay_of(one) == part)}:5555"}
     if kind_of(part) == CLOUD:
         return {}
     ways = {server: f"tcp://{relay_of(server)}:5555" for server in servers}
     first = ways.pop(CLOUD)
-    further = ",".join(f"{server}={endpoint}" for server, endpoint in ways.items())
+    further = ",".join(f"{setups[server].site or server}={endpoint}" for server, endpoint in ways.items())
     return {"cloud": first, **({"site": further} if further else {})}
 
 

@@ -94,7 +94,9 @@ class LocalTestbed:
             self._add(server, setups, commands, flags, ready="/ready")
             flags = {"listen": at.relay, "to": at.server, "http": at.relay_http}
             self._add(relay_of(server), setups, commands, flags, ready="/health")
-        sites = ",".join(f"{name}=tcp://{at.relay}" for name, at in listens.items() if name != CLOUD)
+        sites = ",".join(
+            f"{setups[name].site or name}=tcp://{at.relay}" for name, at in listens.items() if name != CLOUD
+        )
         flags = {"cloud": self.endpoint, **({"site": sites} if sites else {})}
         for name in setups:
             if kind_of(name) == ROBOT:

@@ -43,6 +43,7 @@ class Setup:
     made visible to the part: writable if it is in the folder of the run, else read-only, with its whole
     folder.
     `cpus` is the CPU quota; None: no quota.
+    `site` is the name of a server's site, if it is not that of the part.
     The output of a `shown` part goes to our own output, the output of other parts to logs/NAME.log.
     """
 
@@ -50,6 +51,7 @@ class Setup:
     cpus: float | None = None
     shown: bool = False
     command: str = ""
+    site: str = ""
 
 
 @dataclass(frozen=True, slots=True)
