@@ -20,6 +20,7 @@ import numpy as np
 from benchmarks.measure import Requirement, Table
 from benchmarks.servers import READY_S, cloud_server, running
 from benchmarks.tasks import ONBOARD_FACTOR, hash_near_or_far
+from offboard.loadgen.fleet.fleet_robot import server_of
 from offboard.loadgen.fleet.fleet_run import SPREAD, make_tasks, run_fleet
 from offboard.loadgen.fleet.fleet_settings import FleetConfig
 from offboard.loadgen.progress import progress
@@ -72,7 +73,7 @@ def _simulated() -> list[Done]:
     with progress("simulating", ROBOTS * TASKS) as shown:
         fleet = run_fleet(config, size, tasks, jobs=1, shown=shown)
     return [
-        (one.waited_s, ONBOARD if one.server < 0 else f"server_{one.server}", one.runs)
+        (one.waited_s, ONBOARD if one.server < 0 else server_of(one.server).site, one.runs)
         for robot in fleet.done
         for one in robot
     ]
@@ -89,7 +90,7 @@ def _row(name: str, done: Sequence[Done]) -> list[str]:
 
 
 def run_robots(first: int, count: int, endpoints: Sequence[str]) -> None:
-    sites = {f"server_{n}": endpoint for n, endpoint in enumerate(endpoints)}
+    sites = {server_of(n).site: endpoint for n, endpoint in enumerate(endpoints)}
     done: list[Done] = []
     with contextlib.ExitStack() as stack:
         robots = [
