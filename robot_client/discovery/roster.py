@@ -79,7 +79,8 @@ class Roster:
             self._random.shuffle(members)
             members.sort(key=lambda site: site in self.in_use)  # one that was just left comes last
             room = [site for site in members if site not in kept][: max(0, self._known - len(stay))]
-            in_use |= {site: listed[site] for site in sorted(stay + room)}
+            # In a random order: the first of several equal servers gets the task.
+            in_use |= {site: listed[site] for site in stay + room}
         self.in_use = in_use
 
 
