@@ -38,7 +38,7 @@ def run_fleets(config: FleetConfig) -> int:
             fleet = run_fleet(config, size, tasks, jobs=jobs, shown=shown)
         lines.append(line_of(fleet, config.start_s, time.monotonic() - began_s))
         shares.append(_shares(fleet))
-    table = Table(CAPTION, {"command": "fleet"}, HEADINGS, lines, NOTES)
+    table = Table(CAPTION, {"command": "fleet"}, HEADINGS, lines, notes=NOTES)
     print(config.text([table], config.format), end="")
     _write(config.out, config, lines, shares)
     return 0

@@ -66,41 +66,51 @@ class FleetNoise(Noise):
         return self._of_task[task % NOISES] * self._of_site[place % NOISES]
 
 
+@dataclass(frozen=True, slots=True)
+class Common:
+    """What all robots of a fleet have in common.
+
+    - `noise`: on the costs of the tasks. `listed`: the servers of the fleet, of which each robot uses a few.
+    - `period_s`: the mean time from task to task.
+    """
+
+    config: FleetConfig
+    tasks: RobotTasks
+    noise: Noise
+    listed: Sequence[Server]
+    period_s: float
+
+
 class FleetRobot:
     """Asks for its tasks one after the other: each is due some time after the last one, or when that ends.
 
-    - `noise`: on the costs of its tasks. `listed`: the servers of the fleet, of which it uses a few.
-    - `period_s`: the mean time from task to task.
-    - `post`: sends a message to the servers. `answered` is called after each task.
+    `post` sends a message to the servers. `answered` is called after each task.
     """
 
     def __init__(
         self,
         number: int,
-        config: FleetConfig,
+        common: Common,
         clock: VirtualClock,
-        tasks: RobotTasks,
         *,
-        noise: Noise,
-        listed: Sequence[Server],
-        period_s: float,
         post: Callable[[ToServer], object],
         answered: Callable[[], object],
     ) -> None:
+        config = common.config
         seed = config.seed + number * ROBOT_SEED_STEP
         self.done: list[Done] = []
         self.ended = False
         self._number = number
         self._config = config
         self._clock = clock
-        self._period_s = period_s
+        self._period_s = common.period_s
         self._post = post
         self._answered = answered
         self._random = Random(seed)
         self._cpu = SimulatedCpu(clock, config.robot_cpus)
         self._first = self._random.randrange(FIRST_MAX)  # so that robots have other tasks and other noise
-        self._costs = TrueCosts(tasks, noise)
-        self._listed, self._seed = listed, seed
+        self._costs = TrueCosts(common.tasks, common.noise)
+        self._listed, self._seed = common.listed, seed
         self._sites: dict[int, FleetSite] = {}  # every server that it has ever used, by number
         self._present: PresentSites
         self._walker = Walker(clock, self._life())
@@ -149,7 +159,9 @@ class FleetRobot:
         cpu_s = deciding_s + sending_s + costs.seconds(CLOUD, task)
         arrives_s = now_s + sending_s / 2 + delay_s
         ways = tuple(number_of(site) for site in self._present if site != ONBOARD)
-        ask = ToServer(arrives_s, ASK, self._number, -1, number, cpu_s=cpu_s, limit_s=onboard_s, ways=ways)
+        ask = ToServer(
+            arrives_s, ASK, self._number, -1, number=number, cpu_s=cpu_s, limit_s=onboard_s, ways=ways
+        )
         self._post(ask)
 
     def _connect(self) -> SteppedOffloader:

@@ -62,7 +62,7 @@ def run_fleet(
     try:
         for job in range(jobs):
             mine = range(job, size.robots, jobs)
-            settings = ShardSettings(config, tasks, mine, size.servers, period_s)
+            settings = ShardSettings(config, tasks, mine, size.servers, period_s=period_s)
             shards.append(Shard(settings) if jobs == 1 else ShardProcess(settings))
         _play(shards, servers, size.robots * config.tasks, delay_s, shown=shown)
         found = {number: done for shard in shards for number, done in shard.done().items()}

@@ -132,7 +132,7 @@ class Servers:
         server = self._servers[index]
         if sort == BEAT:
             queue = server.queue(now_s)
-            return [ToRobot(now_s + self._delay_s, robot, index, BEAT_REPLY, number, queue)]
+            return [ToRobot(now_s + self._delay_s, robot, index, BEAT_REPLY, number=number, queue=queue)]
         if sort == CANCEL:
             for end_s, run in server.cancel(robot, number, now_s):
                 self._plan_end(end_s, index, run)
@@ -142,7 +142,9 @@ class Servers:
         return []
 
     def _plan_end(self, end_s: float, index: int, run: Run) -> None:
-        heapq.heappush(self._events, (ToServer(end_s, ENDS, run.robot, index, run.number), run.life, run))
+        heapq.heappush(
+            self._events, (ToServer(end_s, ENDS, run.robot, index, number=run.number), run.life, run)
+        )
 
     def _end(self, message: ToServer, run: Run) -> ToRobot:
         now_s, server = message.arrives_s, self._servers[message.server]
@@ -152,8 +154,8 @@ class Servers:
             run.robot,
             message.server,
             REPLY,
-            run.number,
-            server.queue(now_s),
+            number=run.number,
+            queue=server.queue(now_s),
             queue_s=run.begins_s - run.added_s,
             run_s=run.cpu_s,
         )

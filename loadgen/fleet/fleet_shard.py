@@ -15,10 +15,9 @@ from typing import Any, Protocol
 
 from offboard.common.errors import OffloadError
 from offboard.loadgen.fleet.fleet_messages import ToRobot, ToServer
-from offboard.loadgen.fleet.fleet_robot import Done, FleetNoise, FleetRobot, server_of
+from offboard.loadgen.fleet.fleet_robot import Common, Done, FleetNoise, FleetRobot, server_of
 from offboard.loadgen.fleet.fleet_settings import FleetConfig
 from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks
-from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
 
 ANSWER_S = 600.0  # longest wait for a process; a window takes milliseconds
 END_S = 5.0
@@ -56,23 +55,18 @@ class Shard:
         logging.disable(logging.WARNING)
         # Millions of objects that live on are looked through again and again otherwise; none are in circles.
         gc.disable()
-        noise = FleetNoise(settings.config.seed)
-        listed = [server_of(number) for number in range(settings.servers)]
         self._clock = VirtualClock()
         self._sent: list[ToServer] = []
         self._answered = 0
+        common = Common(
+            settings.config,
+            settings.tasks,
+            noise=FleetNoise(settings.config.seed),
+            listed=[server_of(number) for number in range(settings.servers)],
+            period_s=settings.period_s,
+        )
         self._robots = {
-            number: FleetRobot(
-                number,
-                settings.config,
-                self._clock,
-                settings.tasks,
-                noise=noise,
-                listed=listed,
-                period_s=settings.period_s,
-                post=self._post,
-                answered=self._count,
-            )
+            number: FleetRobot(number, common, self._clock, post=self._post, answered=self._count)
             for number in settings.robots
         }
         for robot in self._robots.values():

@@ -148,4 +148,4 @@ class FleetSite:
     ) -> None:
         robot, server, delay_s = self._place.robot, self._place.server, self._place.delay_s
         arrives_s = self._clock.now_s() + after_s + delay_s
-        self._post(ToServer(arrives_s, sort, robot, server, number, cpu_s=cpu_s, limit_s=limit_s))
+        self._post(ToServer(arrives_s, sort, robot, server, number=number, cpu_s=cpu_s, limit_s=limit_s))

@@ -1,7 +1,7 @@
 """The simulated testbed: the computers and links of a scenario, and what its events do to them."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from offboard.common.errors import ConfigError
@@ -116,11 +116,11 @@ class SimulatedTestbed:
     def happen(self, event: Event) -> None:
         match event.action:
             case "link":
-                self._set_link(event.value, self._links if event.on is None else [event.on])
+                self._set_link(event.value, self._changed(event))
             case "cut" | "join":  # as on loopback, where all traffic passes the relays
                 self._set_link({"outage": event.action == "cut"}, servers_behind(event.value, self._links))
             case "reset":
-                for name in self._links if event.on is None else [event.on]:
+                for name in self._changed(event):
                     for connection in self._connections(name):
                         connection.lose()
             case "cpus":
@@ -133,6 +133,10 @@ class SimulatedTestbed:
                 self._happen_to_server(self._servers[event.value], action)
             case action:
                 self._happen_to_robot(self._others[event.value], action)
+
+    def _changed(self, event: Event) -> Sequence[str]:
+        """The servers whose links an event changes."""
+        return tuple(self._links) if event.on is None else (event.on,)
 
     def _connections(self, server: str) -> list[SimulatedConnection]:
         """The connections of all robots to a server."""

@@ -3,7 +3,7 @@
 The sites are chosen in `policies`; what comes of the runs is learnt in `learning`.
 """
 
-from collections.abc import Callable, Collection, Generator, Mapping
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -15,7 +15,7 @@ from offboard.robot_client.sites.clock import Clock
 from offboard.robot_client.sites.onboard import OnboardAnswer
 from offboard.robot_client.sites.runner import ONBOARD, Execution, Runner
 
-Wait: TypeAlias = tuple[Collection[Future[Any]], float | None]  # for one to be done, in seconds
+Wait: TypeAlias = tuple[Sequence[Future[Any]], float | None]  # for one to be done, in seconds
 Steps: TypeAlias = Generator[Wait, None, tuple[Execution, ...]]
 
 

@@ -91,11 +91,11 @@ def test_both_testbeds_give_robots_and_relays_the_addresses_of_all_servers(
     [
         ('[[cloud]]\nname = "edge"', "", "cloud, edge, edge: each name once, and cloud among them"),
         ('[[cloud]]\nname = "robot"', "", "cloud.name: 'robot' is not a name of letters, digits and _"),
-        ("", 'grupo = "a"', "two.toml:13: unknown key 'grupo'; did you mean 'group'?"),
+        ("", 'grupo = "a"', "two.toml:14: unknown key 'grupo'; did you mean 'group'?"),
         (
             "[[event]]\nat_task = 1\non = 'fog'\nreset = true",
             "",
-            ":17: on: 'fog' is not one of cloud",
+            ":18: on: 'fog' is not one of cloud",
         ),
         ("[[event]]\nat_task = 1\non = 'edge'\nkill = 'edge'", "", "only an event with link or reset"),
         ("[[check]]\nfigure = 'cloud_percent'\nsite = 'fog'\nat_most = 1", "", "'fog' is not one of onboard"),
