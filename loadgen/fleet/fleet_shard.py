@@ -3,6 +3,7 @@
 Between two windows, the robots and the servers exchange their messages.
 """
 
+import contextlib
 import gc
 import logging
 import multiprocessing
@@ -18,6 +19,7 @@ from offboard.loadgen.fleet.fleet_messages import ToRobot, ToServer
 from offboard.loadgen.fleet.fleet_robot import Common, Done, FleetNoise, FleetRobot, server_of
 from offboard.loadgen.fleet.fleet_settings import FleetConfig
 from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks
+from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
 
 ANSWER_S = 600.0  # longest wait for a process; a window takes milliseconds
 END_S = 5.0
@@ -108,7 +110,8 @@ class ShardProcess:
         theirs.close()
 
     def begin(self, messages: Sequence[ToRobot], until_s: float) -> None:
-        self._pipe.send((messages, until_s))
+        with contextlib.suppress(OSError):  # the process has ended: `end` says so
+            self._pipe.send((messages, until_s))
 
     def end(self) -> tuple[list[ToServer], int]:
         found: tuple[list[ToServer], int] = self._answer()
@@ -126,12 +129,10 @@ class ShardProcess:
             self._process.kill()
 
     def _answer(self) -> Any:
-        try:
+        with contextlib.suppress(EOFError, OSError):
             if self._pipe.poll(ANSWER_S):
                 return self._pipe.recv()
-        except EOFError:
-            pass
-        raise OffloadError(f"a process of the fleet ended, or took over {ANSWER_S:g} s for one window")
+        raise OffloadError(f"a process of the fleet ended, or took over {ANSWER_S:g} s for a window")
 
 
 def _serve(pipe: Connection, settings: ShardSettings) -> None:
