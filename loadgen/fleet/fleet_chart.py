@@ -28,6 +28,7 @@ def _paint(figure: Figure, lines: Sequence[FleetLine]) -> None:
         (shares, least, [line.idlest for line in lines], "idlest"),
     ):
         axes.plot(robots, values, color=look.colour, linestyle=look.line, marker="o", gid=gid)
+    for axes in (times, regret, shares):  # only now: the upper end must be above all lines
         axes.set_ylim(bottom=0)
     times.set_ylabel("time (ms)")
     regret.set_ylabel("regret (ms)")
