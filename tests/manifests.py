@@ -1,4 +1,4 @@
-"""The Kubernetes manifests of deploy/, and the `docker run` that starts a container of their pod in the same way.
+"""The Kubernetes manifests of deploy/, and the `docker run` that starts a container as their pod would.
 
 A field of the manifest that is not translated here is an error, so that none is left out by mistake.
 """
@@ -69,7 +69,7 @@ class Pod:
         return found
 
     def docker_run(self, container: Mapping[str, Any], volumes: Mapping[str, str]) -> list[str]:
-        """The arguments of `docker run` behind its own options; `volumes`: the Docker volume of each volume."""
+        """The last arguments of `docker run`; `volumes`: the Docker volume of each volume."""
         unknown = set(container) - AROUND - TRANSLATED
         assert not unknown, f"not translated: {unknown}"
         assert container["securityContext"] == CONTAINED

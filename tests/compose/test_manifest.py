@@ -22,6 +22,7 @@ from offboard.common.planning.map_files import read_map
 from offboard.common.planning.maps import free_pairs, resampled
 from offboard.common.planning.planner import RADIUS_M, Plan, Point, Pose, plan_path
 from offboard.common.security.keys import make_keys
+from offboard.robot_client.records.trace import Record
 from tests.compose.conftest import ROOT, docker
 from tests.manifests import Pod
 from tests.prometheus import until
@@ -115,7 +116,7 @@ def test_it_answers_plans_of_a_robot_with_a_key(server: Running) -> None:
 
 
 def test_it_takes_in_a_robot_of_a_changed_config_map(server: Running, volumes: dict[str, str]) -> None:
-    """When the kubelet replaces the files of the ConfigMap, the server knows the new robot without a restart."""
+    """The kubelet replaces the files of the ConfigMap; the server knows the new robot without a restart."""
     make_robot(server.folder, "arm-2")
     keys = {f"{name}.key": server.folder / name / "robot.key" for name in ("arm-1", "arm-2")}
     project(volumes["robots"], server.pod, keys, "0644")
@@ -126,7 +127,7 @@ def test_it_takes_in_a_robot_of_a_changed_config_map(server: Running, volumes: d
 
 
 def test_it_drains_within_the_grace_period(server: Running) -> None:
-    """SIGTERM makes it unready; it answers what it has accepted, and ends with 0 before the kubelet would kill it."""
+    """After SIGTERM it answers what it has accepted, and ends with 0 before the kubelet would kill it."""
     grace_s, token = server.pod.spec["terminationGracePeriodSeconds"], (server.folder / "token").read_text()
     used: list[str | None] = []
     arguments = plans(WAITING)
@@ -199,7 +200,7 @@ def read(url: str, token: str) -> str:
 
 
 def project(volume: str, pod: Pod, files: Mapping[str, Path], mode: str) -> None:
-    """Put files into a volume as the kubelet does: in a new folder, behind a link that is replaced at once."""
+    """Put files into a volume as the kubelet does: in a new folder, behind a link that is replaced."""
     data = io.BytesIO()
     with tarfile.open(fileobj=data, mode="w") as archive:
         for name, path in files.items():
@@ -216,13 +217,9 @@ def project(volume: str, pod: Pod, files: Mapping[str, Path], mode: str) -> None
 
 def as_root(volume: str, script: str, data: bytes = b"") -> None:
     """Run a shell script with the volume at /volume."""
-    command = [
-        *"docker run --rm --interactive --network none --user 0".split(),
-        "--volume",
-        f"{volume}:/volume",
-    ]
+    options = ("--rm", "--interactive", "--network", "none", "--user", "0", "--volume", f"{volume}:/volume")
     done = subprocess.run(
-        [*command, "--entrypoint", "sh", "offboard-cloud", "-euc", script],
+        ["docker", "run", *options, "--entrypoint", "sh", "offboard-cloud", "-euc", script],
         input=data,
         capture_output=True,
         timeout=60,

@@ -142,7 +142,7 @@ def test_a_misspelt_line_of_a_unit_is_noticed(tmp_path: Path) -> None:
 
 
 def test_the_server_accepts_the_settings_of_its_unit() -> None:
-    """The variables of the unit are settings of the server, and systemd waits longer than the server drains."""
+    """The variables of the unit are settings of the server, and it drains sooner than systemd kills it."""
     unit = (UNITS / SERVICES[0]).read_text()
     lines = re.findall(r"^Environment=(.*)$", unit, re.MULTILINE)
     environ = dict(pair.split("=", 1) for line in lines for pair in line.split())

@@ -1,0 +1,106 @@
+"""`python -m benchmarks.capacity FILE`: measures what one server carries, and writes the figures as JSON.
+
+Real robots (`loadgen drive`) ask a real `cloud-server` for plans at random instants, at several rates. What the
+figures mean in servers and money is in `cost_per_task`.
+"""
+
+import argparse
+import json
+import os
+import re
+import statistics
+import subprocess
+import sys
+import tempfile
+import urllib.request
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from benchmarks.measure import processor
+from benchmarks.servers import Server, cloud_server
+from offboard.loadgen.robot_files import read_trace
+
+MAP = Path(__file__).parents[1] / "maps" / "willow-full-0.05.yaml"
+ROBOTS = 4  # processes that share a rate
+TIMEOUT_S = 5.0  # then a robot plans onboard
+STARTED_S = 120.0  # a robot may take longer than its tasks by this much
+TICKS = os.sysconf("SC_CLK_TCK")
+SENT, RECEIVED = "offboard_server_sent_bytes_total", "offboard_server_received_bytes_total"
+REQUESTS = "offboard_server_requests_total"
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One rate: tasks asked for and answered by the server per second, waits of the robots, cost of a task."""
+
+    asked_a_s: float
+    answered_a_s: float
+    by_server: float
+    p50_ms: float
+    p95_ms: float
+    cpu_s: float
+    bytes_to_server: float
+    bytes_to_robot: float
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.capacity", description=__doc__)
+    parser.add_argument("file", type=Path, metavar="FILE")
+    parser.add_argument("--rates", default="10,20,30,40,50,60", help="tasks per second (default: %(default)s)")
+    parser.add_argument("--seconds", type=float, default=20.0, help="of one rate (default: %(default)s)")
+    parser.add_argument("--resolution", default="0.025", help="of the map, in metres (default: %(default)s)")
+    parser.add_argument("--workers", type=int, default=os.cpu_count(), help="of the server (default: all CPUs)")
+    chosen = parser.parse_args()
+    steps = []
+    with cloud_server(
+        "offboard.common.planning.planner", CLOUD_WORKERS=str(chosen.workers), CLOUD_ROBOT_MIB_S="64"
+    ) as server:
+        before = memory_mib(server, "VmRSS")
+        for rate in map(float, chosen.rates.split(",")):
+            step = measure(server, rate, seconds=chosen.seconds, resolution=chosen.resolution)
+            print(step, flush=True)
+            steps.append(asdict(step))
+        figures = {
+            "measured": f"{datetime.now(UTC):%Y-%m-%d}, commit {commit()}",
+            "machine": f"{processor()}, {os.cpu_count()} cores, shared by server and {ROBOTS} robots",
+            "task": f"plan_path on {MAP.stem} at {chosen.resolution} m",
+            "workers": chosen.workers,
+            "memory_idle_mib": before,
+            "memory_peak_mib": memory_mib(server, "VmHWM"),
+            "steps": steps,
+        }
+    chosen.file.write_text(json.dumps(figures, indent=1) + "\n")
+
+
+def measure(server: Server, rate: float, *, seconds: float, resolution: str) -> Step:
+    """Let robots ask for tasks at random instants, `rate` per second together."""
+    tasks = max(2, round(rate * seconds / ROBOTS))
+    before, cpu_s = counters(server), cpu_seconds(server)
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        traces = [Path(folder) / f"{number}.jsonl" for number in range(ROBOTS)]
+        robots = [
+            stack.enter_context(drive(server, trace, seed, rate=rate, tasks=tasks, resolution=resolution))
+            for seed, trace in enumerate(traces, 1)
+        ]
+        for robot in robots:
+            if robot.wait(seconds + STARTED_S):
+                raise RuntimeError(f"a robot ended with exit code {robot.returncode}")
+        records = [list(read_trace(trace)) for trace in traces]
+    used = {name: value - before[name] for name, value in counters(server).items()}
+    flat = [record for each in records for record in each]
+    waits = [record["waited_s"] * 1e3 for record in flat]
+    by_server = sum(record["used"] == "cloud" for record in flat)
+    spans = [span_s(each) for each in records]
+    cuts = statistics.quantiles(waits, n=20)
+    return Step(
+        asked_a_s=round(sum((len(each) - 1) / span for each, span in zip(records, spans, strict=True)), 2),
+        answered_a_s=round(by_server / max(spans), 2),
+        by_server=round(by_server / len(flat), 4),
+        p50_ms=round(cuts[9], 1),
+        p95_ms=round(cuts[18], 1),
+        cpu_s=round((cpu_seconds(server) - cpu_s) / used[REQUESTS], 5),
+        bytes_to_server=round(statistics.fmean(bytes_of(flat, "bytes_out"))),
+        bytes_to_robot=round(statistics.fmean(bytes_of(flat, "bytes_in"))),
+    )
