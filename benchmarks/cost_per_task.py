@@ -1,6 +1,7 @@
 """`python -m benchmarks.cost_per_task FILE`: servers, bytes and money for a fleet.
 
-FILE holds figures that `python -m benchmarks.capacity` has measured. All prices are yours: this file knows none. The currency is that of your prices.
+FILE holds figures that `python -m benchmarks.capacity` has measured. All prices are yours: this program knows
+none. The currency is that of your prices.
 """
 
 import argparse

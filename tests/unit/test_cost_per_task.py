@@ -34,7 +34,7 @@ def test_servers_and_money_follow_from_figures_and_prices(
     """The highest rate that is fast enough counts; servers are rounded up, and one is spare."""
     assert main([str(figures), *PRICES, "--p95-ms", "100", "--rate", "0.5", "--robots", "100"]) == 0
     (found,) = rows(capsys.readouterr().out)[-1:]
-    # 50 tasks/s at 20 of a server: 3 and 1 spare; 180,000 tasks/h with 20 kB each, of which 18 kB leave the cloud.
+    # 50 tasks/s at 20 a server: 3 and 1 spare; 180,000 tasks/h of 20 kB each, of which 18 kB leave the cloud.
     money = [4 * 0.5, 3.24 * 0.25, 3.6 * 2]
     expected = [100, 50, 4, 3.6, *money, sum(money), sum(money) / 0.18]
     assert [float(cell) for cell in found] == pytest.approx(expected, rel=1e-3)
