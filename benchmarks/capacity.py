@@ -8,10 +8,12 @@ import argparse
 import json
 import os
 import re
+import resource
 import statistics
 import subprocess
 import sys
 import tempfile
+import time
 import urllib.request
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
@@ -33,7 +35,11 @@ OK = re.compile(r'^offboard_server_requests_total{kind="plan_path",status="ok"} 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One rate: tasks that robots asked for and the server answered, waits of robots, and cost of a task."""
+    """One rate: tasks that robots asked for and the server answered, waits of robots, and cost of a task.
+
+    `cpu_s` is the server's for one task; `robots_cpus` and `others_cpus` are the CPUs that the robots and all
+    other programs of the machine used meanwhile.
+    """
 
     asked_a_s: float
     answered_a_s: float
@@ -41,6 +47,8 @@ class Step:
     p50_ms: float
     p95_ms: float
     cpu_s: float
+    robots_cpus: float
+    others_cpus: float
     bytes_to_server: float
     bytes_to_robot: float
 
@@ -81,7 +89,8 @@ def main() -> None:
 def measure(server: Server, rate: float, *, seconds: float, resolution: str) -> Step:
     """Let robots ask for tasks at random instants, `rate` per second together."""
     tasks = max(2, round(rate * seconds / ROBOTS))
-    plans, cpu_s = answered(server), cpu_seconds(server)
+    plans, cpu_s, robots_s, busy_s = answered(server), cpu_seconds(server), children_s(), machine_s()
+    began = time.monotonic()
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         traces = [Path(folder) / f"{number}.jsonl" for number in range(ROBOTS)]
         robots = [
@@ -92,7 +101,10 @@ def measure(server: Server, rate: float, *, seconds: float, resolution: str) -> 
             if robot.wait(seconds + STARTED_S):
                 raise RuntimeError(f"a robot ended with exit code {robot.returncode}")
         records = [list(read_trace(trace)) for trace in traces]
+    took_s = time.monotonic() - began
     plans, cpu_s = answered(server) - plans, cpu_seconds(server) - cpu_s
+    robots_s = children_s() - robots_s
+    others_s = machine_s() - busy_s - robots_s - cpu_s
     flat = [record for each in records for record in each]
     waits = [record["waited_s"] * 1e3 for record in flat]
     by_server = sum(record["used"] == "cloud" for record in flat)
@@ -104,6 +116,8 @@ def measure(server: Server, rate: float, *, seconds: float, resolution: str) -> 
         p50_ms=round(cuts[9], 1),
         p95_ms=round(cuts[18], 1),
         cpu_s=round(cpu_s / plans, 5),
+        robots_cpus=round(robots_s / took_s, 2),
+        others_cpus=round(max(0.0, others_s / took_s), 2),
         bytes_to_server=round(statistics.fmean(bytes_of(flat, "bytes_out"))),
         bytes_to_robot=round(statistics.fmean(bytes_of(flat, "bytes_in"))),
     )
@@ -154,6 +168,18 @@ def cpu_seconds(server: Server) -> float:
     """CPU time of the server so far."""
     after_name = Path(f"/proc/{server.pid}/stat").read_text().rpartition(")")[2].split()
     return (int(after_name[11]) + int(after_name[12])) / TICKS
+
+
+def children_s() -> float:
+    """CPU time of the robots that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def machine_s() -> float:
+    """CPU time that all programs of this machine have used: user, nice, system and interrupts."""
+    user, nice, system, _idle, _wait, *interrupts = map(int, Path("/proc/stat").read_text().split()[1:8])
+    return (user + nice + system + sum(interrupts)) / TICKS
 
 
 def memory_mib(server: Server, field: str) -> int:

@@ -72,6 +72,7 @@ def carried(steps: Sequence[dict[str, Any]]) -> Table:
             f"{step['p50_ms']:.0f}",
             f"{step['p95_ms']:.0f}",
             f"{step['cpu_s'] * 1e3:.1f}",
+            f"{step['robots_cpus'] + step['others_cpus']:.1f}",
             f"{step['bytes_to_server']:.0f}",
             f"{step['bytes_to_robot']:.0f}",
         ]

@@ -9,7 +9,15 @@ import pytest
 from benchmarks.cost_per_task import main
 
 PRICES = ("--server-hour", "0.5", "--gigabyte-out", "0.25", "--gigabyte-radio", "2")
-STEP = {"by_server": 1, "p50_ms": 20, "cpu_s": 0.02, "bytes_to_server": 2_000, "bytes_to_robot": 18_000}
+STEP = {
+    "by_server": 1,
+    "p50_ms": 20,
+    "cpu_s": 0.02,
+    "robots_cpus": 0.5,
+    "others_cpus": 0.1,
+    "bytes_to_server": 2_000,
+    "bytes_to_robot": 18_000,
+}
 
 
 def step(rate: float, p95_ms: float, **changed: float) -> dict[str, Any]:
