@@ -53,8 +53,10 @@ def volumes(engine: None) -> Iterator[dict[str, str]]:  # noqa: ARG001 - skips w
     docker("build", "--target", "cloud", "--tag", "offboard-cloud", ".")
     pod = Pod.read()
     names = {volume["name"]: f"{NAME}-{volume['name']}" for volume in pod.spec["volumes"]}
+    docker("rm", "--force", NAME)  # of a run that was killed
     with contextlib.ExitStack() as stack:
         for name in names.values():
+            docker("volume", "rm", "--force", name)
             docker("volume", "create", name)
             stack.callback(docker, "volume", "rm", "--force", name)
             as_root(name, f"chown 0:{pod.group} /volume && chmod 2777 /volume")
@@ -133,7 +135,7 @@ def test_it_drains_within_the_grace_period(server: Running) -> None:
     arguments = plans(WAITING)
     with connect(server, "arm-1", lambda record: used.append(record.used)) as offload:
         answers: list[Future[Plan]] = [offload.submit(plan_path, *one) for one in arguments]
-        until(lambda: json.loads(read(f"{server.http}/health", token))["running"], "plans run")
+        until(lambda: used or json.loads(read(f"{server.http}/health", token))["running"], "plans run")
         began = time.monotonic()
         docker("stop", "--time", str(grace_s), NAME)
         took_s = time.monotonic() - began

@@ -62,6 +62,7 @@ def run(engine: None) -> Iterator[Callable[..., str]]:  # noqa: ARG001 - skips w
         cwd=ROOT, input=DOCKERFILE, capture_output=True, text=True, timeout=600,
     )  # fmt: skip
     assert built.returncode == 0, built.stderr
+    docker("rm", "--force", NAME)  # of a run that was killed
     docker("run", "--detach", "--name", NAME, "--cgroupns", "private", "--tmpfs", "/run", *RIGHTS, IMAGE)
 
     def script(text: str, check: bool = True) -> str:
@@ -72,9 +73,7 @@ def run(engine: None) -> Iterator[Callable[..., str]]:  # noqa: ARG001 - skips w
 
     try:
         try:
-            until(
-                lambda: script("systemctl is-system-running", check=False) in STARTED, "systemd has started"
-            )
+            until(lambda: script("systemctl is-system-running", check=False) in STARTED, "systemd runs")
         except AssertionError:
             pytest.skip("systemd does not start in a container of this machine")
         yield script
