@@ -40,7 +40,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"{chosen.file}: no figures of `python -m benchmarks.capacity`: {error!r}")
     if step is None:
         parser.error(f"--p95-ms: no measured rate stays within {chosen.p95_ms:g} ms")
-    print(f"{figures['task']}; {figures['workers']} workers; {figures['measured']}; {figures['machine']}\n")
+    memory = f"{figures['memory_idle_mib']} MiB of memory at the start, {figures['memory_peak_mib']} at most"
+    print(f"{figures['task']}; {figures['workers']} workers; {memory};")
+    print(f"{figures['measured']}; {figures['machine']}\n")
     print(carried(figures["steps"]))
     print(fleet(step, chosen))
     return 0
@@ -55,14 +57,8 @@ def best_step(steps: Sequence[dict[str, Any]], p95_ms: float) -> dict[str, Any] 
 def carried(steps: Sequence[dict[str, Any]]) -> Table:
     """What was measured at each rate."""
     columns = (
-        "asked/s",
-        "answered/s",
-        "by the server",
-        "P50 ms",
-        "P95 ms",
-        "CPU ms",
-        "bytes up",
-        "bytes down",
+        *("asked/s", "answered/s", "by server", "P50 ms", "P95 ms"),
+        *("CPU ms", "other CPUs", "bytes up", "bytes down"),
     )
     rows = [
         [
