@@ -30,7 +30,9 @@ def step(rate: float, p95_ms: float, **changed: float) -> dict[str, Any]:
 def figures(tmp_path: Path) -> Path:
     path = tmp_path / "figures.json"
     steps = [step(10, 50), step(20, 90), step(30, 400), step(40, 80, by_server=0.9)]
-    path.write_text(json.dumps({"task": "t", "workers": 2, "measured": "m", "machine": "c", "steps": steps}))
+    texts = {"task": "t", "measured": "m", "machine": "c"}
+    memory = {"memory_idle_mib": 1, "memory_peak_mib": 2}
+    path.write_text(json.dumps({**texts, **memory, "workers": 2, "steps": steps}))
     return path
 
 
@@ -57,7 +59,7 @@ def test_the_page_shows_what_the_program_prints(capsys: pytest.CaptureFixture[st
     name, *flags = command.split()
     assert main([str(ROOT / "benchmarks" / name), *flags]) == 0
     printed = rows(capsys.readouterr().out)
-    assert all(len(row) == len(printed[0]) for row in printed)
+    assert {len(row) for row in printed} == {9}
     assert [row for row in printed if row not in rows(page)] == []
 
 
