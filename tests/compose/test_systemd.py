@@ -51,6 +51,33 @@ with Offloader.connect("tcp://127.0.0.1:5555", policy="cloud", **more) as offloa
     print(json.dumps({"missing": missing, "used": offload.last.used, "status": plan.status}))
     time.sleep(600)
 """
+# A task that shows whether its worker was left alone, and a robot that calls it.
+TASK = """
+import time
+from offboard import task
+
+@task("nap", size=lambda seconds: seconds)
+def nap(seconds: float) -> float:
+    time.sleep(seconds)
+    return seconds
+"""
+SLEEPER = """
+import json
+from naps import nap
+from offboard import Offloader
+
+keys = "/var/lib/offboard/robot-keys"
+with Offloader.connect("tcp://127.0.0.1:5555", policy="cloud", timeout_s=60, keys=keys) as offload:
+    assert offload.wait_for_sites(nap, 30) == {}
+    offload(nap, 6.0)
+    print(json.dumps({"used": offload.last.used}))
+"""
+RUNNING = """
+import json, urllib.request as u
+token = open("/var/lib/offboard/token").read().strip()
+asked = u.Request("http://127.0.0.1:8000/health", headers={"Authorization": "Bearer " + token})
+print(json.load(u.urlopen(asked, timeout=2))["running"])
+"""
 
 
 @pytest.fixture(scope="module")
@@ -118,15 +145,28 @@ def test_wrong_settings_are_not_tried_again(run: Callable[..., str]) -> None:
     run("systemctl restart offboard-cloud")
     until(lambda: run("systemctl is-failed offboard-cloud", check=False) == "failed", "it failed")
     assert shown(run, "ExecMainStatus", "NRestarts") == {"ExecMainStatus": "2", "NRestarts": "0"}
-    run("rm /etc/offboard/cloud.env; systemctl start offboard-cloud")
-    until(lambda: ready(run), "the server is ready")
 
 
 def test_stopping_drains_the_server(run: Callable[..., str]) -> None:
-    """`systemctl stop` ends the server with exit code 0, after the last answer."""
+    """`systemctl stop` lets a worker process finish its task, and the robot gets the answer."""
+    run(f"cd /opt/offboard/robot; cat > naps.py <<'END'\n{TASK}END\ncp naps.py /var/lib/offboard")
+    run(f"cat > /opt/offboard/robot/sleeper.py <<'END'\n{SLEEPER}END")
+    run("printf 'CLOUD_EXECUTOR=processes\nCLOUD_TASKS=naps\n' > /etc/offboard/cloud.env")
+    run("systemctl restart offboard-cloud")
+    until(lambda: ready(run), "the server is ready")
+    run("systemctl start offboard-robot@sleeper")
+    until(lambda: running(run), "the task runs")
     run("systemctl stop offboard-cloud")
     assert shown(run, "Result", "ExecMainStatus") == {"Result": "success", "ExecMainStatus": "0"}
     assert "every accepted request was answered" in run("journalctl --unit offboard-cloud --lines 20")
+    said = "journalctl --quiet --output cat --unit offboard-robot@sleeper --grep used"
+    until(lambda: run(said, check=False) != "", "the robot has its answer")
+    assert json.loads(run(said)) == {"used": "cloud"}
+
+
+def running(run: Callable[..., str]) -> bool:
+    """True while the server runs a task."""
+    return run(f"python3 -c '{RUNNING}'", check=False) == "1"
 
 
 def commands(heading: str) -> str:
