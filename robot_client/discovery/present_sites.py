@@ -87,8 +87,8 @@ class PresentSites(Mapping[str, Runner]):
                     del self._connected[site]
                     self._leaving.append((runner, self._clock_s() + LEAVING_MAX_S))
                     log.info("%s: %s is no longer used", site, server.endpoint)
-            for site in wanted.keys() - self._connected.keys():
-                self._open(wanted[site])
+            new = [wanted[site] for site in wanted.keys() - self._connected.keys()]
+            self._failed = {server for server in new if not self._open(server)}
             self.now = {one.site: one for one in self.staying} | {
                 site: self._connected[site][1] for site in wanted if site in self._connected
             }
@@ -109,8 +109,8 @@ class PresentSites(Mapping[str, Runner]):
         for runner in runners:
             runner.close()
 
-    def _open(self, server: Server) -> None:
-        """Connect to a server; one that cannot be connected to is left out, and the log says so once."""
+    def _open(self, server: Server) -> bool:
+        """Connect to a server, or say once in the log why that cannot be done; returns whether it was."""
         assert self._connect is not None, "only a roster with servers needs it"
         try:
             self._connected[server.site] = server, self._connect(server)
@@ -118,10 +118,9 @@ class PresentSites(Mapping[str, Runner]):
             if server not in self._failed:
                 said = "%s: %s; it is not used; remedy: correct its entry, or close other files"
                 log.warning(said, server.site, error)
-            self._failed.add(server)
-        else:
-            self._failed.discard(server)
-            log.info("%s: %s is used from now on", server.site, server.endpoint)
+            return False
+        log.info("%s: %s is used from now on", server.site, server.endpoint)
+        return True
 
     def _may_close(self, runner: Runner, until_s: float) -> bool:
         return not self.in_flight(runner.site) or self._clock_s() >= until_s
