@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from offboard.common.errors import ConfigError
-from offboard.common.security.keys import RobotKeys, checked_key, own_keys, robot_keys
+from offboard.common.security.keys import checked_key, robot_keys
 from offboard.common.variants import group_of
 from offboard.robot_client.discovery.dns_name import DnsName, is_dns
 from offboard.robot_client.discovery.following import Following, Source
@@ -26,7 +26,7 @@ from offboard.robot_client.sites import heartbeat
 from offboard.robot_client.sites.background import Background
 from offboard.robot_client.sites.cloud import CloudRunner
 from offboard.robot_client.sites.onboard import OnboardRunner
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Runner
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Runner, check_endpoint
 
 Sites = Mapping[str, str] | Path | str
 
@@ -86,6 +86,17 @@ def connect_sites(
     return present
 
 
+def read_servers(operand: str, keys: Path | None) -> list[Server]:
+    """The server at tcp://HOST:PORT, or those at dns://HOST:PORT or in a sites file now."""
+    key_of = partial(_key_of, keys, insecure=True)
+    if is_dns(operand):
+        return DnsName(CLOUD, operand, key_of(CLOUD, None)).read()
+    if operand.endswith(".toml"):
+        return SitesFile(Path(operand), key_of, {ONBOARD, BOTH}).read() or []
+    check_endpoint("ENDPOINT", operand)
+    return [Server(CLOUD, operand)]
+
+
 def _connect(
     server: Server, *, keys: Path | None, heartbeat_s: float, settings: Settings, background: Background
 ) -> Runner:
@@ -100,16 +111,12 @@ def _connect(
             insecure=settings.insecure,
             background=background,
         )
-    own = None
-    if keys is not None:
-        key = server.key
-        own = robot_keys(keys, server.site) if key is None else RobotKeys(own_keys(keys), key)
     return CloudRunner(
         server.endpoint,
         site=server.site,
         heartbeat_s=heartbeat_s,
         seed=settings.seed,
-        keys=own,
+        keys=None if keys is None else robot_keys(keys, server.site, server.key),
         background=background,
         compress=settings.compress,
     )
