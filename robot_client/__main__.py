@@ -10,7 +10,8 @@ from pathlib import Path
 
 from offboard.common.command_line import Command, CommandParser, add_flags, run_commands
 from offboard.common.config import resolve
-from offboard.robot_client.sites.runner import check_endpoint
+
+ENDPOINT = "tcp://HOST:PORT of the server; dns://HOST:PORT or a sites file FILE.toml: each server there"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -23,23 +24,33 @@ def _check(argv: Sequence[str]) -> int:
 
     about = "Check step by step whether this robot can use a server. Each failed step comes with a remedy."
     parser = CommandParser(prog="robot-client check", description=about, operands="ENDPOINT")
-    parser.add_argument("endpoint", metavar="ENDPOINT", help="tcp://HOST:PORT of the server")
+    parser.add_argument("endpoint", metavar="ENDPOINT", help=ENDPOINT)
     add_flags(parser, CheckConfig, "ROBOT_CHECK")
     flags = parser.parse_args(argv)
     config = resolve(CheckConfig, flags, environ=os.environ, prefix="ROBOT_CHECK")
-    check_endpoint("ENDPOINT", flags.endpoint)
     sys.path.insert(0, str(Path.cwd()))  # so that task modules here are found, as with `python -m`
     import logging
 
     from offboard.robot_client.check.outcome import FAIL
     from offboard.robot_client.check.steps import Check
+    from offboard.robot_client.servers import read_servers
 
     logging.disable(logging.WARNING)  # the lines say the same
-    check = Check(flags.endpoint, keys=config.keys, modules=config.tasks, timeout_s=config.timeout_s)
     failed = False
-    for line in check.run():
-        print(line, flush=True)
-        failed = failed or line.status == FAIL
+    servers = read_servers(flags.endpoint, config.keys)
+    for server in servers:
+        if len(servers) > 1:
+            print(f"{server.site}: {server.endpoint}", flush=True)
+        check = Check(
+            server.endpoint,
+            keys=config.keys,
+            modules=config.tasks,
+            timeout_s=config.timeout_s,
+            key=server.key,
+        )
+        for line in check.run():
+            print(line, flush=True)
+            failed = failed or line.status == FAIL
     return int(failed)
 
 

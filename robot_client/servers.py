@@ -7,11 +7,12 @@ What a runner does is in `sites` and, for policy servers, in `openpi`; how lists
 import os
 import socket
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
-from offboard.common.errors import ConfigError, OffloadError
-from offboard.common.security.keys import RobotKeys, checked_key, own_keys, robot_keys
+from offboard.common.errors import ConfigError
+from offboard.common.security.keys import checked_key, robot_keys
 from offboard.common.variants import group_of
 from offboard.robot_client.discovery.dns_name import DnsName, is_dns
 from offboard.robot_client.discovery.following import Following, Source
@@ -25,7 +26,7 @@ from offboard.robot_client.sites import heartbeat
 from offboard.robot_client.sites.background import Background
 from offboard.robot_client.sites.cloud import CloudRunner
 from offboard.robot_client.sites.onboard import OnboardRunner
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Runner
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Runner, check_endpoint
 
 Sites = Mapping[str, str] | Path | str
 
@@ -59,93 +60,66 @@ def connect_sites(
     ]
     if isinstance(sites, Path | str):
         sources.append(SitesFile(Path(sites), key_of, {ONBOARD, BOTH, *fixed}))
-    make = _Make(folder, settings.beats(policy), settings, wrap)
-    runners: list[Runner] = []
-    try:
+    heartbeat_s = heartbeat.EVERY_S if settings.beats(policy) else 0.0
+    background = Background()
+    connect = partial(
+        _connect, keys=folder, heartbeat_s=heartbeat_s, settings=settings, background=background
+    )
+    with ExitStack() as opened:  # also after Ctrl-C, no thread or socket is left
+        runners: list[Runner] = []
         for site, one in fixed.items():
-            runners.append(make.server(Server(site, one)))
-        runners.append(make.onboard())
-        return _followed(runners, sources, make, settings)
-    except BaseException:  # also after Ctrl-C, no thread or socket of the others is left
-        for runner in runners:
-            runner.close()
-        raise
-
-
-def _followed(
-    runners: list[Runner], sources: list[Source], make: "_Make", settings: Settings
-) -> PresentSites:
-    """These sites, and the servers of the sources as they are from now on."""
-    if not sources:
-        return PresentSites(runners)
-    seed = f"{settings.seed} {socket.gethostname()} {os.getpid()}"  # the robots of a fleet spread out
-    sites = PresentSites(runners, roster=Roster(settings.known, seed), connect=make.server, tended=True)
-    try:
-        for source in sources:
-            following = Following(source, sites, settings.reread_s)
-            if isinstance(source, SitesFile):
-                sites.follow(source.read() or [], source.name)  # a mistake in the file is an error at start
-            else:
-                following.read()
-            following.start()
-    except BaseException as error:
-        sites.close()
-        if isinstance(error, RuntimeError):
-            raise OffloadError(f"{error}; free some threads") from error
-        raise
-    return sites
-
-
-class _Make:
-    """Makes the runners of one offloader."""
-
-    def __init__(
-        self, keys: Path | None, beats: bool, settings: Settings, wrap: Callable[[Runner], Runner]
-    ) -> None:
-        self._keys = keys
-        self._heartbeat_s = heartbeat.EVERY_S if beats else 0.0
-        self._settings = settings
-        self._wrap = wrap
-        self._background = Background()
-
-    def onboard(self) -> Runner:
-        return self._wrap(OnboardRunner(states=self._settings.states, background=self._background))
-
-    def server(self, server: Server) -> Runner:
-        settings = self._settings
-        if is_policy_server(server.endpoint):
-            from offboard.robot_client.openpi.policy_server import (
-                PolicyServerRunner,  # its library is an extra
-            )
-
-            return self._wrap(
-                PolicyServerRunner(
-                    server.endpoint,
-                    site=server.site,
-                    heartbeat_s=self._heartbeat_s,
-                    seed=settings.seed,
-                    insecure=settings.insecure,
-                    background=self._background,
-                )
-            )
-        return self._wrap(
-            CloudRunner(
-                server.endpoint,
-                site=server.site,
-                heartbeat_s=self._heartbeat_s,
-                seed=settings.seed,
-                keys=self._keys_for(server),
-                background=self._background,
-                compress=settings.compress,
-            )
+            runners.append(wrap(connect(Server(site, one))))
+            opened.callback(runners[-1].close)
+        runners.append(wrap(OnboardRunner(states=settings.states, background=background)))
+        opened.callback(runners[-1].close)
+        seed = f"{settings.seed} {socket.gethostname()} {os.getpid()}"  # the robots of a fleet spread out
+        present = PresentSites(
+            runners,
+            roster=Roster(settings.known, seed) if sources else None,
+            connect=lambda server: wrap(connect(server)),
+            tended=True,
         )
+        opened.callback(present.close)
+        for source in sources:
+            Following(source, present, settings.reread_s).start()
+        opened.pop_all()
+    return present
 
-    def _keys_for(self, server: Server) -> RobotKeys | None:
-        if self._keys is None:
-            return None
-        if server.key is None:
-            return robot_keys(self._keys, server.site)
-        return RobotKeys(own_keys(self._keys), server.key)
+
+def read_servers(operand: str, keys: Path | None) -> list[Server]:
+    """The server at tcp://HOST:PORT, or those at dns://HOST:PORT or in a sites file now."""
+    key_of = partial(_key_of, keys, insecure=True)
+    if is_dns(operand):
+        return DnsName(CLOUD, operand, key_of(CLOUD, None)).read()
+    if operand.endswith(".toml"):
+        return SitesFile(Path(operand), key_of, {ONBOARD, BOTH}).read() or []
+    check_endpoint("ENDPOINT", operand)
+    return [Server(CLOUD, operand)]
+
+
+def _connect(
+    server: Server, *, keys: Path | None, heartbeat_s: float, settings: Settings, background: Background
+) -> Runner:
+    if is_policy_server(server.endpoint):
+        from offboard.robot_client.openpi.policy_server import PolicyServerRunner  # its library is an extra
+
+        return PolicyServerRunner(
+            server.endpoint,
+            site=server.site,
+            heartbeat_s=heartbeat_s,
+            seed=settings.seed,
+            insecure=settings.insecure,
+            background=background,
+        )
+    return CloudRunner(
+        server.endpoint,
+        site=server.site,
+        heartbeat_s=heartbeat_s,
+        seed=settings.seed,
+        keys=None if keys is None else robot_keys(keys, server.site, server.key),
+        background=background,
+        compress=settings.compress,
+    )
 
 
 def _key_of(folder: Path | None, site: str, given: str | None, *, insecure: bool) -> bytes | None:

@@ -33,6 +33,7 @@ from offboard.loadgen.scenario import event_timeline, scenario
 from offboard.loadgen.table import measured_rows
 from offboard.loadgen.testbed import docker_engine, docker_images
 from offboard.robot_client import lifetime, task_runs
+from offboard.robot_client.discovery import dns_name, present_sites, roster, sites_file
 from offboard.robot_client.execution import placement
 from offboard.robot_client.learning import store
 from offboard.robot_client.policies import allowance
@@ -123,6 +124,11 @@ ROBOT = {
         connection.LOG_PAUSE_S,
     ],
     "messages that are read at once from a server": [cloud.READ_MAX],
+    "the file of `--sites`": [sites_file.FILE_BYTES_MAX, sites_file.SERVERS_MAX, sites_file.GROUPS_MAX],
+    "addresses of a name": [dns_name.ADDRESSES_MAX],
+    "servers of a group that are used at a time": [roster.KNOWN_MAX],
+    "sites that a task is remembered on": [base.REMEMBERED],
+    "a server that left the list, and still has tasks": [present_sites.LEAVING_MAX_S],
     "arrays of one task that are sent compressed inside the request": [values.DECOMPRESSED_BYTES_MAX],
     "rows of a CSV file of sizes, or of a dataset": [same(workload.ROWS_MAX, measured_rows.ROWS_MAX)],
 }

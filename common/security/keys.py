@@ -99,17 +99,14 @@ def server_keys(folder: Path) -> KeyPair:
     return _read_pair("--keys", folder / f"{SERVER}{PRIVATE}")
 
 
-def own_keys(folder: Path) -> KeyPair:
-    """The robot's own keys in the folder of its --keys."""
-    return _read_pair("--keys", folder / f"{ROBOT}{PRIVATE}")
-
-
-def robot_keys(folder: Path, site: str) -> RobotKeys:
+def robot_keys(folder: Path, site: str, server: bytes | None = None) -> RobotKeys:
     """The keys in the folder of a robot's --keys, for one site.
 
-    The key of the site's server is in SITE.key, or else in server.key.
+    The key of the site's server is the one that is given, or else in SITE.key, or else in server.key.
     """
-    own = own_keys(folder)
+    own = _read_pair("--keys", folder / f"{ROBOT}{PRIVATE}")
+    if server is not None:
+        return RobotKeys(own, server)
     path = folder / f"{site}{PUBLIC}"
     if site == ROBOT or not path.exists():
         path = folder / f"{SERVER}{PUBLIC}"

@@ -94,13 +94,13 @@ def _run_tasks(
     last: "LastPlan | None",
 ) -> None:
     """Run the tasks of `work`, then close `files`, to which the file of --reference is added."""
-    own, sites = OwnRecord(), config.sites()
+    own, sites = OwnRecord(), config.sites or config.further()
     with ExitStack() as stack:
         offload = stack.enter_context(_observed(config, states, own, trace))
         again, references = None, None
         if config.trace and config.reference:
             again = stack.enter_context(_connect(config, states=states, sites=sites))
-            path, names = reference_path(config.trace), [ONBOARD, CLOUD, *sites]
+            path, names = reference_path(config.trace), [ONBOARD, CLOUD, *config.further()]
             references = References(
                 path,
                 again,
@@ -140,7 +140,12 @@ def _observed(config: RobotConfig, states: TaskStates, own: OwnRecord, trace: Tr
     observers: list[Observer] = [own, *([trace.write] if trace else []), *([metrics] if metrics else [])]
     settings = config.settings(config.seed)
     offload = _connect(
-        config, states, settings, sites=config.sites(), policy=config.policy, observers=observers
+        config,
+        states,
+        settings,
+        sites=config.sites or config.further(),
+        policy=config.policy,
+        observers=observers,
     )
     if metrics:
         offload.show_on(metrics.live)

@@ -11,6 +11,7 @@ from offboard.common.variants import IN_GROUP
 from offboard.loadgen.robot.decision_settings import DecisionSettings
 from offboard.loadgen.robot.run_settings import RunSettings
 from offboard.loadgen.robot.workload import CLOSED, SIZES_ALLOWED, parse_sizes
+from offboard.robot_client.discovery.dns_name import check_dns, is_dns
 from offboard.robot_client.openpi.endpoint import check_site
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, TIMEOUT_S
 
@@ -29,11 +30,19 @@ class ServerSettings:
     )
     site: tuple[str, ...] = setting(
         (),
-        "a further server, with a name; ws:// or wss:// is a policy server; GROUP/NAME are equal servers; "
+        "a further server, with a name, or GROUP/NAME for one of several equal servers; ws:// or wss:// is a "
+        "policy server; dns://HOST:PORT is a server at each address of HOST, looked up again every 2 s; "
         "repeat the flag for more",
         group=SERVERS,
         rare=True,
         metavar="NAME=ENDPOINT",
+    )
+    sites: Path | None = setting(
+        None,
+        "TOML file of servers with endpoint, key and group (docs/formats.md), read again every 2 s",
+        group=SERVERS,
+        rare=True,
+        metavar="FILE",
     )
     keys: Path | None = setting(
         None,
@@ -44,8 +53,8 @@ class ServerSettings:
     )
     insecure: bool = setting(
         False,
-        "allow ws:// to a policy server beyond this computer: anyone on the way can read and change what is "
-        "sent",
+        "allow ws:// to a policy server beyond this computer, and dns:// and --sites without --keys: anyone "
+        "on the way can read and change what is sent",
         group=SERVERS,
         rare=True,
     )
@@ -70,11 +79,20 @@ class ServerSettings:
     def check_servers(self) -> None:
         if self.cloud is not None:
             check_site("--cloud", self.cloud, insecure=self.insecure)
-        if self.keys is not None and self.cloud is None and not self.site:
+        if self.sites is not None and self.site:
+            raise ConfigError(f"--sites: {self.sites} cannot be combined with --site; list all servers in it")
+        if self.keys is not None and self.cloud is None and not (self.site or self.sites):
             raise ConfigError(f"--keys: {self.keys} needs --cloud, the server to use")
-        self.sites()
+        self.further()
 
-    def sites(self) -> dict[str, str]:
+    @property
+    def changing(self) -> str | None:
+        """The flag of servers that may change during the run."""
+        if self.sites is not None:
+            return "--sites"
+        return next((f"--site {name}" for name, one in self.further().items() if is_dns(one)), None)
+
+    def further(self) -> dict[str, str]:
         """The endpoint of each --site, by its name."""
         found: dict[str, str] = {}
         for entry in self.site:
@@ -83,9 +101,13 @@ class ServerSettings:
             if not (equals and len(parts) <= 2 and all(part.isidentifier() for part in parts)):
                 allowed = "NAME=tcp://HOST:PORT or NAME=ws://HOST:PORT, where NAME may be GROUP/NAME"
                 raise ConfigError(f"--site: {entry!r} is not {allowed}")
-            if name in (ONBOARD, CLOUD, *found):
+            free = CLOUD if self.cloud is None and is_dns(endpoint) else ""
+            if name in {ONBOARD, CLOUD, *found} - {free}:
                 raise ConfigError(f"--site: {entry!r}: the name {name!r} is already taken")
-            check_site(f"--site {name}", endpoint, insecure=self.insecure)
+            if is_dns(endpoint):
+                check_dns(f"--site {name}", endpoint)
+            else:
+                check_site(f"--site {name}", endpoint, insecure=self.insecure)
             found[name] = endpoint
         return found
 
@@ -100,6 +122,8 @@ class RobotConfig(RunSettings, DecisionSettings, ServerSettings):
         self.check_servers()
         self.check_decisions()
         self.check_run(cloud=self.cloud)
+        if self.reference and self.changing:
+            raise ConfigError(f"--reference: {self.reference} needs servers that stay, so no {self.changing}")
         if self.metrics is not None:
             address("--metrics", self.metrics)
         if self.memory is not None and self.memory in (self.trace, self.answers):

@@ -26,15 +26,23 @@ PINGS = 10
 class Check:
     """One check of the server at `endpoint`. Each step uses what the steps before it found out.
 
-    `keys` is the folder of the robot's keys, `modules` register the tasks that are compared, `timeout_s`
-    bounds each step.
+    `keys` is the folder of the robot's keys, `key` that of the server if a list has it. `modules` register
+    the tasks that are compared, `timeout_s` bounds each step.
     """
 
-    def __init__(self, endpoint: str, *, keys: Path | None, modules: Sequence[str], timeout_s: float) -> None:
+    def __init__(
+        self,
+        endpoint: str,
+        *,
+        keys: Path | None,
+        modules: Sequence[str],
+        timeout_s: float,
+        key: bytes | None = None,
+    ) -> None:
         self._endpoint = endpoint
         self._address = Address.of(endpoint)
         self._folder = keys
-        self._keys = None if keys is None else robot_keys(keys, CLOUD)
+        self._keys = None if keys is None else robot_keys(keys, CLOUD, key)
         self._kinds, self._chosen = load_kinds(modules), bool(modules)
         self._timeout_s = timeout_s
         self._ips: list[str] = []

@@ -5,7 +5,7 @@ The command line checks its flags here, so nothing heavy is imported.
 
 import socket
 
-from offboard.common.errors import ConfigError, DataError
+from offboard.common.errors import CloudBroken, ConfigError
 from offboard.common.variants import IN_GROUP
 from offboard.robot_client.discovery.roster import Server
 from offboard.robot_client.sites.runner import check_endpoint
@@ -44,11 +44,11 @@ class DnsName:
         self._key = key
 
     def read(self) -> list[Server]:
-        """The servers now; DataError if the name has no address."""
+        """The servers now; CloudBroken if the name has no address."""
         try:
             found = socket.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM)
         except (OSError, UnicodeError) as error:
-            raise DataError(f"{self._host}: {getattr(error, 'strerror', None) or error}") from error
+            raise CloudBroken(f"{self._host}: {getattr(error, 'strerror', None) or error}") from error
         addresses = {family: set[str]() for family in (socket.AF_INET, socket.AF_INET6)}
         for family, _, _, _, address in found:
             if family in addresses and "%" not in str(address[0]):

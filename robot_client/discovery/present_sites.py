@@ -87,8 +87,7 @@ class PresentSites(Mapping[str, Runner]):
                     del self._connected[site]
                     self._leaving.append((runner, self._clock_s() + LEAVING_MAX_S))
                     log.info("%s: %s is no longer used", site, server.endpoint)
-            for site in wanted.keys() - self._connected.keys():
-                self._open(wanted[site])
+            self._connect_to([wanted[site] for site in wanted.keys() - self._connected.keys()])
             self.now = {one.site: one for one in self.staying} | {
                 site: self._connected[site][1] for site in wanted if site in self._connected
             }
@@ -109,19 +108,20 @@ class PresentSites(Mapping[str, Runner]):
         for runner in runners:
             runner.close()
 
-    def _open(self, server: Server) -> None:
-        """Connect to a server; one that cannot be connected to is left out, and the log says so once."""
-        assert self._connect is not None, "only a roster with servers needs it"
-        try:
-            self._connected[server.site] = server, self._connect(server)
-        except OffloadError as error:
-            if server not in self._failed:
-                said = "%s: %s; it is not used; remedy: correct its entry, or close other files"
-                log.warning(said, server.site, error)
-            self._failed.add(server)
-        else:
-            self._failed.discard(server)
-            log.info("%s: %s is used from now on", server.site, server.endpoint)
+    def _connect_to(self, servers: Iterable[Server]) -> None:
+        """Connect to these servers; the log says once why that cannot be done."""
+        failed = set()
+        for server in servers:
+            assert self._connect is not None, "a roster with servers needs it"
+            try:
+                self._connected[server.site] = server, self._connect(server)
+                log.info("%s: %s is used from now on", server.site, server.endpoint)
+            except OffloadError as error:
+                failed.add(server)
+                if server not in self._failed:
+                    said = "%s: %s; it is not used; remedy: correct its entry, or close other files"
+                    log.warning(said, server.site, error)
+        self._failed = failed
 
     def _may_close(self, runner: Runner, until_s: float) -> bool:
         return not self.in_flight(runner.site) or self._clock_s() >= until_s

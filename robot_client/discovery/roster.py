@@ -58,16 +58,18 @@ class Roster:
     def look(self, finish_s: Mapping[str, float], now_s: float) -> None:
         """Replace servers of larger groups: those that cannot take tasks, and rarely one more.
 
-        `finish_s`: how long a task should take on each site that can take it, in seconds. The site that is
-        left for a trial is the later one of two drawn ones: the best one always stays.
+        If none of a group can, it is more likely the link of the robot that fails, so they are replaced as
+        rarely. `finish_s`: how long a task should take on each site that can take it, in seconds. The site
+        that is left for a trial is the later one of two drawn ones: the best one always stays.
         """
         self._tasks, self._looked_s = 0, now_s
         self._looks += 1
-        kept = {site for site in self.in_use if site in finish_s}
-        if self._looks % TRY_EVERY == 0:
-            for members in _groups(kept).values():
-                if len(members) >= self._known:
-                    kept.remove(max(self._random.sample(members, 2), key=finish_s.__getitem__))
+        kept: set[str] = set()
+        for members in _groups(self.in_use).values():
+            able = [site for site in members if site in finish_s] or members
+            kept.update(able)
+            if self._looks % TRY_EVERY == 0 and len(able) >= self._known:
+                kept.remove(max(self._random.sample(able, 2), key=lambda site: finish_s.get(site, math.inf)))
         self._use(kept)
 
     def _use(self, kept: Iterable[str]) -> None:

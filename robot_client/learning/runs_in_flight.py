@@ -3,7 +3,6 @@
 They are started and ended by the offloader.
 """
 
-from collections import defaultdict
 from dataclasses import dataclass
 
 OVERDUE = 0.5  # of its time so far: an overdue run should still need this long
@@ -23,24 +22,27 @@ class Flights:
     """The runs under way, by site and task. Called under the offloader's lock."""
 
     def __init__(self) -> None:
-        self._flights: defaultdict[str, dict[int, _Flight]] = defaultdict(dict)
+        self._flights: dict[str, dict[int, _Flight]] = {}  # of the sites that have any
 
     def begin(self, site: str, task: int, *, predicted_s: float, now_s: float) -> None:
         """A run of the task with this id starts."""
-        self._flights[site][task] = _Flight(now_s, predicted_s)
+        self._flights.setdefault(site, {})[task] = _Flight(now_s, predicted_s)
 
     def end(self, site: str, task: int) -> None:
         """The run has ended. Safe to call twice."""
-        self._flights[site].pop(task, None)
+        flights = self._flights.get(site, {})
+        flights.pop(task, None)
+        if not flights:
+            self._flights.pop(site, None)
 
     def end_all(self, task: int) -> None:
         """All runs of the task were given up."""
-        for flights in self._flights.values():
-            flights.pop(task, None)
+        for site in list(self._flights):
+            self.end(site, task)
 
     def count(self, site: str) -> int:
-        return len(self._flights[site])
+        return len(self._flights.get(site, ()))
 
     def left_s(self, site: str, now_s: float) -> float:
         """How long the runs on this site should still take, one after the other."""
-        return sum([one.left_s(now_s) for one in self._flights[site].values()])
+        return sum([one.left_s(now_s) for one in self._flights.get(site, {}).values()])

@@ -17,6 +17,7 @@ from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import ONBOARD
 from tests import slow_site
 from tests.curves import WAIT_S, Served, until
+from tests.namespaces import run_alone
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(300)]
 
@@ -171,6 +172,14 @@ def test_a_name_is_a_group_with_a_server_at_each_address(fleet: Fleet) -> None:
         offload(slow_site.hash_slowly, ROUNDS, where="planners")
         assert offload.last is not None
         assert offload.last.used == "planners/127.0.0.1"
+
+
+def test_the_servers_of_a_name_follow_its_addresses() -> None:
+    """An address that is added becomes a site, and one that is removed is none; real names, real servers."""
+    found = run_alone("tests.name_changes", timeout_s=150.0)
+    one, two = "planners/127.0.0.1", "planners/127.0.0.2"
+    assert found["seen"] == [[ONBOARD, one], [ONBOARD, one, two], [ONBOARD, two]]
+    assert found["used"] == two
 
 
 def used(offload: Offloader) -> str | None:

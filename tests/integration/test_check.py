@@ -89,6 +89,19 @@ def fails(result: tuple[int, list[str]], step: str, *texts: str) -> None:
         assert text in lines[at]
 
 
+def test_each_server_of_a_list_is_checked(serve: Serve, tmp_path: Path) -> None:
+    """The lines of each server follow its name; one that fails makes the exit code 1."""
+    served, path = serve(), tmp_path / "sites.toml"
+    path.write_text(f'[a]\nendpoint = "{served.endpoint}"\n[b]\nendpoint = "tcp://127.0.0.1:1"\n')
+    command = [sys.executable, "-m", "offboard.robot_client", "check", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=ROOT, env=clean_environ())
+    lines = done.stdout.splitlines()
+    assert (done.returncode, done.stderr) == (1, "")
+    assert lines[0] == f"a: {served.endpoint}"
+    assert lines[len(STEPS) + 1] == "b: tcp://127.0.0.1:1"
+    assert all(line.startswith("ok ") for line in lines[1 : len(STEPS) + 1])
+
+
 @pytest.mark.parametrize("executor", ["threads", "processes"])
 def test_a_good_server_passes_each_step(serve: Serve, executor: str) -> None:
     """With the tasks of its user, a server passes each step, and runs the empty task."""

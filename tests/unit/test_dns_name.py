@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from offboard.common.errors import ConfigError, DataError
+from offboard.common.errors import CloudBroken, ConfigError
 from offboard.robot_client.discovery.dns_name import DnsName, check_dns
 from offboard.robot_client.discovery.roster import Server
 
@@ -43,7 +43,7 @@ def test_a_server_with_two_kinds_of_address_counts_once(monkeypatch: pytest.Monk
 
 def test_a_name_without_address_is_an_error() -> None:
     """`.invalid` never has one (RFC 2606); the error names the host."""
-    with pytest.raises(DataError, match=r"planners\.invalid: "):
+    with pytest.raises(CloudBroken, match=r"planners\.invalid: "):
         DnsName("cloud", "dns://planners.invalid:5555", None).read()
 
 

@@ -27,6 +27,7 @@ GROUP = [f"planners/{name}" for name in "abcd"]
 TRIP_S, RUN_S, ONBOARD_S, TIMEOUT_S = 0.01, 0.05, 0.3, 0.5
 NOISE = 0.1
 TASKS = 500  # in each phase
+HEARTBEAT_TASKS = 8  # about the tasks between two heartbeats
 
 
 @task("lifted", size=lambda size: size)
@@ -74,6 +75,12 @@ class Servers:
         return self.slower.get(site, 1.0)
 
 
+def waited_s(record: Record) -> float:
+    """How long the caller waited: for the first answer, after the runs that failed before it."""
+    failed_s = sum(one.seconds for one in record.executions if not one.ok)
+    return failed_s + min(one.seconds for one in record.executions if one.ok)
+
+
 def play(seed: int, phases: Sequence[dict[str, float]]) -> tuple[list[Record], float]:
     """The records of TASKS tasks in each phase, and what the oracle needs for all of them, in seconds."""
     servers, records, random, oracle_s = Servers(seed), list[Record](), Random(seed), 0.0
@@ -87,12 +94,13 @@ def play(seed: int, phases: Sequence[dict[str, float]]) -> tuple[list[Record], f
     ) as offload:
         for slower in phases:
             servers.slower = slower
-            for runner in servers.made:
-                servers.measure(runner)
-            for _ in range(TASKS):
+            for number in range(TASKS):
                 size = random.uniform(0.8, 1.2)
                 oracle_s += servers.oracle_s(size)
                 offload(lifted, size)
+                if number == HEARTBEAT_TASKS:  # only now the heartbeats show that a server is silent
+                    for runner in servers.made:
+                        servers.measure(runner)
     return records, oracle_s
 
 
@@ -101,7 +109,7 @@ def test_one_of_four_servers_fails_and_comes_back(seed: int) -> None:
     """One is slow, dead, and back: the mean is within 5 % of the oracle, and at most 5 % are probes."""
     site = GROUP[seed % len(GROUP)]
     records, oracle_s = play(seed, [{}, {site: 5.0}, {site: 0.0}, {}])
-    took_s = sum(next(one.seconds for one in record.executions if one.ok) for record in records)
+    took_s = sum(waited_s(record) for record in records)
     probes = sum(isinstance(record.decision.second, Probe) for record in records)
     print(f"mean {took_s / oracle_s - 1:+.1%} of the oracle, {probes / len(records):.1%} probes")
     assert took_s <= 1.05 * oracle_s

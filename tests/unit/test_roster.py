@@ -82,8 +82,17 @@ def test_a_server_that_cannot_take_tasks_is_replaced_at_the_next_look() -> None:
     roster.look({site: 0.1 for site in roster.in_use if site != dead}, now_s=0.0)
     assert len(roster.in_use) == 5
     assert dead not in roster.in_use
-    roster.look({}, now_s=1.0)
     assert "gpu" in roster.in_use
+
+
+def test_an_outage_of_the_robot_does_not_cost_it_its_servers() -> None:
+    """If no server of a group can take tasks, they stay in use, and only one is replaced now and then."""
+    roster = Roster(known=4, seed=1)
+    roster.follow(group(100))
+    before = set(roster.in_use)
+    for looks in range(1, 2 * TRY_EVERY):
+        roster.look({}, now_s=looks * LOOK_S)
+        assert len(before - set(roster.in_use)) == looks // TRY_EVERY
 
 
 def test_a_look_is_due_after_tasks_and_time() -> None:

@@ -99,8 +99,14 @@ def test_a_wrong_setting_is_an_error_of_connect(settings: Settings, says: str) -
 
 WRONG = [
     ({"endpoint": 5}, "endpoint 5: must be a string or None"),
-    ({"sites": ["tcp://h:1"]}, "sites ['tcp://h:1']: must be a dictionary of strings or None"),
-    ({"sites": {"edge": 5}}, "sites {'edge': 5}: must be a dictionary of strings or None"),
+    (
+        {"sites": ["tcp://h:1"]},
+        "sites ['tcp://h:1']: must be a dictionary of strings or a path or a string or None",
+    ),
+    (
+        {"sites": {"edge": 5}},
+        "sites {'edge': 5}: must be a dictionary of strings or a path or a string or None",
+    ),
     ({"policy": None}, "policy None: must be a string"),
     ({"timeout_s": "3"}, "timeout_s '3': must be a number"),
     ({"timeout_s": True}, "timeout_s True: must be a number"),
@@ -129,6 +135,8 @@ WRONG_SETTINGS = [
     ({"states": 5}, "states 5: must be TaskStates or None"),
     ({"compress": "no"}, "compress 'no': must be True or False"),
     ({"insecure": 1}, "insecure 1: must be True or False"),
+    ({"known": 4.0}, "known 4.0: must be a whole number"),
+    ({"reread_s": "2"}, "reread_s '2': must be a number"),
     ({"seed": "1"}, "seed '1': must be a whole number"),
 ]
 

@@ -57,7 +57,7 @@ def test_a_change_counts_once_two_reads_agree(listed: SitesFile, tmp_path: Path)
     ("text", "said"),
     [
         ("", "0 servers; allowed are 1 to 1000"),
-        ("[gpu", "line 1"),
+        ("[gpu", "Expected .* at the end of a table declaration"),
         ("gpu = 1", r"\[gpu\]: must be a table with `endpoint`"),
         ("[gpu]", r"\[gpu\]: `endpoint` is missing"),
         ("[gpu]\nendpoint = 5", r"\[gpu\]: endpoint 5 must be a string"),
