@@ -35,7 +35,7 @@ class Forecaster:
                 condition,
                 in_flight=in_flight,
                 timeout_s=timeout_s,
-                bytes_out=sending.bytes,
+                sending=sending,
                 # Most tasks have nothing to make smaller, so that is asked first.
                 packing=memory.packing.plan(sending, known.link_s) if packs or sending.large else None,
             )
@@ -58,7 +58,7 @@ class Forecaster:
                 condition,
                 in_flight=count,
                 timeout_s=timeout_s,
-                bytes_out=sending.bytes,
+                sending=sending,
                 packing=memory.packing.plan(sending, known.link_s) if packs or sending.large else None,
             )
         return self._with_allowance(memory, task.size, outlooks)
