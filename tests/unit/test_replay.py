@@ -14,7 +14,7 @@ from offboard.loadgen import rivals
 from offboard.loadgen.table import table_two
 from offboard.loadgen.table.measured_rows import Rows, read
 from offboard.loadgen.table.predictor_evaluation import predict
-from offboard.loadgen.table.replay import ReplayConfig, replay_policy, run_replay
+from offboard.loadgen.replay.replay import ReplayConfig, replay_policy, run_replay
 from offboard.loadgen.table.table_settings import TableConfig
 from offboard.robot_client import predictors
 from offboard.robot_client.learning.memories import Memories
