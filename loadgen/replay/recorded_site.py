@@ -7,7 +7,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
 
-from offboard.common.errors import Overtaken
+from offboard.common.errors import CloudBroken, Overtaken
 from offboard.common.tasks import Kind, Task
 from offboard.loadgen.replay.recorded_tasks import RecordedTask
 from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
@@ -18,11 +18,15 @@ GIVEN_UP = 2.0  # times as long as it ran in the run: when a run ends whose own 
 
 @dataclass(eq=False, slots=True)
 class _Run:
-    """A run under way: what it was in the run, when it began here and ends, and whether nothing can stop it."""
+    """A run under way: when it began and ends, what the trace says of it, and whether it was stopped there.
+
+    A `lasting` one was not stopped although another site had answered.
+    """
 
     recorded: Execution
     began_s: float
     ends_s: float
+    stopped: bool
     lasting: bool
     future: "Future[Execution]" = field(default_factory=Future)
 
@@ -49,8 +53,8 @@ class RecordedSite:
         recorded, now_s = self._task.runs.get(self.site), self._clock.now_s()
         if recorded is None:
             missing: Future[Execution] = Future()
-            failure = Overtaken("the trace does not hold this run")
-            missing.set_result(Execution(self.site, 0.0, failure=failure, censored=True, started=False))
+            failure = CloudBroken("the trace does not hold this run")
+            missing.set_result(Execution(self.site, 0.0, failure=failure, started=False))
             return missing
         wait_s = max([run.ends_s - now_s for run in self._runs.values()], default=0.0)
         if self.site == ONBOARD and wait_s > 0:  # behind a run of an earlier task, as it may have been before
@@ -59,7 +63,9 @@ class RecordedSite:
         stopped = isinstance(recorded.failure, Overtaken)
         seconds = recorded.seconds * (GIVEN_UP if stopped else 1.0)
         lasting = self._task.decision is not None and not stopped
-        run = self._runs[task.id] = _Run(recorded, now_s, now_s + seconds, lasting)
+        run = self._runs[task.id] = _Run(
+            recorded, now_s, now_s + seconds, stopped=stopped, lasting=lasting
+        )
         self._clock.at(run.ends_s, partial(self._end, task.id, run))
         return run.future
 
@@ -70,7 +76,8 @@ class RecordedSite:
         run = self._runs.get(task.id)
         if run is not None and not run.lasting:
             failure, seconds = Overtaken("another site answered first"), self._clock.now_s() - run.began_s
-            self._end_with(task.id, run, Execution(self.site, seconds, failure=failure, censored=True))
+            stopped = Execution(self.site, seconds, failure=failure, censored=True)
+            self._end_with(task.id, run, replace(run.recorded) if run.stopped else stopped)
 
     def hurry(self) -> None:
         pass

@@ -89,7 +89,7 @@ def _task(fields: Mapping[str, Any]) -> RecordedTask:
         runs=runs,
         conditions={site: _condition(site, features) for site in sites},
         sendings={site: _sending(outlook) for site, outlook in sites.items()},
-        sites=tuple(sites),
+        sites=tuple(dict.fromkeys((*sites, ONBOARD))),  # onboard always exists
         decision=_decision(fields["decision"]),
         started_s=fields.get("started_s"),
         timeout_s=fields.get("timeout_s", TIMEOUT_S),

@@ -80,8 +80,11 @@ class VirtualRobot:
         for recorded in tasks:
             if recorded.started_s is not None and first_s is not None:
                 self._clock.pass_by(max(0.0, recorded.started_s - first_s - self._clock.now_s()))
-            by_rule = recorded.decision is not None and recorded.decision.policy not in NOT_BY_A_RULE
-            self._run(recorded, instead=recorded.decision, ask=by_rule)
+            decision = recorded.decision
+            assert decision is not None, "a run is followed that decided its tasks"
+            if decision.second is not None and decision.second.site not in recorded.runs:
+                decision = decision._replace(second=None)  # its second run was not due, or not allowed
+            self._run(recorded, instead=decision, ask=decision.policy not in NOT_BY_A_RULE)
             yield self._chooser.decided
 
     def _run(self, recorded: RecordedTask, *, instead: Decision | None, ask: bool) -> Record:
