@@ -3,6 +3,7 @@
 What each task took is in `recorded_tasks`; which sites run it is decided by the offloader.
 """
 
+from collections.abc import Collection
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -37,20 +38,22 @@ class RecordedSite:
     def __init__(self, site: str, clock: VirtualClock) -> None:
         self.site = site
         self._clock = clock
-        self._task = RecordedTask(0.0, {})
+        self._tasks: dict[int, RecordedTask] = {}  # those that have begun, by number
+        self._sites: Collection[str] = ()
         self._condition = UNMEASURED
         self._runs: dict[int, _Run] = {}  # by task id
 
-    def begin(self, task: RecordedTask) -> None:
-        """The next task that is submitted is this one."""
-        self._task = task
+    def begin(self, number: int, task: RecordedTask) -> None:
+        """The next task that is decided is this one; the second argument of its calls is `number`."""
+        self._tasks[number], self._sites = task, task.sites
         self._condition = task.conditions.get(self.site, UNMEASURED)
 
     def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - one kind is replayed
-        return None if self.site in self._task.sites else "it could not take the task in the run"
+        return None if self.site in self._sites else "it could not take the task in the run"
 
     def submit(self, task: Task, budget_s: float) -> "Future[Execution]":  # noqa: ARG002 - it ends as in the run
-        recorded, now_s = self._task.runs.get(self.site), self._clock.now_s()
+        of, now_s = self._recorded(task), self._clock.now_s()
+        recorded = of.runs.get(self.site)
         if recorded is None:
             missing: Future[Execution] = Future()
             failure = CloudBroken("the trace does not hold this run")
@@ -62,15 +65,13 @@ class RecordedSite:
             recorded = replace(recorded, seconds=taken_s, queue_s=wait_s)
         stopped = isinstance(recorded.failure, Overtaken)
         seconds = recorded.seconds * (GIVEN_UP if stopped else 1.0)
-        lasting = self._task.decision is not None and not stopped
-        run = self._runs[task.id] = _Run(
-            recorded, now_s, now_s + seconds, stopped=stopped, lasting=lasting
-        )
+        lasting = of.decision is not None and not stopped
+        run = self._runs[task.id] = _Run(recorded, now_s, now_s + seconds, stopped=stopped, lasting=lasting)
         self._clock.at(run.ends_s, partial(self._end, task.id, run))
         return run.future
 
-    def to_send(self, task: Task) -> Sending:  # noqa: ARG002 - it is the one that began
-        return self._task.sendings.get(self.site, NOTHING)
+    def to_send(self, task: Task) -> Sending:
+        return self._recorded(task).sendings.get(self.site, NOTHING)
 
     def cancel(self, task: Task) -> None:
         run = self._runs.get(task.id)
@@ -87,6 +88,10 @@ class RecordedSite:
 
     def close(self) -> None:
         pass
+
+    def _recorded(self, task: Task) -> RecordedTask:
+        _, number = task.args
+        return self._tasks[number]
 
     def _end(self, task_id: int, run: _Run) -> None:
         if self._runs.get(task_id) is run:  # it was not cancelled

@@ -1,9 +1,9 @@
-"""The tasks of a trace or a dataset, with all that a replay needs of them: what was measured and what was done.
+"""The tasks of a trace or a dataset, with all that a replay needs to know of them.
 
 The fields of a trace are those of docs/formats.md; `recorded_site` plays the runs again.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,8 @@ class RecordedTask:
     `runs`: its runs by site, with the work as their value. A run that was stopped has the failure Overtaken.
     `conditions`, `sendings`: by site, what was measured and what a run would send, when it was decided.
     `sites`: those that could take it. `decision`: of the run; None in a dataset.
-    `started_s`: on the clock of the robot; None: unknown. `process`: one for each start of the robot.
+    `i`: its place in the order in which tasks began. `process`: one for each start of the robot.
+    `started_s`, `answered_s`: on the clock of the robot; None: unknown.
     `measured`: both times were known when the task was answered, so it is a row of `measured_rows`.
     """
 
@@ -44,7 +45,9 @@ class RecordedTask:
     sendings: Mapping[str, Sending] = field(default_factory=dict)
     sites: tuple[str, ...] = (ONBOARD, CLOUD)
     decision: Decision | None = None
+    i: int = 0
     started_s: float | None = None
+    answered_s: float = 0.0
     timeout_s: float = TIMEOUT_S
     deadline_s: float | None = None
     process: str = ""
@@ -91,7 +94,9 @@ def _task(fields: Mapping[str, Any]) -> RecordedTask:
         sendings={site: _sending(outlook) for site, outlook in sites.items()},
         sites=tuple(dict.fromkeys((*sites, ONBOARD))),  # onboard always exists
         decision=_decision(fields["decision"]),
+        i=fields["i"],
         started_s=fields.get("started_s"),
+        answered_s=fields.get("started_s", 0.0) + fields["waited_s"],
         timeout_s=fields.get("timeout_s", TIMEOUT_S),
         deadline_s=fields.get("deadline_s"),
         process=str(fields["id"]).rpartition("-")[0],

@@ -23,7 +23,7 @@ from offboard.loadgen.table.confidence_intervals import Picks
 from offboard.loadgen.table.measured_rows import Column, Rows, is_csv, read_lived
 from offboard.loadgen.table.measurement_notes import read_noted
 from offboard.loadgen.table.table_formats import Heading, Table
-from offboard.loadgen.table.table_settings import BOTH, FULL, MeasuredTimesConfig
+from offboard.loadgen.table.table_settings import FULL, MeasuredTimesConfig
 from offboard.loadgen.table.table_two_figures import Scored, Sides
 from offboard.robot_client import policies
 from offboard.robot_client.learning.memories import Memories

@@ -5,19 +5,22 @@ Either the policy decides (`play`), or the run is followed and the policy is onl
 
 import contextlib
 import itertools
+import math
 import operator
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 from offboard.common.errors import OffloadError
 from offboard.common.tasks import Size, task
 from offboard.loadgen.replay.recorded_site import RecordedSite
 from offboard.loadgen.replay.recorded_tasks import RecordedTask
-from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
+from offboard.loadgen.simulation.model.lockstep_clock import LockstepClock
 from offboard.robot_client.execution import batch
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.policies import ALONE, BOTH, PINNED, Decision, Forecast, Hedge, Policy, observe
+from offboard.robot_client.policies import ALONE, PINNED, Decision, Forecast, Hedge, Policy, observe
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.policies.objectives import by_deadline
 from offboard.robot_client.records.trace import Record
@@ -42,11 +45,12 @@ class VirtualRobot:
         self, policy: Policy, memories: Memories, *, tells_work: bool, sites: Sequence[str] = (ONBOARD, CLOUD)
     ) -> None:
         self._function = _replayed_with_work if tells_work else _replayed
-        self._clock = VirtualClock()
+        self._clock = LockstepClock()
+        self._zero_s: float | None = None  # when the first task began, on the clock of the run
         self._allowance = Allowance()
         self._sites = [RecordedSite(site, self._clock) for site in sites]
         self._chooser = _Chooser(policy)
-        self._records: list[Record] = []
+        self._records: deque[Record] = deque(maxlen=1)
         self._offload = Offloader(
             self._sites,
             policy=self._chooser,
@@ -63,7 +67,8 @@ class VirtualRobot:
         """
         for number, recorded in enumerate(tasks):
             warm = number >= warm_up
-            record = self._run(recorded, instead=ON_BOTH if all_learn or not warm else None, ask=warm)
+            self._run(number, recorded, instead=ON_BOTH if all_learn or not warm else None, ask=warm)
+            record = self._records.pop()
             if warm and all_learn:
                 yield self._as_decided(self._chooser.decided, recorded)
             elif warm:
@@ -71,30 +76,42 @@ class VirtualRobot:
                 waited_s = runs[0].seconds if len(runs) == 1 else record.waited_s  # without rounding
                 yield Played(record.used == CLOUD, len(runs) > 1, waited_s)
 
-    def follow(self, tasks: Sequence[RecordedTask]) -> Iterator[Decision | None]:
+    def follow(self, tasks: Sequence[RecordedTask]) -> list[Decision | None]:
         """What the policy would have decided for each task after all that the run had learnt before.
 
         None: in the run no rule decided. Each task begins when it did in the run, and runs as it did there.
         """
-        first_s = tasks[0].started_s
-        for recorded in tasks:
-            if recorded.started_s is not None and first_s is not None:
-                self._clock.pass_by(max(0.0, recorded.started_s - first_s - self._clock.now_s()))
-            decision = recorded.decision
-            assert decision is not None, "a run is followed that decided its tasks"
-            if decision.second is not None and decision.second.site not in recorded.runs:
-                decision = decision._replace(second=None)  # its second run was not due, or not allowed
-            self._run(recorded, instead=decision, ask=decision.policy not in NOT_BY_A_RULE)
-            yield self._chooser.decided
+        decided: list[Decision | None] = [None] * len(tasks)
+        under_way: dict[int, RecordedTask] = {}
 
-    def _run(self, recorded: RecordedTask, *, instead: Decision | None, ask: bool) -> Record:
-        self._records.clear()
+        def run(number: int, decision: Decision) -> None:
+            self._run(number, tasks[number], instead=decision, ask=decision.policy not in NOT_BY_A_RULE)
+            del under_way[number]
+
+        for number in sorted(range(len(tasks)), key=lambda number: tasks[number].i):
+            self._wait_for(tasks[number], under_way)
+            under_way[number] = tasks[number]
+            self._clock.begin(partial(run, number, _carried_out(tasks[number])))
+            decided[number] = self._chooser.decided
+        while under_way:
+            self._clock.step(math.inf)
+        return decided
+
+    def _wait_for(self, begins: RecordedTask, under_way: Mapping[int, RecordedTask]) -> None:
+        """Let the time pass until this task begins, and until all have their answer that had it by then."""
+        began_s = begins.started_s
+        if began_s is not None:
+            self._zero_s = began_s if self._zero_s is None else self._zero_s
+            self._clock.pass_by(max(0.0, began_s - self._zero_s - self._clock.now_s()))
+        while any(began_s is None or one.answered_s <= began_s for one in under_way.values()):
+            self._clock.step(math.inf)
+
+    def _run(self, number: int, recorded: RecordedTask, *, instead: Decision | None, ask: bool) -> None:
         self._chooser.begin(recorded.deadline_s, instead=instead, ask=ask)
         for site in self._sites:
-            site.begin(recorded)
+            site.begin(number, recorded)
         with contextlib.suppress(OffloadError):  # as in the run, no site may have answered
-            self._offload(self._function, recorded.size, timeout_s=recorded.timeout_s)
-        return self._records[-1]
+            self._offload(self._function, recorded.size, number, timeout_s=recorded.timeout_s)
 
     def _as_decided(self, decision: Decision | None, recorded: RecordedTask) -> Played:
         """What would have become of a task that ran on both sites only so that both learn."""
@@ -111,6 +128,15 @@ class VirtualRobot:
         ends_s = {one: began_s + taken_s[one] for one, began_s in begins_s.items()}
         first = min(ends_s, key=ends_s.__getitem__)
         return Played(first == CLOUD, len(begins_s) > 1, ends_s[first])
+
+
+def _carried_out(recorded: RecordedTask) -> Decision:
+    """The decision of the run, without a second run that was then not due or not allowed."""
+    decision = recorded.decision
+    assert decision is not None, "a run is followed that decided its tasks"
+    if decision.second is not None and decision.second.site not in recorded.runs:
+        return decision._replace(second=None)
+    return decision
 
 
 class _Chooser:
@@ -139,11 +165,11 @@ def by_process(tasks: Sequence[RecordedTask]) -> list[list[RecordedTask]]:
     return [list(group) for _, group in itertools.groupby(tasks, operator.attrgetter("process"))]
 
 
-@task("replayed", size=lambda size: size)
-def _replayed(size: Size) -> None:  # noqa: ARG001
+@task("replayed", size=lambda size, number: size)  # noqa: ARG005 - the size is known
+def _replayed(size: Size, number: int) -> None:  # noqa: ARG001
     raise AssertionError("a replayed task is looked up, not run")
 
 
-@task("replayed_with_work", size=lambda size: size, work=lambda work: work)
-def _replayed_with_work(size: Size) -> float:  # noqa: ARG001
+@task("replayed_with_work", size=lambda size, number: size, work=lambda work: work)  # noqa: ARG005
+def _replayed_with_work(size: Size, number: int) -> float:  # noqa: ARG001
     raise AssertionError("a replayed task is looked up, not run")

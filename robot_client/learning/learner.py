@@ -23,8 +23,8 @@ class PendingTask:
     """A task that is under way, and what was known when it was decided.
 
     `amount`: what the predictors were asked for. `absent`: why sites are not in the forecast.
-    `work`: what a result told. `started_s`: by the clock of the offloader. `call`: may name one more site while the task runs.
-    `ended`: the runs that a probe is compared by.
+    `started_s`: by the clock of the offloader. `call`: may name one more site while the task runs.
+    `work`: what a result told. `ended`: the runs that a probe is compared by.
     """
 
     task: Task

@@ -62,7 +62,7 @@ class Execution:
     bytes_out, bytes_in: bytes of the messages, without transport headers.
     started: false if the task certainly never ran there.
     packed: what was made smaller before it was sent; `network_s` leaves out the time for it.
-    held_up: there is no answer, and the site did not answer heartbeats either, or was late, when the run ended.
+    held_up: the run failed while the heartbeats of the site were unanswered or late.
     """
 
     site: str

@@ -42,7 +42,9 @@ def outlook(
     in_flight: int = 0,
     bytes_out: int = 100,
 ) -> Outlook:
-    return of.site(site).outlook(1.0, condition, in_flight=in_flight, timeout_s=2.0, sending=Sending(bytes_out))
+    return of.site(site).outlook(
+        1.0, condition, in_flight=in_flight, timeout_s=2.0, sending=Sending(bytes_out)
+    )
 
 
 def learn(

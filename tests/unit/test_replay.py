@@ -10,11 +10,11 @@ import pytest
 from offboard.common.errors import ConfigError, DataError
 from offboard.common.tasks import task
 from offboard.loadgen import rivals
+from offboard.loadgen.replay.recorded_tasks import of_rows
+from offboard.loadgen.replay.replay import ReplayConfig, replay_policy, run_replay
 from offboard.loadgen.table import table_two
 from offboard.loadgen.table.measured_rows import Rows, read
 from offboard.loadgen.table.predictor_evaluation import predict
-from offboard.loadgen.replay.recorded_tasks import of_rows
-from offboard.loadgen.replay.replay import ReplayConfig, replay_policy, run_replay
 from offboard.loadgen.table.table_settings import TableConfig
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
