@@ -30,19 +30,8 @@ CLOSE_WAIT_S = 5.0  # that `close` waits for the disk
 
 _OUTLOOK_FIELDS = ("predicted_s", "spread_s", "low_s", "high_s", "age", "failures")
 _EXECUTION_FIELDS = (
-    "site",
-    "seconds",
-    "ok",
-    "error",
-    "censored",
-    "queue_s",
-    "run_s",
-    "network_s",
-    "cpu_s",
-    "bytes_out",
-    "bytes_in",
-    "started",
-    "held_up",
+    *("site", "seconds", "ok", "error", "censored", "started", "held_up"),
+    *("queue_s", "run_s", "network_s", "cpu_s", "bytes_out", "bytes_in"),
 )
 
 log = logging.getLogger(__name__)
