@@ -54,10 +54,9 @@ class Record:
     work: what the results told.
     started_s, timeout_s: when the task began, on the clock of the robot; how long a remote site had for it.
     late: executions of earlier tasks that have ended since the record before.
-    regret: the present estimate, if there is one.
+    regret, savings: the present estimates, if there are any; the savings are those of this kind.
     deadline_s: of the call, if it had one. The call missed it if `waited_s`, the time until the answer, is
     longer.
-    savings: the present estimate for this kind, if there is one.
     """
 
     i: int
