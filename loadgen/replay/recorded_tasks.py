@@ -69,7 +69,8 @@ def of_rows(rows: Rows) -> list[RecordedTask]:
 
 def read_tasks(path: Path, kind: str | None) -> list[RecordedTask]:
     """The tasks of a trace in the order of their answers; `kind` selects one kind."""
-    found, places = [], {}
+    found: list[RecordedTask] = []
+    places: dict[str, int] = {}  # of each task by its id
     for line, fields in enumerate(read_trace(path), 1):
         try:
             if kind is None or fields["kind"] == kind:

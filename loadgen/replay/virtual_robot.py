@@ -66,12 +66,12 @@ class VirtualRobot:
         A task begins when the one before is answered. With `all_learn`, every site learns every task.
         """
         for number, recorded in enumerate(tasks):
-            warm = number >= warm_up
-            self._run(number, recorded, instead=ON_BOTH if all_learn or not warm else None, ask=warm)
+            scored = number >= warm_up
+            self._run(number, recorded, instead=ON_BOTH if all_learn or not scored else None, ask=scored)
             record = self._records.pop()
-            if warm and all_learn:
+            if scored and all_learn:
                 yield self._as_decided(self._chooser.decided, recorded)
-            elif warm:
+            elif scored:
                 runs = record.executions
                 waited_s = runs[0].seconds if len(runs) == 1 else record.waited_s  # without rounding
                 yield Played(record.used == CLOUD, len(runs) > 1, waited_s)

@@ -30,7 +30,9 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
     known: dict[tuple[str, int], dict[str, RobotTasks]] = {}
 
     def factory(name: str, policy: str, seed: int = 1, *, measure_all: bool = False) -> Path:
-        scenario = read_scenario(find_scenario(name)).changed(policy=policy, seed=seed, measure_all=measure_all)
+        scenario = read_scenario(find_scenario(name)).changed(
+            policy=policy, seed=seed, measure_all=measure_all
+        )
         if (name, seed) not in known:
             workload = scenario.workload
             known[name, seed] = {
