@@ -3,16 +3,16 @@
 The fields of a trace are those of docs/formats.md; `recorded_site` plays the runs again.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from offboard.common import errors
-from offboard.common.errors import CloudBroken, CloudError, DataError, OffloadError, TaskError
+from offboard.common.errors import CloudBroken, CloudError, ConfigError, DataError, OffloadError, TaskError
 from offboard.common.tasks import Size
 from offboard.loadgen.robot_files import read_trace
-from offboard.loadgen.table.measured_rows import Rows
+from offboard.loadgen.table.measured_rows import ALLOWED, VALUE_MAX, Rows
 from offboard.robot_client.policies import Decision, Hedge, Probe
 from offboard.robot_client.sites.runner import (
     CLOUD,
@@ -24,7 +24,10 @@ from offboard.robot_client.sites.runner import (
     Execution,
     Packed,
     Sending,
+    checked_timeout,
 )
+
+PARTS = ("queue_s", "run_s", "network_s", "cpu_s")  # of the seconds of an execution
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,27 +82,28 @@ def read_tasks(path: Path, kind: str | None) -> list[RecordedTask]:
             for one in fields.get("late", ()):  # of this task too, if its run was stopped at once
                 if one["id"] in places:
                     _end_late(found, places[one["id"]], one)
-        except (TypeError, KeyError, ValueError, AttributeError) as error:
+        except (TypeError, KeyError, ValueError, AttributeError, ConfigError) as error:
             raise DataError(f"{path}:{line}: cannot be replayed: {error!r}") from error
     return found
 
 
 def _task(fields: Mapping[str, Any]) -> RecordedTask:
     size, features, sites = fields["size"], fields["features"], fields["sites"]
-    work = fields.get("work")
+    work = None if fields.get("work") is None else _number(fields["work"])
     runs = {one["site"]: _execution(one, work) for one in fields["executions"]}
+    began_s = _number(fields["started_s"]) if "started_s" in fields else None
     return RecordedTask(
-        size=tuple(map(float, size)) if isinstance(size, list) else float(size),
+        size=tuple(map(_number, size)) if isinstance(size, list) else _number(size),
         runs=runs,
         conditions={site: _condition(site, features) for site in sites},
         sendings={site: _sending(outlook) for site, outlook in sites.items()},
         sites=tuple(dict.fromkeys((*sites, ONBOARD))),  # onboard always exists
-        decision=_decision(fields["decision"]),
-        i=fields["i"],
-        started_s=fields.get("started_s"),
-        answered_s=fields.get("started_s", 0.0) + fields["waited_s"],
-        timeout_s=fields.get("timeout_s", TIMEOUT_S),
-        deadline_s=fields.get("deadline_s"),
+        decision=_decision(fields["decision"], {*sites, ONBOARD}),
+        i=int(fields["i"]),
+        started_s=began_s,
+        answered_s=(began_s or 0.0) + _number(fields["waited_s"]),
+        timeout_s=checked_timeout(fields.get("timeout_s", TIMEOUT_S)),
+        deadline_s=None if fields.get("deadline_s") is None else checked_timeout(fields["deadline_s"]),
         process=str(fields["id"]).rpartition("-")[0],
         measured=all(site in runs and runs[site].ok for site in (ONBOARD, CLOUD)),
     )
@@ -115,10 +119,14 @@ def _end_late(tasks: list[RecordedTask], place: int, fields: Mapping[str, Any]) 
 
 def _condition(site: str, features: Mapping[str, Any]) -> Condition:
     """What was measured of a site. The wait for the robot's own runs is left out: a replay has its own."""
-    found = {name: features[key] for name in Condition._fields if (key := f"{site}.{name}") in features}
+    found = {
+        name: _number(features[key]) for name in Condition._fields if (key := f"{site}.{name}") in features
+    }
     if site == ONBOARD:
         found.pop("wait_s", None)
-    return Condition(**found) if found else UNMEASURED
+    if found.get("capacity") == 0:
+        raise ValueError(f"{site}.capacity is 0")
+    return Condition(**found) if found else UNMEASURED  # type: ignore[arg-type] # `silent` is 0 or 1
 
 
 def _sending(outlook: Mapping[str, Any]) -> Sending:
@@ -131,10 +139,13 @@ def _sending(outlook: Mapping[str, Any]) -> Sending:
     return Sending(sending["bytes"], tuple((number, size) for number, size in sending["large"]))
 
 
-def _decision(fields: Mapping[str, Any]) -> Decision:
+def _decision(fields: Mapping[str, Any], sites: Collection[str]) -> Decision:
+    for site in (fields["site"], fields["second"]):
+        if site is not None and site not in sites:
+            raise ValueError(f"decision: {site!r} is not one of its sites")
     second: Probe | Hedge | None = None
     if fields["second"] is not None:
-        after_s = fields["second_after_s"]
+        after_s = _number(fields["second_after_s"])
         second = Hedge(fields["second"], after_s) if after_s > 0 else Probe(fields["second"])
     spared = tuple(fields.get("spared", ()))
     return Decision(
@@ -144,22 +155,30 @@ def _decision(fields: Mapping[str, Any]) -> Decision:
 
 def _execution(fields: Mapping[str, Any], work: float | None) -> Execution:
     ok = fields["ok"] and not fields["censored"]
+    part_s = {name: None if fields.get(name) is None else _number(fields[name]) for name in PARTS}
     return Execution(
         fields["site"],
-        float(fields["seconds"]),
+        _number(fields["seconds"]),
         work if ok else None,
         None if ok else _failure(fields.get("error")),
         censored=fields["censored"],
-        queue_s=fields.get("queue_s"),
-        run_s=fields.get("run_s"),
-        network_s=fields.get("network_s"),
-        cpu_s=fields.get("cpu_s"),
-        bytes_out=fields.get("bytes_out", 0),
-        bytes_in=fields.get("bytes_in", 0),
+        queue_s=part_s["queue_s"],
+        run_s=part_s["run_s"],
+        network_s=part_s["network_s"],
+        cpu_s=part_s["cpu_s"],
+        bytes_out=int(_number(fields.get("bytes_out", 0))),
+        bytes_in=int(_number(fields.get("bytes_in", 0))),
         started=fields.get("started", True),
         packed=tuple(Packed(**one) for one in fields.get("packed", ())),
         held_up=fields.get("held_up", False),
     )
+
+
+def _number(value: Any) -> float:
+    number = float(value)
+    if not 0 <= number <= VALUE_MAX:
+        raise ValueError(f"{number} is not {ALLOWED}")
+    return number
 
 
 def _failure(text: str | None) -> OffloadError:

@@ -19,7 +19,7 @@ from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.mazes import warm
 
 warm()
-SEEDS = (1, 2)
+pytestmark = pytest.mark.timeout(60)  # tasks of a simulation are planned for real
 
 Simulated = Callable[..., Path]
 
@@ -59,8 +59,7 @@ def same_percent(path: Path, policy: str) -> float:
 @pytest.mark.parametrize("name", ["calm", "outage", "heavy-tail", "burst"])
 def test_the_policy_of_the_run_decides_as_in_the_run(simulated: Simulated, name: str, policy: str) -> None:
     """At least 99 % of the decisions are equal: site, second site and when it starts."""
-    for seed in SEEDS:
-        assert same_percent(simulated(name, policy, seed), policy) >= 99, seed
+    assert same_percent(simulated(name, policy), policy) >= 99
 
 
 def test_another_policy_decides_otherwise(simulated: Simulated) -> None:
@@ -73,7 +72,7 @@ def test_another_policy_decides_otherwise(simulated: Simulated) -> None:
 def test_a_robot_that_starts_again_knows_nothing(simulated: Simulated, tmp_path: Path) -> None:
     """In a trace of two processes, the second one begins with a warm-up, and so does its replay."""
     path = tmp_path / "trace.jsonl"
-    path.write_text("".join(simulated("calm", "default", seed).read_text() for seed in SEEDS))
+    path.write_text("".join(simulated("heavy-tail", "default", seed).read_text() for seed in (1, 2)))
     assert same_percent(path, "default") >= 99
 
 
@@ -89,18 +88,26 @@ def test_the_policy_sees_the_features_of_the_trace(simulated: Simulated) -> None
     assert mean_s["features"] < mean_s["times"]
 
 
-def test_a_line_that_cannot_be_replayed_is_named(simulated: Simulated, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("old", "new", "error"),
+    [
+        ('"waited_s":', '"waited_s":null,"was":', "TypeError"),
+        ('"seconds":', '"seconds":-1,"was":', "-1.0 is not a finite number"),
+        ('"decision":{"site":"onboard"', '"decision":{"site":"moon"', "'moon' is not one of its sites"),
+        ('"timeout_s":', '"timeout_s":0,"was":', "timeout_s 0: must be above 0"),
+        ('"onboard.capacity":', '"onboard.capacity":0,"was":', "onboard.capacity is 0"),
+    ],
+)
+def test_a_line_that_cannot_be_replayed_is_named(
+    simulated: Simulated, tmp_path: Path, old: str, new: str, error: str
+) -> None:
     """A wrong value is an error with file and line."""
     path = tmp_path / "trace.jsonl"
-    first, second, *_ = simulated("calm", "paper").read_text().splitlines(keepends=True)
-    path.write_text(
-        first
-        + second.replace('"second_after_s":0.0', '"second_after_s":null').replace(
-            '"second":null', '"second":"cloud"'
-        )
-    )
-    with pytest.raises(DataError, match=r"trace\.jsonl:2: cannot be replayed: TypeError"):
+    first, second, *_ = simulated("calm", "default").read_text().splitlines(keepends=True)
+    path.write_text(first + second.replace(old, new))
+    with pytest.raises(DataError, match=r"trace\.jsonl:2: cannot be replayed: ") as raised:
         read_tasks(path, None)
+    assert error in str(raised.value)
 
 
 def test_decisions_are_equal_if_they_start_the_same_sites_at_the_same_time() -> None:
