@@ -14,7 +14,7 @@ from offboard.loadgen.replay.recorded_tasks import RecordedTask
 from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
 from offboard.robot_client.sites.runner import NOTHING, ONBOARD, UNMEASURED, Condition, Execution, Sending
 
-GIVEN_UP = 2.0  # times as long as it ran in the run: when a run ends whose own end the trace does not hold
+GIVEN_UP = 2.0  # times as long as the task took: when a run ends whose own end the trace does not hold
 
 
 @dataclass(eq=False, slots=True)
@@ -59,13 +59,14 @@ class RecordedSite:
             failure = CloudBroken("the trace does not hold this run")
             missing.set_result(Execution(self.site, 0.0, failure=failure, started=False))
             return missing
+        followed = of.decision is not None  # then its seconds include the wait for other tasks
         wait_s = max([run.ends_s - now_s for run in self._runs.values()], default=0.0)
-        if self.site == ONBOARD and wait_s > 0:  # behind a run of an earlier task, as it may have been before
+        if self.site == ONBOARD and wait_s > 0 and not followed:
             taken_s = wait_s + recorded.seconds - (recorded.queue_s or 0.0)
             recorded = replace(recorded, seconds=taken_s, queue_s=wait_s)
         stopped = isinstance(recorded.failure, Overtaken)
-        seconds = recorded.seconds * (GIVEN_UP if stopped else 1.0)
-        lasting = of.decision is not None and not stopped
+        seconds = GIVEN_UP * max(recorded.seconds, of.waited_s) if stopped else recorded.seconds
+        lasting = followed and not stopped
         run = self._runs[task.id] = _Run(recorded, now_s, now_s + seconds, stopped=stopped, lasting=lasting)
         self._clock.at(run.ends_s, partial(self._end, task.id, run))
         return run.future

@@ -38,7 +38,7 @@ class RecordedTask:
     `conditions`, `sendings`: by site, what was measured and what a run would send, when it was decided.
     `sites`: those that could take it. `decision`: of the run; None in a dataset.
     `i`: its place in the order in which tasks began. `process`: one for each start of the robot.
-    `started_s`, `answered_s`: on the clock of the robot; None: unknown.
+    `started_s`: on the clock of the robot; None: unknown. `waited_s`: until it was answered.
     `measured`: both times were known when the task was answered, so it is a row of `measured_rows`.
     """
 
@@ -50,11 +50,15 @@ class RecordedTask:
     decision: Decision | None = None
     i: int = 0
     started_s: float | None = None
-    answered_s: float = 0.0
+    waited_s: float = 0.0
     timeout_s: float = TIMEOUT_S
     deadline_s: float | None = None
     process: str = ""
     measured: bool = True
+
+    @property
+    def answered_s(self) -> float:
+        return (self.started_s or 0.0) + self.waited_s
 
     @property
     def tells_work(self) -> bool:
@@ -91,7 +95,6 @@ def _task(fields: Mapping[str, Any]) -> RecordedTask:
     size, features, sites = fields["size"], fields["features"], fields["sites"]
     work = None if fields.get("work") is None else _number(fields["work"])
     runs = {one["site"]: _execution(one, work) for one in fields["executions"]}
-    began_s = _number(fields["started_s"]) if "started_s" in fields else None
     return RecordedTask(
         size=tuple(map(_number, size)) if isinstance(size, list) else _number(size),
         runs=runs,
@@ -100,8 +103,8 @@ def _task(fields: Mapping[str, Any]) -> RecordedTask:
         sites=tuple(dict.fromkeys((*sites, ONBOARD))),  # onboard always exists
         decision=_decision(fields["decision"], {*sites, ONBOARD}),
         i=int(fields["i"]),
-        started_s=began_s,
-        answered_s=(began_s or 0.0) + _number(fields["waited_s"]),
+        started_s=_number(fields["started_s"]) if "started_s" in fields else None,
+        waited_s=_number(fields["waited_s"]),
         timeout_s=checked_timeout(fields.get("timeout_s", TIMEOUT_S)),
         deadline_s=None if fields.get("deadline_s") is None else checked_timeout(fields["deadline_s"]),
         process=str(fields["id"]).rpartition("-")[0],

@@ -213,7 +213,7 @@ def _table(path: Path, rows: Rows, config: ReplayConfig, lines: list[PolicyScore
     predictor = config.predictor or "each policy's own"
     about = f"predictor {predictor}, window {config.window}, feedback {feedback}"
     absent = set() if config.bootstrap else {"bound"}
-    if is_csv(path):  # no run decided its tasks
+    if all(line.same_percent is None for line in lines):  # no policy of a run decided them
         absent.add("same_percent")
     return Table(
         caption=f"{path}: {len(rows)} rows{left_out}, {about}.",
