@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from offboard.common.errors import Overtaken
 from offboard.loadgen.replay.recorded_tasks import RecordedTask, of_rows
 from offboard.loadgen.replay.replay import ReplayConfig, replay, tables
 from offboard.loadgen.replay.virtual_robot import Played, VirtualRobot
 from offboard.loadgen.table.measured_rows import Rows, write_csv
 from offboard.robot_client.policies import Decision, Forecast, Hedge, Probe
 from offboard.robot_client.settings import Settings
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 
 Times = tuple[float, float]  # onboard, cloud
 
@@ -70,6 +71,30 @@ def test_a_run_that_lost_to_a_hedge_is_stopped() -> None:
     """No task waits for a run whose answer is no longer wanted."""
     _, after = played([(1.0, 0.05), (0.1, 9.0)], sent(ONBOARD, Hedge(CLOUD, 0.2)), sent(ONBOARD))
     assert after.seconds == pytest.approx(0.1)
+
+
+def test_a_run_that_was_stopped_in_the_run_is_stopped_when_the_task_is_answered() -> None:
+    """Its seconds are those of the run, although the hedge had begun late there; then the site is free."""
+    seen: list[Forecast] = []
+
+    class Watching(Scripted):
+        def decide(self, forecast: Forecast) -> Decision:
+            seen.append(forecast)
+            return super().decide(forecast)
+
+    hedged = sent(CLOUD, Hedge(ONBOARD, 0.05))
+    runs = {
+        CLOUD: Execution(CLOUD, 0.06),
+        ONBOARD: Execution(ONBOARD, 0.001, failure=Overtaken("stopped"), censored=True),
+    }
+    tasks = [
+        RecordedTask(1.0, runs, decision=hedged, i=0, started_s=5.0, waited_s=0.06),
+        RecordedTask(1.0, {CLOUD: runs[CLOUD]}, decision=sent(CLOUD), i=1, started_s=5.07, waited_s=0.06),
+    ]
+    memories = Settings().make_memories("default")
+    robot = VirtualRobot(Watching(hedged, sent(CLOUD)), memories, tells_work=False)
+    assert robot.follow(tasks) == [hedged, sent(CLOUD)]
+    assert [forecast.sites[ONBOARD].in_flight for forecast in seen] == [0, 0]
 
 
 def test_second_runs_end_with_the_allowance() -> None:
