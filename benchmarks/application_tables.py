@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from offboard.loadgen.replay.replay import ORACLE
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.outcome_figures import FIGURES
 from offboard.loadgen.table.confidence_intervals import Blocks, Picks
 from offboard.loadgen.table.measured_rows import Column
-from offboard.loadgen.table.replay import ORACLE
 from offboard.loadgen.table.table_formats import UNDEFINED
 from offboard.loadgen.table.table_two_figures import quantile
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD

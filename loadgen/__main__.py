@@ -136,7 +136,7 @@ def _table(argv: Sequence[str]) -> int:
 
 
 def _replay(argv: Sequence[str]) -> int:
-    from offboard.loadgen.table.replay import ReplayConfig, run_replay
+    from offboard.loadgen.replay.replay import ReplayConfig, run_replay
 
     return run_replay(*_file_and_config("replay", ReplayConfig, argv))
 

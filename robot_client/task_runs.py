@@ -125,7 +125,7 @@ class TaskRuns:
     ) -> None:
         """A run has ended after its task was answered; called in any thread."""
         with self._lock:
-            self.late.append(Late.of(pending.id, site, execution))
             self._flights.end(site, pending.task.id)
             if execution.started and not self._life.closed:
                 self._learner.learn_late(pending, execution, beside=beside)
+            self.late.append(Late(pending.id, execution.without_value()))

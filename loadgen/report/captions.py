@@ -6,9 +6,9 @@ The charts are drawn in `charts.py`.
 from dataclasses import dataclass
 from typing import Any
 
+from offboard.loadgen.replay.replay import ORACLE, RECORDED
 from offboard.loadgen.report.chart_data import POINTS_MAX, Times
 from offboard.loadgen.report.findings import Findings
-from offboard.loadgen.table.replay import ORACLE, RECORDED
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 NO_WINDOW = "Not drawn: there are too few rows to fill any window and predict the next row."

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from offboard.loadgen import rivals
-from offboard.loadgen.table.replay import ORACLE, RECORDED
+from offboard.loadgen.replay.replay import ORACLE, RECORDED
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 PAPER = "paper"  # the published rule

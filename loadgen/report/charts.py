@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from offboard.loadgen.replay.replay import ORACLE, RECORDED
 from offboard.loadgen.report.chart_data import Decisions, Times, ecdf
 from offboard.loadgen.report.chart_parts import (
     Axes,
@@ -27,7 +28,6 @@ from offboard.loadgen.report.chart_parts import (
 from offboard.loadgen.report.chart_styles import FURTHER_LOOKS, LOOKS, Look, policy_look
 from offboard.loadgen.report.window_charts import accuracy, errors
 from offboard.loadgen.table.measured_rows import Column
-from offboard.loadgen.table.replay import ORACLE, RECORDED
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 

@@ -6,18 +6,18 @@ Captions and charts are left to `captions.py` and `charts.py`.
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-
+from offboard.loadgen.replay import replay
+from offboard.loadgen.replay.recorded_tasks import read_tasks
+from offboard.loadgen.replay.replay import ORACLE, RECORDED, ReplayConfig, Replayed
 from offboard.loadgen.report import chart_data
 from offboard.loadgen.report.chart_data import Accuracies, Decisions, Times
-from offboard.loadgen.table import replay, table_two
-from offboard.loadgen.table.measured_rows import Column, read_lived
+from offboard.loadgen.table import table_two
+from offboard.loadgen.table.measured_rows import Column, is_csv, read_lived
 from offboard.loadgen.table.measurement_notes import read_noted
 from offboard.loadgen.table.predictor_evaluation import Evaluation
-from offboard.loadgen.table.replay import ORACLE, RECORDED, ReplayConfig
 from offboard.loadgen.table.table_formats import Table
 from offboard.loadgen.table.table_settings import TableConfig
-from offboard.loadgen.table.table_two_figures import Score, Sides
+from offboard.loadgen.table.table_two_figures import Score
 
 
 class Findings:
@@ -83,37 +83,41 @@ class Findings:
         policy = settings.policies[0]
         return chart_data.decisions(
             policy,
-            self._spent_s(self._to_cloud[policy]),
-            self._to_cloud[policy],
+            self._played[policy].spent_s,
+            self._played[policy].to_cloud,
             first=settings.window + 1,
             seed=settings.seed,
-            best=self._to_cloud[ORACLE],
+            best=self._best.to_cloud,
         )
 
     @property
     def spent_s(self) -> dict[str, Column]:
         """The times of the rows after the warm-up, by policy; the run as recorded has other tasks."""
-        found = {policy: self._spent_s(to_cloud) for policy, to_cloud in self._to_cloud.items()}
+        found = {policy: played.spent_s for policy, played in self._played.items()}
+        if found:
+            found[ORACLE] = self._best.spent_s
         return found | ({RECORDED: self.lived.waited_s} if len(self.lived.waited_s) else {})
 
     @cached_property
-    def _to_cloud(self) -> dict[str, Sides]:
-        """Which rows after the warm-up went to the cloud, by policy; empty if there are no such rows."""
+    def _played(self) -> dict[str, Replayed]:
+        """What became of the rows after the warm-up, by policy; empty if there are no such rows."""
         if not len(self.scored):
             return {}
         settings = self.settings
-        found = {
+        run = [] if is_csv(self._source) else read_tasks(self._source, settings.kind)
+        tasks = replay.measured_tasks(self.rows, run)
+        return {
             policy: replay.replay(
-                self.rows,
+                tasks,
                 policy,
                 predictor=settings.predictor,
                 window=settings.window,
                 feedback=settings.feedback,
                 seed=settings.seed,
-            ).to_cloud
+            )
             for policy in settings.policies
         }
-        return found | {ORACLE: self.scored.cloud_s < self.scored.onboard_s}
 
-    def _spent_s(self, to_cloud: Sides) -> Column:
-        return np.where(to_cloud, self.scored.cloud_s, self.scored.onboard_s)
+    @property
+    def _best(self) -> Replayed:
+        return replay.best(self.scored)

@@ -13,12 +13,12 @@ from offboard.common.security.plain_files import replace_file
 from offboard.loadgen import rivals
 from offboard.loadgen.play.run_files import PICTURE, TRACE, find_source
 from offboard.loadgen.progress import progress
+from offboard.loadgen.replay.replay import ORACLE, ReplayConfig
 from offboard.loadgen.report.captions import all_charts
 from offboard.loadgen.report.findings import Findings
 from offboard.loadgen.report.html_page import Panel, page
 from offboard.loadgen.table import published_table_two as paper
 from offboard.loadgen.table.measured_rows import write_whole
-from offboard.loadgen.table.replay import ORACLE, ReplayConfig
 from offboard.loadgen.table.table_settings import ALL, BOTH, CHOSEN, FULL, TableConfig
 from offboard.robot_client import predictors
 from offboard.robot_client.predictors.window import WINDOW, WINDOW_MAX

@@ -23,7 +23,7 @@ from offboard.loadgen.simulation.simulated_testbed import SimulatedTestbed
 from offboard.loadgen.simulation.stepped_offloader import SteppedOffloader
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client.policies import BOTH
-from offboard.robot_client.records.trace import Record, as_dict
+from offboard.robot_client.records.trace import Record, Trace, as_dict
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites import heartbeat
 from offboard.robot_client.sites.runner import ONBOARD
@@ -41,12 +41,15 @@ class SimulatedReference(Reference):
         return self.waited_s
 
 
-def simulate(scenario: Scenario, tasks: Mapping[str, RobotTasks], *, noise: float = 1.0) -> Outcome:
+def simulate(
+    scenario: Scenario, tasks: Mapping[str, RobotTasks], *, noise: float = 1.0, trace: Trace | None = None
+) -> Outcome:
     """Play the scenario to its end, and return the outcome of the first robot.
 
-    `tasks` are those of each robot by name. A `noise` of 0 removes the random part of the costs.
+    `tasks` are those of each robot by name. A `noise` of 0 removes the random part of the costs. `trace` gets
+    every record of the first robot.
     """
-    run = _Run(scenario, tasks, noise)
+    run = _Run(scenario, tasks, noise, trace)
     with run.offload:
         run.play()
     deadline_ms = scenario.workload.deadline_ms
@@ -75,7 +78,9 @@ class _Run:
     task depends on the others.
     """
 
-    def __init__(self, scenario: Scenario, tasks: Mapping[str, RobotTasks], noise: float) -> None:
+    def __init__(
+        self, scenario: Scenario, tasks: Mapping[str, RobotTasks], noise: float, trace: Trace | None
+    ) -> None:
         self._ended: list[_Ended] = []
         self.references: list[Reference] = []
         self._scenario = scenario
@@ -96,7 +101,7 @@ class _Run:
             policy=settings.make_policy(policy),
             memories=settings.make_memories(policy),
             timeout_s=robot.timeout_s,
-            observers=[self._own],
+            observers=[self._own] if trace is None else [self._own, trace.write],
             clock=self._clock,
         )
 

@@ -20,7 +20,7 @@ from offboard.loadgen.table.table_settings import ALL, CHOSEN, FULL, FULL_WINDOW
 from offboard.loadgen.table.table_two_figures import Score, Scored, figures, mean_r, plain
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.learning.site import SiteMemory
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Execution
+from offboard.robot_client.sites.runner import CLOUD, NOTHING, ONBOARD, UNMEASURED, Execution
 
 ROW = Kind("row", function=float, size=float)
 SITES: tuple[str, ...] = (ONBOARD, CLOUD)
@@ -177,6 +177,6 @@ def predict(rows: Rows, length: int, *, predictor: str, feedback: str, seed: int
 
 
 def _seconds(memory: SiteMemory, size: float) -> float:
-    outlook = memory.outlook(size, UNMEASURED, in_flight=0, timeout_s=0.0, bytes_out=0.0)
+    outlook = memory.outlook(size, UNMEASURED, in_flight=0, timeout_s=0.0, sending=NOTHING)
     assert outlook.predicted_s is not None, "a predictor that has learnt something can predict"
     return outlook.predicted_s

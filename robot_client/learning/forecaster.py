@@ -58,7 +58,7 @@ class Forecaster:
                 condition(runner, in_flight) if known.measured else UNMEASURED,
                 in_flight=in_flight,
                 timeout_s=timeout_s,
-                bytes_out=sending.bytes,
+                sending=sending,
                 # Most tasks have nothing to make smaller, so that is asked first.
                 packing=memory.packing.plan(sending, known.link_s) if packs or sending.large else None,
             )

@@ -25,7 +25,7 @@ class PendingTask:
     `runners`: those of the sites that were present then. `absent`: why some are not in the forecast.
     `amount`: what the predictors were asked for.
     `started_s`: by the clock of the offloader. `call`: may name one more site while the task runs.
-    `ended`: the runs that a probe is compared by.
+    `work`: what a result told. `ended`: the runs that a probe is compared by.
     """
 
     task: Task
@@ -42,6 +42,7 @@ class PendingTask:
     absent: Mapping[str, str]
     call: "Future[str] | None" = None
     deadline_s: float | None = None
+    work: float | None = None
     ended: dict[str, Execution] = field(default_factory=dict)
 
     def task_for(self, site: str) -> Task:
@@ -63,7 +64,7 @@ class Learner:
     def learn(self, pending: PendingTask, executions: Sequence[Execution]) -> None:
         """Learn what had ended when the task was answered."""
         ended = [one for one in executions if not isinstance(one.failure, Overtaken)]
-        work = pending.memory.work_of_any(ended)
+        work = pending.work = pending.memory.work_of_any(ended)
         pending.memory.count_task()
         if work is not None:
             pending.memory.learn_size(pending.task.size, work)
@@ -88,11 +89,12 @@ class Learner:
             beside = site != ONBOARD and decision.site == ONBOARD and (decision.both or second_here)
         if site != ONBOARD:
             pending.memory.packing.learn(execution)
+        execution.held_up = not execution.ok and memory.measured and _held_up(pending.runners[site])
         memory.learn(
             pending.amount if work is None else work,
             execution,
             pending.forecast.sites.get(site),
-            silent=not execution.ok and memory.measured and _held_up(pending.runners[site]),
+            silent=execution.held_up,
             size=pending.task.size,
             work=work,
             beside=beside,

@@ -18,7 +18,7 @@ from offboard.robot_client.predictors.base import REMEMBERED
 from offboard.robot_client.predictors.least_squares import LeastSquares
 from offboard.robot_client.predictors.line import RunningMean
 from offboard.robot_client.predictors.parts import Parts
-from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Execution
+from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Execution, Sending
 
 NOT_OF_THE_SITE = (TaskError, CannotCross)  # failures that another site would have too
 
@@ -93,15 +93,15 @@ class SiteMemory:
         *,
         in_flight: int,
         timeout_s: float,
-        bytes_out: float,
+        sending: Sending,
         packing: Packing | None = None,
     ) -> Outlook:
-        """The outlook for a task of this amount that sends this many bytes, unless `packing` says fewer.
+        """The outlook for a task of this amount that sends these bytes, unless `packing` says fewer.
 
         An amount of None is unknown.
         """
         predictor = self.predictor
-        moved = (bytes_out if packing is None else packing.bytes) + self._bytes_in.value
+        moved = (sending.bytes if packing is None else packing.bytes) + self._bytes_in.value
         found = None if amount is None else self._predict(amount, moved, condition)
         if found is None:
             return Outlook(
@@ -112,6 +112,7 @@ class SiteMemory:
                 condition=condition,
                 quality=self._quality,
                 packing=packing,
+                sending=sending,
             )
         seconds = found.seconds + condition.wait_s
         if packing is not None and self._parts is not None:  # all others learn it with the rest of the time
@@ -138,6 +139,7 @@ class SiteMemory:
             errors=errors,
             quality=self._quality,
             packing=packing,
+            sending=sending,
         )
 
     @property

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from offboard.common.tasks import Size
 from offboard.robot_client.predictors.base import WARM_UP
-from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition
+from offboard.robot_client.sites.runner import NOTHING, ONBOARD, UNMEASURED, Condition, Sending
 
 ERRORS_MIN = 10  # with fewer errors, they are taken to be normal, and the spread counts as one of them
 SPREADS_90 = 1.645  # standard deviations on each side that hold 90 % of the times, and above which 5 % are
@@ -129,7 +129,7 @@ class Outlook(NamedTuple):
     `bytes`, `joules`: what running the task there should take.
     `condition`: what was measured of the site. `errors`: how wrong its past predictions were.
     `quality`: of the variant that the site runs; WHOLE for a task without variants.
-    `packing`: what should be made smaller on the way to the site; None: nothing.
+    `sending`: what a run there would send, and `packing`: what of it should be made smaller; None: nothing.
 
     Build it with keywords. It is a named tuple because every task needs one for each site, and a frozen
     dataclass takes twice as long to build.
@@ -152,6 +152,7 @@ class Outlook(NamedTuple):
     errors: PredictionErrors = NO_ERRORS
     quality: Quality = WHOLE
     packing: Packing | None = None
+    sending: Sending = NOTHING
 
     @property
     def given_up(self) -> bool:

@@ -97,7 +97,7 @@ class Parts:
 
     def learn_late(self, size: float, seconds: float, *, moved: float, condition: Condition) -> None:
         """A run was given up after these seconds, which are more than predicted."""
-        if not self.remote:
+        if not (self.remote and self._network.count):  # onboard, or a server that does not tell the parts
             self._learn_run(size, seconds, condition)
             return
         rtt_s = condition.round_trip_s or 0.0

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from offboard.common.errors import describe
 from offboard.common.tasks import Size
@@ -21,7 +21,7 @@ from offboard.robot_client.learning.savings import Savings
 from offboard.robot_client.policies import Decision, Hedge, Outlook
 from offboard.robot_client.policies.forecast import WHOLE
 from offboard.robot_client.records.lines import VERSION, Lines
-from offboard.robot_client.sites.runner import UNMEASURED, Condition, Execution
+from offboard.robot_client.sites.runner import TIMEOUT_S, UNMEASURED, Condition, Execution
 
 WRITE_EVERY_S = 0.5
 WAITING_MAX = 1000  # records in memory
@@ -30,17 +30,8 @@ CLOSE_WAIT_S = 5.0  # that `close` waits for the disk
 
 _OUTLOOK_FIELDS = ("predicted_s", "spread_s", "low_s", "high_s", "age", "failures")
 _EXECUTION_FIELDS = (
-    "site",
-    "seconds",
-    "ok",
-    "error",
-    "censored",
-    "queue_s",
-    "run_s",
-    "network_s",
-    "cpu_s",
-    "bytes_out",
-    "bytes_in",
+    *("site", "seconds", "ok", "error", "censored", "started", "held_up"),
+    *("queue_s", "run_s", "network_s", "cpu_s", "bytes_out", "bytes_in"),
 )
 
 log = logging.getLogger(__name__)
@@ -51,14 +42,7 @@ class Late:
     """An execution that ended after another site had answered; `id` is that of the record of its task."""
 
     id: str
-    site: str
-    seconds: float
-    ok: bool
-    censored: bool
-
-    @classmethod
-    def of(cls, id: str, site: str, execution: Execution) -> Self:
-        return cls(id, site, seconds=execution.seconds, ok=execution.ok, censored=execution.censored)
+    execution: Execution
 
 
 @dataclass(slots=True)
@@ -67,11 +51,12 @@ class Record:
 
     used: the site whose answer was used; None if no site answered.
     amount: what the predictors of the sites were asked with: the size, or the work that was expected for it.
+    work: what the results told.
+    started_s, timeout_s: when the task began, on the clock of the robot; how long a remote site had for it.
     late: executions of earlier tasks that have ended since the record before.
-    regret: the present estimate, if there is one.
+    regret, savings: the present estimates, if there are any; the savings are those of this kind.
     deadline_s: of the call, if it had one. The call missed it if `waited_s`, the time until the answer, is
     longer.
-    savings: the present estimate for this kind, if there is one.
     """
 
     i: int
@@ -84,6 +69,9 @@ class Record:
     used: str | None
     waited_s: float
     amount: Size | None = None
+    work: float | None = None
+    started_s: float = 0.0
+    timeout_s: float = TIMEOUT_S
     late: tuple[Late, ...] = ()
     regret: Regret | None = None
     started_at: datetime = field(default_factory=lambda: datetime.now(UTC))
@@ -91,9 +79,7 @@ class Record:
     savings: Savings | None = None
 
 
-_LATE_FIELDS, _REGRET_FIELDS, _SAVINGS_FIELDS = (
-    tuple(one.name for one in fields(of)) for of in (Late, Regret, Savings)
-)
+_REGRET_FIELDS, _SAVINGS_FIELDS = (tuple(one.name for one in fields(of)) for of in (Regret, Savings))
 
 
 class Trace(Lines):
@@ -173,7 +159,10 @@ def as_dict(record: Record) -> dict[str, Any]:
         "id": record.id,
         "kind": record.kind,
         "started_at": record.started_at.isoformat(timespec="milliseconds"),
+        "started_s": record.started_s,
+        "timeout_s": record.timeout_s,
         "size": record.size,
+        "work": record.work,
         "features": features(record),
         "sites": {site: _outlook(outlook) for site, outlook in record.sites.items()},
         "decision": _decision(record.decision),
@@ -181,7 +170,7 @@ def as_dict(record: Record) -> dict[str, Any]:
         "used": record.used,
         "waited_s": record.waited_s,
         "deadline_s": record.deadline_s,
-        "late": [_values(one, _LATE_FIELDS) for one in record.late],
+        "late": [{"id": one.id} | _execution(one.execution) for one in record.late],
         "regret": _values(record.regret, _REGRET_FIELDS) if record.regret else None,
         "savings": _values(record.savings, _SAVINGS_FIELDS) if record.savings else None,
     }
@@ -205,7 +194,8 @@ def _outlook(outlook: Outlook) -> dict[str, Any]:
     """Only a task with variants has a quality."""
     quality = None if outlook.quality is WHOLE else outlook.quality.value
     packing = None if outlook.packing is None else outlook.packing._asdict()
-    return _values(outlook, _OUTLOOK_FIELDS) | {"quality": quality, "packing": packing}
+    sending = outlook.sending._asdict() if outlook.sending.bytes else None
+    return _values(outlook, _OUTLOOK_FIELDS) | {"quality": quality, "packing": packing, "sending": sending}
 
 
 def _execution(execution: Execution) -> dict[str, Any]:

@@ -62,6 +62,7 @@ class Execution:
     bytes_out, bytes_in: bytes of the messages, without transport headers.
     started: false if the task certainly never ran there.
     packed: what was made smaller before it was sent; `network_s` leaves out the time for it.
+    held_up: the run failed while the heartbeats of the site were unanswered or late.
     """
 
     site: str
@@ -77,6 +78,7 @@ class Execution:
     bytes_in: int = 0
     started: bool = True
     packed: tuple[Packed, ...] = ()
+    held_up: bool = False
 
     def without_value(self) -> "Execution":
         """A copy for the record, without the result, which may be large."""

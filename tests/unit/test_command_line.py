@@ -17,9 +17,9 @@ from offboard.loadgen.compare.compare_settings import CompareConfig
 from offboard.loadgen.export.export import ExportConfig
 from offboard.loadgen.play.measure_dataset import DatasetConfig
 from offboard.loadgen.relay.wan import WanConfig
+from offboard.loadgen.replay.replay import ReplayConfig
 from offboard.loadgen.report.report import ReportConfig
 from offboard.loadgen.robot.config import CallConfig, DriveConfig
-from offboard.loadgen.table.replay import ReplayConfig
 from offboard.loadgen.table.table_settings import TableConfig
 
 SHOWN_MAX = 16  # flags in --help, --help itself included

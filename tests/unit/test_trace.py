@@ -10,6 +10,7 @@ import sys
 import time
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,7 +21,7 @@ from offboard.robot_client.learning.savings import Savings
 from offboard.robot_client.policies import Decision, Hedge, Outlook
 from offboard.robot_client.policies.forecast import Packing
 from offboard.robot_client.records.trace import WAITING_MAX, Late, Record, Trace
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution, Packed
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution, Packed, Sending
 
 ROOT = Path(__file__).parents[2]
 
@@ -37,6 +38,7 @@ def record(i: int = 0) -> Record:
                 failures=1,
                 condition=Condition(round_trip_s=0.03, queue=2),
                 packing=Packing((1,), 2000, 500.0, 0.25),
+                sending=Sending(2010, ((1, 2000),)),
             ),
         },
         decision=Decision(CLOUD, "cloud 1 ms against onboard 2 ms", "paper", second=Hedge(ONBOARD, 0.5)),
@@ -48,18 +50,29 @@ def record(i: int = 0) -> Record:
                 censored=True,
                 bytes_out=10,
                 packed=(Packed(1, "zstd", 2000, bytes=400, seconds=0.2),),
+                held_up=True,
             ),
             Execution(ONBOARD, 0.1, queue_s=0.0, run_s=0.1, network_s=0.0, cpu_s=0.02),
         ),
         used=ONBOARD,
         waited_s=2.1,
         amount=70.0,
-        late=(Late("s-7", CLOUD, 0.4, True, False),),
+        work=60.0,
+        started_s=12.5,
+        timeout_s=3.0,
+        late=(Late("s-7", Execution(CLOUD, 0.4, run_s=0.3)),),
         regret=Regret(0.01, 0.0, 0.02, 9),
         started_at=datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC),
         deadline_s=2.0,
         savings=Savings(0.03, 0.02, 0.04, tasks=50, sent=0.5, probes=8),
     )
+
+
+def ran(site: str, seconds: float, **more: Any) -> dict[str, Any]:
+    """An execution as a line holds it."""
+    unknown = dict.fromkeys(("error", "queue_s", "run_s", "network_s", "cpu_s"))
+    plain = {"ok": True, "censored": False, "started": True, "held_up": False, "packed": []}
+    return {"site": site, "seconds": seconds, "bytes_out": 0, "bytes_in": 0} | unknown | plain | more
 
 
 def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
@@ -74,7 +87,10 @@ def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
         "id": "s-0",
         "kind": "plan_path",
         "started_at": "2026-01-02T03:04:05.000+00:00",
+        "started_s": 12.5,
+        "timeout_s": 3.0,
         "size": 1.5,
+        "work": 60.0,
         "features": {
             "work": 70.0,
             "cloud.round_trip_s": 0.03,
@@ -95,6 +111,7 @@ def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
                 "failures": 0,
                 "quality": None,
                 "packing": None,
+                "sending": None,
             },
             "cloud": {
                 "predicted_s": None,
@@ -105,6 +122,7 @@ def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
                 "failures": 1,
                 "quality": None,
                 "packing": {"compress": [1], "raw_bytes": 2000, "bytes": 500.0, "seconds": 0.25},
+                "sending": {"bytes": 2010, "large": [[1, 2000]]},
             },
         },
         "decision": {
@@ -118,39 +136,22 @@ def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
             "advised": None,
         },
         "executions": [
-            {
-                "site": "cloud",
-                "seconds": 2.0,
-                "ok": False,
-                "error": "CloudTimeout: late",
-                "censored": True,
-                "queue_s": None,
-                "run_s": None,
-                "network_s": None,
-                "cpu_s": None,
-                "bytes_out": 10,
-                "bytes_in": 0,
-                "packed": [{"argument": 1, "how": "zstd", "raw_bytes": 2000, "bytes": 400, "seconds": 0.2}],
-            },
-            {
-                "site": "onboard",
-                "seconds": 0.1,
-                "ok": True,
-                "error": None,
-                "censored": False,
-                "queue_s": 0.0,
-                "run_s": 0.1,
-                "network_s": 0.0,
-                "cpu_s": 0.02,
-                "bytes_out": 0,
-                "bytes_in": 0,
-                "packed": [],
-            },
+            ran(
+                "cloud",
+                2.0,
+                ok=False,
+                error="CloudTimeout: late",
+                censored=True,
+                bytes_out=10,
+                packed=[{"argument": 1, "how": "zstd", "raw_bytes": 2000, "bytes": 400, "seconds": 0.2}],
+                held_up=True,
+            ),
+            ran("onboard", 0.1, queue_s=0.0, run_s=0.1, network_s=0.0, cpu_s=0.02),
         ],
         "used": "onboard",
         "waited_s": 2.1,
         "deadline_s": 2.0,
-        "late": [{"id": "s-7", "site": "cloud", "seconds": 0.4, "ok": True, "censored": False}],
+        "late": [{"id": "s-7", **ran("cloud", 0.4, run_s=0.3)}],
         "regret": {"mean_s": 0.01, "low_s": 0.0, "high_s": 0.02, "probes": 9},
         "savings": {
             "mean_s": 0.03,

@@ -1,11 +1,10 @@
-"""`loadgen replay`: runs each policy on the same measured tasks, with the `Offloader` of the robot.
+"""`loadgen replay`: what each policy makes of the same measured tasks, with the `Offloader` of the robot.
 
-Only the runners differ from a live run: they answer at once, with the time that was measured.
+Only the sites differ from those of a live run: they take as long as was measured, in virtual time.
 """
 
 import sys
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,30 +13,23 @@ import numpy as np
 
 from offboard.common.config import check, setting
 from offboard.common.errors import DataError
-from offboard.common.tasks import Kind, Task, task
 from offboard.loadgen import rivals
 from offboard.loadgen.progress import progress
+from offboard.loadgen.replay import same_decisions
+from offboard.loadgen.replay.recorded_tasks import RecordedTask, of_rows, read_tasks
+from offboard.loadgen.replay.virtual_robot import VirtualRobot
 from offboard.loadgen.table import confidence_intervals, table_two_figures
-from offboard.loadgen.table.measured_rows import Column, Rows, read_lived
+from offboard.loadgen.table.confidence_intervals import Picks
+from offboard.loadgen.table.measured_rows import Column, Rows, is_csv, read_lived
 from offboard.loadgen.table.measurement_notes import read_noted
 from offboard.loadgen.table.table_formats import Heading, Table
-from offboard.loadgen.table.table_settings import BOTH, FULL, MeasuredTimesConfig
+from offboard.loadgen.table.table_settings import FULL, MeasuredTimesConfig
 from offboard.loadgen.table.table_two_figures import Scored, Sides
 from offboard.robot_client import policies
 from offboard.robot_client.learning.memories import Memories
-from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.policies import Decision, Forecast, Policy, Probe
-from offboard.robot_client.predictors import Predictor
+from offboard.robot_client.policies import Policy
 from offboard.robot_client.predictors.window import WINDOW, WINDOW_MAX
-from offboard.robot_client.sites.runner import (
-    CLOUD,
-    NOTHING,
-    ONBOARD,
-    UNMEASURED,
-    Condition,
-    Execution,
-    Sending,
-)
+from offboard.robot_client.settings import Settings
 
 ORACLE = "oracle"
 RECORDED = "as recorded"
@@ -74,7 +66,8 @@ class ReplayConfig(MeasuredTimesConfig):
 class PolicyScore:
     """One line of the table: one policy on the `scored` tasks. None: undefined, or not known from the file.
 
-    If a policy ran a task on both sites, its time is that of the first answer.
+    If a policy ran a task on both sites, its time is that of the first answer. `same_percent` is the share of
+    all decisions of the run that the policy makes too, if it has learnt what the run had learnt.
     """
 
     policy: str
@@ -89,6 +82,7 @@ class PolicyScore:
     accuracy_percent: float | None = None
     cloud_percent: float | None = None
     both_percent: float | None = None
+    same_percent: float | None = None
     note: str = ""
 
 
@@ -105,16 +99,22 @@ HEADINGS: dict[str, Heading] = {
     "accuracy_percent": Heading("accuracy %", r"acc. \%", 2),
     "cloud_percent": Heading("cloud %", r"cloud \%", 2),
     "both_percent": Heading("on both sites %", r"on both sites \%", 2),
+    "same_percent": Heading("as the run %", r"as the run \%", 2),
 }
-FIRST = ("scored", "mean_s", "p95_s", "time_over_oracle", "accuracy_percent", "cloud_percent")
+FIRST = ("same_percent", "scored", "mean_s", "p95_s", "time_over_oracle", "accuracy_percent", "cloud_percent")
 
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """What a policy did with the scored rows: whether the cloud answered first, whether both sites ran."""
+    """What became of the scored tasks: whether the cloud answered, whether two sites ran, and the seconds."""
 
     to_cloud: Sides
     both: Sides
+    spent_s: Column
+
+    def picked(self, picks: Picks) -> "Replayed":
+        """The tasks with these indices, in their shape."""
+        return Replayed(self.to_cloud[picks], self.both[picks], self.spent_s[picks])
 
 
 def run_replay(path: Path, config: ReplayConfig) -> int:
@@ -130,111 +130,91 @@ def tables(path: Path, config: ReplayConfig) -> list[Table]:
     if not len(rows) + rows.left_out:
         raise DataError(f"{path}: there is no {config.kind or 'task'} in this trace")
     recorded = [_recorded(lived.waited_s, lived.to_cloud)] if len(lived.waited_s) else []
+    run = [] if is_csv(path) else read_tasks(path, config.kind)
+    tasks = measured_tasks(rows, run)
     with progress("policies", len(config.modes()) * (len(config.policies) + 1)) as shown:
-        lines = {mode: [*recorded, *_mode_lines(rows, config, mode, shown.step)] for mode in config.modes()}
+        same = {policy: _same_percent(run, policy, config) for policy in config.policies if recorded}
+        lines = {
+            mode: [*recorded, *_mode_lines(tasks, rows, config, feedback=mode, same=same, step=shown.step)]
+            for mode in config.modes()
+        }
     return [_table(path, rows, config, lines[mode], feedback=mode) for mode in config.modes()]
 
 
+def measured_tasks(rows: Rows, run: Sequence[RecordedTask]) -> list[RecordedTask]:
+    """The tasks of these rows: those of the `run`, with all that its trace knows, or else of a dataset.
+
+    The decisions of the run are left out: here the policies decide.
+    """
+    found = [replace(one, decision=None, deadline_s=None) for one in run if one.measured]
+    return found or of_rows(rows)
+
+
 def replay(
-    rows: Rows, policy: str, *, predictor: str | None, window: int, feedback: str, seed: int = 1
+    tasks: Sequence[RecordedTask],
+    policy: str,
+    *,
+    predictor: str | None,
+    window: int,
+    feedback: str,
+    seed: int = 1,
 ) -> Replayed:
     """Replay the policy with this name; without a `predictor` it uses its own."""
-    known = rivals.policy(policy)
-    name = policies.predictor_of(known) if predictor is None else predictor
-    return replay_policy(
-        rows,
-        policies.make(known, seed),
-        predictor=lambda: rivals.make(name, window, seed),
-        window=window,
-        feedback=feedback,
-    )
+    chosen, memories = _made(policy, predictor=predictor, window=window, seed=seed)
+    return replay_policy(tasks, chosen, memories=memories, window=window, feedback=feedback)
 
 
 def replay_policy(
-    rows: Rows, policy: Policy, *, predictor: Callable[[], Predictor], window: int, feedback: str
+    tasks: Sequence[RecordedTask], policy: Policy, *, memories: Memories, window: int, feedback: str
 ) -> Replayed:
-    """Let `policy` decide every row, in order; its decisions on the rows after the first `window`.
+    """Let `policy` decide every task, in order; what became of those after the first `window`.
 
-    The warm-up runs on both sites for every policy, so that all policies are scored on the same rows.
+    The warm-up runs on both sites for every policy, so that all policies are scored on the same tasks.
     """
-    chooser = _Chooser(policy, every=feedback == FULL)
-    to_cloud, both = np.zeros((2, len(rows)), dtype=bool)
-    with Offloader(
-        [_Replaying(ONBOARD, rows.onboard_s), _Replaying(CLOUD, rows.cloud_s)],
-        policy=chooser,
-        memories=Memories(predictor),
-    ) as offload:
-        for row, size in enumerate(rows.size.tolist()):
-            offload(_replayed, size, row, where=BOTH if row < window else None)
-            if row >= window:
-                to_cloud[row], both[row] = chooser.last.site == CLOUD, _ran_both(chooser.last)
-    first = rows.cloud_s < rows.onboard_s
-    return Replayed(np.where(both, first, to_cloud)[window:], both[window:])
+    robot = VirtualRobot(policy, memories, tells_work=_tell_work(tasks))
+    played = list(robot.play(tasks, warm_up=window, all_learn=feedback == FULL))
+    return Replayed(
+        to_cloud=np.array([one.to_cloud for one in played], dtype=bool),
+        both=np.array([one.twice for one in played], dtype=bool),
+        spent_s=np.array([one.seconds for one in played], dtype=np.float64),
+    )
 
 
-def _ran_both(decision: Decision) -> bool:
-    """A probe runs both at once; a hedge waits for a time that a replayed task does not have."""
-    return decision.both or isinstance(decision.second, Probe)
+def best(rows: Rows) -> Replayed:
+    """What the oracle makes of these rows."""
+    to_cloud = rows.cloud_s < rows.onboard_s
+    return Replayed(to_cloud, np.zeros_like(to_cloud), np.minimum(rows.cloud_s, rows.onboard_s))
 
 
-class _Chooser:
-    """Wraps a policy, and keeps its last decision.
+def _same_percent(run: Sequence[RecordedTask], policy: str, config: ReplayConfig) -> float | None:
+    """The share of the run's decisions that this policy makes too."""
 
-    With `every`, each task runs on both sites, so that both learn.
-    """
+    def robot(sites: Sequence[str]) -> VirtualRobot:
+        made = _made(policy, predictor=config.predictor, window=config.window, seed=config.seed)
+        return VirtualRobot(*made, tells_work=_tell_work(run), sites=sites)
 
-    last: Decision
-
-    def __init__(self, policy: Policy, *, every: bool) -> None:
-        self._policy = policy
-        self._every = every
-
-    def decide(self, forecast: Forecast) -> Decision:
-        self.last = self._policy.decide(forecast)
-        return self.last._replace(both=self.last.both or self._every)
+    return same_decisions.same_percent(same_decisions.compare(run, robot))
 
 
-class _Replaying:
-    """A runner that returns the measured times."""
-
-    def __init__(self, site: str, seconds: Column) -> None:
-        self.site = site
-        self._seconds = seconds.tolist()
-
-    def unavailable(self, kind: Kind) -> str | None:  # noqa: ARG002 - every row has both times
-        return None
-
-    def submit(self, task: Task, budget_s: float) -> "Future[Execution]":  # noqa: ARG002 - it was answered
-        _, row = task.args
-        future: Future[Execution] = Future()
-        future.set_result(Execution(self.site, self._seconds[row]))
-        return future
-
-    def to_send(self, task: Task) -> Sending:  # noqa: ARG002 - nothing is sent
-        return NOTHING
-
-    def cancel(self, task: Task) -> None:
-        pass
-
-    def hurry(self) -> None:
-        pass
-
-    def condition(self) -> Condition:
-        return UNMEASURED
-
-    def close(self) -> None:
-        pass
+def _made(policy: str, *, predictor: str | None, window: int, seed: int) -> tuple[Policy, Memories]:
+    """The policy with this name, and what it knows of its tasks at first: nothing."""
+    name = rivals.policy(policy)
+    learnt_with = None if predictor is None else rivals.predictor(predictor)
+    settings = Settings(predictor=learnt_with, window=window, seed=seed)
+    return policies.make(name, seed), settings.make_memories(name)
 
 
-@task("replayed", size=lambda size, row: size)  # noqa: ARG005 - the size of a row is known
-def _replayed(size: float, row: int) -> None:  # noqa: ARG001
-    raise AssertionError("a replayed task is looked up, not run")
+def _tell_work(tasks: Sequence[RecordedTask]) -> bool:
+    return any(one.tells_work for one in tasks)
 
 
 def _table(path: Path, rows: Rows, config: ReplayConfig, lines: list[PolicyScore], *, feedback: str) -> Table:
     left_out = f" ({rows.left_out} tasks without both times left out)" if rows.left_out else ""
     predictor = config.predictor or "each policy's own"
     about = f"predictor {predictor}, window {config.window}, feedback {feedback}"
+    absent = set() if config.bootstrap else {"bound"}
+    if all(line.same_percent is None for line in lines):  # no policy of a run decided them
+        absent.add("same_percent")
     return Table(
         caption=f"{path}: {len(rows)} rows{left_out}, {about}.",
         about={
@@ -245,7 +225,7 @@ def _table(path: Path, rows: Rows, config: ReplayConfig, lines: list[PolicyScore
             "predictor": predictor,
             "window": config.window,
         },
-        headings={name: of for name, of in HEADINGS.items() if name != "bound" or config.bootstrap},
+        headings={name: of for name, of in HEADINGS.items() if name not in absent},
         lines=lines,
         notes=rows.notes,
         first=FIRST,
@@ -253,15 +233,24 @@ def _table(path: Path, rows: Rows, config: ReplayConfig, lines: list[PolicyScore
 
 
 def _mode_lines(
-    rows: Rows, config: ReplayConfig, feedback: str, step: Callable[[], object]
+    tasks: Sequence[RecordedTask],
+    rows: Rows,
+    config: ReplayConfig,
+    *,
+    feedback: str,
+    same: Mapping[str, float | None],
+    step: Callable[[], object],
 ) -> Iterator[PolicyScore]:
     """The lines of one feedback mode; `step` is called after each policy."""
     for name in (*config.policies, ORACLE):
-        yield from _lines(rows, name, config, feedback)
+        for line in _lines(tasks, rows, name, config, feedback=feedback):
+            yield replace(line, same_percent=None if line.bound else same.get(name))
         step()
 
 
-def _lines(rows: Rows, policy: str, config: ReplayConfig, feedback: str) -> Iterator[PolicyScore]:
+def _lines(
+    tasks: Sequence[RecordedTask], rows: Rows, policy: str, config: ReplayConfig, *, feedback: str
+) -> Iterator[PolicyScore]:
     """The figures of one policy, and with --bootstrap the ends of their intervals."""
     line = PolicyScore(policy)
     if len(rows) <= config.window:
@@ -270,11 +259,10 @@ def _lines(rows: Rows, policy: str, config: ReplayConfig, feedback: str) -> Iter
         return
     scored = rows.since(config.window)
     if policy == ORACLE:
-        first = scored.cloud_s < scored.onboard_s
-        played = Replayed(first, np.zeros_like(first))
+        played = best(scored)
     else:
         played = replay(
-            rows,
+            tasks,
             policy,
             predictor=config.predictor,
             window=config.window,
@@ -282,20 +270,23 @@ def _lines(rows: Rows, policy: str, config: ReplayConfig, feedback: str) -> Iter
             seed=config.seed,
         )
     sent = Scored(scored.onboard_s, scored.cloud_s, played.to_cloud)
-    yield replace(line, scored=len(scored), **table_two_figures.plain(_figures(sent, played.both)))
+    yield replace(line, scored=len(scored), **table_two_figures.plain(_figures(sent, played)))
     if config.bootstrap:
         ends = config.blocks(len(scored)).intervals(
-            lambda picks: _figures(sent.picked(picks), played.both[picks])
+            lambda picks: _figures(sent.picked(picks), played.picked(picks))
         )
         for bound, end in zip(confidence_intervals.BOUNDS, ends, strict=True):
             yield replace(line, bound=bound, scored=len(scored), **end)
 
 
-def _figures(sent: Scored, both: Sides) -> dict[str, Any]:
-    spent_s = np.where(sent.to_cloud, sent.cloud_s, sent.onboard_s)
-    rule = table_two_figures.rule_figures(sent)
+def _figures(sent: Scored, played: Replayed) -> dict[str, Any]:
+    rule = table_two_figures.rule_figures(sent, played.spent_s)
     kept = ("time_over_oracle", "regret_s", "regret_mean_s", "accuracy_percent", "cloud_percent")
-    return _times(spent_s) | {name: rule[name] for name in kept} | {"both_percent": 100 * both.mean(-1)}
+    return (
+        _times(played.spent_s)
+        | {name: rule[name] for name in kept}
+        | {"both_percent": 100 * played.both.mean(-1)}
+    )
 
 
 def _recorded(waited_s: Column, to_cloud: Sides) -> PolicyScore:

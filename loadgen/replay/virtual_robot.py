@@ -1,0 +1,175 @@
+"""A robot in virtual time: the `Offloader` of the robot runs recorded tasks on recorded sites.
+
+Either the policy decides (`play`), or the run is followed and the policy is only asked (`follow`).
+"""
+
+import contextlib
+import itertools
+import math
+import operator
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+from offboard.common.errors import OffloadError
+from offboard.common.tasks import Size, task
+from offboard.loadgen.replay.recorded_site import RecordedSite
+from offboard.loadgen.replay.recorded_tasks import RecordedTask
+from offboard.loadgen.simulation.model.lockstep_clock import LockstepClock
+from offboard.robot_client.execution import batch
+from offboard.robot_client.learning.memories import Memories
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.policies import ALONE, PINNED, Decision, Forecast, Hedge, Policy, observe
+from offboard.robot_client.policies.allowance import Allowance
+from offboard.robot_client.policies.objectives import by_deadline
+from offboard.robot_client.records.trace import Record
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
+
+NOT_BY_A_RULE = (PINNED, ALONE, batch.NAME, observe.NAME)  # who else decides where a task runs
+ON_BOTH = Decision(ONBOARD, "all sites learn", PINNED, both=True)
+
+
+class Played(NamedTuple):
+    """What became of a task: whether the cloud answered, whether two sites ran it, how long it took."""
+
+    to_cloud: bool
+    twice: bool
+    seconds: float
+
+
+class VirtualRobot:
+    """Runs tasks one after the other; `sites` are its sites, in the order in which it knows them."""
+
+    def __init__(
+        self, policy: Policy, memories: Memories, *, tells_work: bool, sites: Sequence[str] = (ONBOARD, CLOUD)
+    ) -> None:
+        self._function = _replayed_with_work if tells_work else _replayed
+        self._clock = LockstepClock()
+        self._zero_s: float | None = None  # when the first task began, on the clock of the run
+        self._allowance = Allowance()
+        self._sites = [RecordedSite(site, self._clock) for site in sites]
+        self._chooser = _Chooser(policy)
+        self._records: deque[Record] = deque(maxlen=1)
+        self._offload = Offloader(
+            self._sites,
+            policy=self._chooser,
+            memories=memories,
+            allowance=self._allowance,
+            observers=[self._records.append],
+            clock=self._clock,
+        )
+
+    def play(self, tasks: Sequence[RecordedTask], *, warm_up: int, all_learn: bool) -> Iterator[Played]:
+        """Let the policy decide every task after the first `warm_up`, which run on all sites.
+
+        A task begins when the one before is answered. With `all_learn`, every site learns every task.
+        """
+        for number, recorded in enumerate(tasks):
+            scored = number >= warm_up
+            self._run(number, recorded, instead=ON_BOTH if all_learn or not scored else None, ask=scored)
+            record = self._records.pop()
+            if scored and all_learn:
+                yield self._as_decided(self._chooser.decided, recorded)
+            elif scored:
+                runs = record.executions
+                waited_s = runs[0].seconds if len(runs) == 1 else record.waited_s  # without rounding
+                yield Played(record.used == CLOUD, len(runs) > 1, waited_s)
+
+    def follow(self, tasks: Sequence[RecordedTask]) -> list[Decision | None]:
+        """What the policy would have decided for each task after all that the run had learnt before.
+
+        None: in the run no rule decided. Each task begins when it did in the run, and runs as it did there.
+        """
+        decided: list[Decision | None] = [None] * len(tasks)
+        under_way: dict[int, RecordedTask] = {}
+
+        def run(number: int, decision: Decision) -> None:
+            self._run(number, tasks[number], instead=decision, ask=decision.policy not in NOT_BY_A_RULE)
+            del under_way[number]
+
+        for number in sorted(range(len(tasks)), key=lambda number: tasks[number].i):
+            self._wait_for(tasks[number], under_way)
+            under_way[number] = tasks[number]
+            self._clock.begin(partial(run, number, _carried_out(tasks[number])))
+            decided[number] = self._chooser.decided
+        while under_way:
+            self._clock.step(math.inf)
+        return decided
+
+    def _wait_for(self, begins: RecordedTask, under_way: Mapping[int, RecordedTask]) -> None:
+        """Let the time pass until this task begins, and until all have their answer that had it by then."""
+        began_s = begins.started_s
+        if began_s is not None:
+            self._zero_s = began_s if self._zero_s is None else self._zero_s
+            self._clock.pass_by(max(0.0, began_s - self._zero_s - self._clock.now_s()))
+        while any(began_s is None or one.answered_s <= began_s for one in under_way.values()):
+            self._clock.step(math.inf)
+
+    def _run(self, number: int, recorded: RecordedTask, *, instead: Decision | None, ask: bool) -> None:
+        self._chooser.begin(recorded.deadline_s, instead=instead, ask=ask)
+        for site in self._sites:
+            site.begin(number, recorded)
+        with contextlib.suppress(OffloadError):  # as in the run, no site may have answered
+            self._offload(self._function, recorded.size, number, timeout_s=recorded.timeout_s)
+
+    def _as_decided(self, decision: Decision | None, recorded: RecordedTask) -> Played:
+        """What would have become of a task that ran on both sites only so that both learn."""
+        assert decision is not None, "the policy is always asked"
+        site, second = decision.site, decision.second
+        taken_s = {one: recorded.runs[one].seconds for one in (ONBOARD, CLOUD)}
+        begins_s = {ONBOARD: 0.0, CLOUD: 0.0} if decision.both else {site: 0.0}
+        if second is not None:
+            after_s = second.after_s if isinstance(second, Hedge) else 0.0
+            if after_s < taken_s[site] and self._allowance.duplicates >= 1:
+                begins_s[second.site] = after_s
+        if len(begins_s) > 1:
+            self._allowance.duplicate()
+        ends_s = {one: began_s + taken_s[one] for one, began_s in begins_s.items()}
+        first = min(ends_s, key=ends_s.__getitem__)
+        return Played(first == CLOUD, len(begins_s) > 1, ends_s[first])
+
+
+def _carried_out(recorded: RecordedTask) -> Decision:
+    """The decision of the run, without a second run that was then not due or not allowed."""
+    decision = recorded.decision
+    assert decision is not None, "a run is followed that decided its tasks"
+    if decision.second is not None and decision.second.site not in recorded.runs:
+        return decision._replace(second=None)
+    return decision
+
+
+class _Chooser:
+    """Asks a policy, and carries out its decision or another one `instead`."""
+
+    def __init__(self, policy: Policy) -> None:
+        self._policy = policy
+        self.begin(None, instead=ON_BOTH, ask=False)
+
+    def begin(self, deadline_s: float | None, *, instead: Decision | None, ask: bool) -> None:
+        """The next task may be decided `instead` of the policy, which is then asked only with `ask`."""
+        self._deadline_s, self._instead, self._ask = deadline_s, instead, ask
+        self.decided: Decision | None = None
+
+    def decide(self, forecast: Forecast) -> Decision:
+        if self._ask or self._instead is None:
+            by = forecast if self._deadline_s is None else by_deadline(forecast, self._deadline_s)
+            self.decided = self._policy.decide(by)
+        decision = self._instead or self.decided
+        assert decision is not None
+        return decision
+
+
+def by_process(tasks: Sequence[RecordedTask]) -> list[list[RecordedTask]]:
+    """The tasks of each start of the robot, which then knew nothing."""
+    return [list(group) for _, group in itertools.groupby(tasks, operator.attrgetter("process"))]
+
+
+@task("replayed", size=lambda size, number: size)  # noqa: ARG005 - the size is known
+def _replayed(size: Size, number: int) -> None:  # noqa: ARG001
+    raise AssertionError("a replayed task is looked up, not run")
+
+
+@task("replayed_with_work", size=lambda size, number: size, work=lambda work: work)  # noqa: ARG005
+def _replayed_with_work(size: Size, number: int) -> float:  # noqa: ARG001
+    raise AssertionError("a replayed task is looked up, not run")
