@@ -13,7 +13,7 @@ TABLES = (
     "planner",
     "decision",
     "lower_bounds",
-    "round_trip",
+    "calls",
     "server_load",
     "attacks",
     "footprint",
