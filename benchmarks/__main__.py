@@ -18,6 +18,7 @@ TABLES = (
     "attacks",
     "footprint",
     "page_cost",
+    "task_cost",
 )
 
 
