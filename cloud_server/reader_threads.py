@@ -90,14 +90,20 @@ class ReaderThreads:
             self._ended.set_exception(error)
 
     def _run(self, chosen: list[Work]) -> bool:
-        """Start this work, the last of it in this thread if possible. True if another thread leads now."""
+        """Start this work, the last of it in this thread if possible. True if another thread leads now.
+
+        Then this thread goes on with what waits: a plan that another thread has to wake up for starts later.
+        """
         *others, here = chosen
         self._start(others)
         outcome = self._executor.run(self._call(here), meanwhile=self._lead)
         if outcome is None:
             self._start([here])
             return False
-        self._start(self._answer(here, outcome))
+        while outcome is not None and (chosen := self._answer(here, outcome)):
+            *others, here = chosen
+            self._start(others)
+            outcome = self._executor.run(self._call(here), meanwhile=None)
         return True
 
     def _run_short(self, chosen: list[Work]) -> bool:
