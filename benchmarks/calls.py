@@ -1,4 +1,4 @@
-"""The time of a call as a user makes it, through Offboard and through other software, with new data each time.
+"""The time of a call as a user makes it, with new data each time, through Offboard and other software.
 
 Each of them has a server and a process that calls it, as `peers` starts them. They run in turns.
 """

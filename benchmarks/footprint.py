@@ -61,7 +61,9 @@ def _help() -> Table:
         said = _run([*python, "-X", "importtime", "-m", *f"offboard.{words}".split(), "--help"])
         loaded = [heavy for heavy in HEAVY if f"| {heavy}\n" in said.replace(" " * 2, "")]
         requirements.append(Requirement(f"heavy libraries that {name} --help imports", len(loaded), 0))
-    return Table("Time of --help and of an import", ("command", "ms", f"relative to {NOTHING}"), rows, requirements)
+    return Table(
+        "Time of --help and of an import", ("command", "ms", f"relative to {NOTHING}"), rows, requirements
+    )
 
 
 def _run(command: list[str]) -> str:

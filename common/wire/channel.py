@@ -52,8 +52,8 @@ class Channel:
     def send(self, frames: Sequence[Any]) -> None:
         """Send without waiting; zmq.Again if the queue is full."""
         with self.lock:
-            # libzmq signals only once for everything that happened, and sending may use up the signal. A reader
-            # that does not wait yet looks before it does.
+            # libzmq signals only once for everything that happened, and sending may use up the signal.
+            # A reader that does not wait yet looks before it does.
             self._read_out = False
             *first, last = frames
             for frame in first:

@@ -1,5 +1,6 @@
 """Short tasks run in the thread that reads the socket, and keep nobody waiting if they are long after all."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ def test_short_tasks_stay_in_one_thread(serve: Serve, join: Join) -> None:
     """Once a kind is known to be short, its tasks run in the thread that reads, without a hand-over."""
     peer = join(serve(workers=2).server.endpoint)
     threads = [peer.value(id, "served_thread") for id in range(1, TASKS)]
-    moves = sum(before != after for before, after in zip(threads, threads[1:], strict=False))
+    moves = sum(before != after for before, after in pairwise(threads))
     assert moves < TASKS / 2, threads  # a computer that stalls makes a task long, and a hand-over
 
 
