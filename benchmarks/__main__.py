@@ -13,12 +13,13 @@ TABLES = (
     "planner",
     "decision",
     "lower_bounds",
-    "round_trip",
+    "calls",
     "server_load",
     "hundred_robots",
     "attacks",
     "footprint",
     "page_cost",
+    "task_cost",
 )
 
 

@@ -16,10 +16,11 @@ from benchmarks.servers import READY_S, Server, cloud_server, running
 from offboard.common.wire import messages as wire
 
 COMMANDS = {"robot-client check": "robot_client check", "cloud-server": "cloud_server", "loadgen": "loadgen"}
-ROBOTS = 500  # connected and idle
+ROBOTS = 1_000  # connected
+BEATS_A_S = 2  # heartbeats of each robot
 REST_S = 10.0
 HEAVY = ("zmq", "numba")
-NOTHING = "python -c pass"
+NOTHING, IMPORT = "python -c pass", "import offboard"
 ROOT = Path(__file__).parents[1]
 TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 # A robot that is connected and idle, with its planner compiled.
@@ -46,6 +47,7 @@ def _help() -> Table:
         cases[f"{name} --help"] = lambda words=words: _run(
             [*python, "-m", *f"offboard.{words}".split(), "--help"]
         )
+    cases[IMPORT] = lambda: _run([*python, "-c", IMPORT])
     seconds = interleaved(cases)
     least = seconds[NOTHING]
     rows = [[name, f"{each * 1e3:.0f}", f"{each / least:.1f}"] for name, each in seconds.items()]
@@ -54,11 +56,14 @@ def _help() -> Table:
         for name, each in seconds.items()
         if each != least
     ]
+    requirements.append(Requirement(f"{IMPORT} alone", (seconds[IMPORT] - least) * 1e3, 60, "ms"))
     for name, words in COMMANDS.items():
         said = _run([*python, "-X", "importtime", "-m", *f"offboard.{words}".split(), "--help"])
         loaded = [heavy for heavy in HEAVY if f"| {heavy}\n" in said.replace(" " * 2, "")]
         requirements.append(Requirement(f"heavy libraries that {name} --help imports", len(loaded), 0))
-    return Table("Time of --help", ("command", "ms", f"relative to {NOTHING}"), rows, requirements)
+    return Table(
+        "Time of --help and of an import", ("command", "ms", f"relative to {NOTHING}"), rows, requirements
+    )
 
 
 def _run(command: list[str]) -> str:
@@ -76,12 +81,16 @@ def _rest() -> Table:
         robot.stdout.readline()
         mib = {"robot": _mib(robot.pid), "server": _mib(server.pid)}
         busy = _cpu_share({"robot": robot.pid, "server": server.pid})
-        each_kb = _connected(stack, server)
+        before = _mib(server.pid)
+        sockets = _connected(stack, server)
+        each_kb = (_mib(server.pid) - before) * 1024 * 1.024 / ROBOTS
+        beating = _cpu_share({"server": server.pid}, meanwhile=lambda: _beat(sockets))["server"]
     rows = [
         ["server, cold start until ready", f"{cold.took_s:.2f} s"],
         ["server, warm start (planner compiled before)", f"{server.took_s:.2f} s"],
         *([f"{name} at rest", f"{mib[name]:.0f} MiB, {busy[name]:.2%} of a core"] for name in mib),
         [f"server, per robot ({ROBOTS} are connected)", f"{each_kb:.1f} kB"],
+        [f"server, {ROBOTS} robots with {BEATS_A_S} heartbeats a second", f"{beating:.1%} of a core"],
     ]
     requirements = [
         Requirement("cold start", cold.took_s, 15.0, "s"),
@@ -89,6 +98,7 @@ def _rest() -> Table:
         Requirement("robot at rest, planner compiled", mib["robot"], 200, "MiB"),
         *(Requirement(f"CPU of the {name} at rest", 100 * share, 0.5, "%") for name, share in busy.items()),
         Requirement("server memory per robot", each_kb, 50, "kB"),
+        Requirement(f"CPU of the server for the heartbeats of {ROBOTS} robots", 100 * beating, 10, "%"),
     ]
     return Table("Start and rest", ("process", "time, or memory and CPU"), rows, requirements)
 
@@ -98,10 +108,13 @@ def _mib(pid: int) -> float:
     return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS")) / 1024
 
 
-def _cpu_share(pids: dict[str, int]) -> dict[str, float]:
-    before = {name: _ticks(pid) for name, pid in pids.items()}
-    time.sleep(REST_S)
-    return {name: (_ticks(pid) - before[name]) * TICK_S / REST_S for name, pid in pids.items()}
+def _cpu_share(
+    pids: dict[str, int], meanwhile: Callable[[], object] = lambda: time.sleep(REST_S)
+) -> dict[str, float]:
+    before, began_s = {name: _ticks(pid) for name, pid in pids.items()}, time.perf_counter()
+    meanwhile()
+    took_s = time.perf_counter() - began_s
+    return {name: (_ticks(pid) - before[name]) * TICK_S / took_s for name, pid in pids.items()}
 
 
 def _ticks(pid: int) -> int:
@@ -109,11 +122,11 @@ def _ticks(pid: int) -> int:
     return int(fields[11]) + int(fields[12])
 
 
-def _connected(stack: contextlib.ExitStack, server: Server) -> float:
-    """The memory of the server for each robot that has said hello, in kB."""
+def _connected(stack: contextlib.ExitStack, server: Server) -> "list[zmq.Socket[bytes]]":
+    """The sockets of robots that have said hello."""
     context = stack.enter_context(zmq.Context())
     context.set(zmq.MAX_SOCKETS, 2 * ROBOTS)
-    before, hello = _mib(server.pid), wire.pack(wire.Hello({}, "bench", 2**20))
+    sockets, hello = list[zmq.Socket[bytes]](), wire.pack(wire.Hello({}, "bench", 2**20))
     for _ in range(ROBOTS):
         socket = stack.enter_context(context.socket(zmq.DEALER))
         socket.linger = 0
@@ -121,7 +134,22 @@ def _connected(stack: contextlib.ExitStack, server: Server) -> float:
         socket.send_multipart(hello)
         if not socket.poll(READY_S * 1e3):
             raise RuntimeError("the server did not answer hello")
-    return (_mib(server.pid) - before) * 1024 * 1.024 / ROBOTS
+        socket.recv_multipart()
+        sockets.append(socket)
+    return sockets
+
+
+def _beat(sockets: "list[zmq.Socket[bytes]]") -> None:
+    """Send the heartbeats of all robots, evenly spread over the time, and read the answers."""
+    began_s, ping = time.perf_counter(), wire.pack(wire.Ping(1))
+    for n in range(int(REST_S * BEATS_A_S * len(sockets))):
+        time.sleep(max(0.0, began_s + n / (BEATS_A_S * len(sockets)) - time.perf_counter()))
+        socket = sockets[n % len(sockets)]
+        if n >= len(sockets):
+            if not socket.poll(READY_S * 1e3):
+                raise RuntimeError("the server did not answer a heartbeat")
+            socket.recv_multipart()
+        socket.send_multipart(ping)
 
 
 def _installed() -> Table:

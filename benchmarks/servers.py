@@ -1,10 +1,11 @@
-"""Servers to measure: `cloud-server`, and other software that answers an empty call.
+"""Servers to measure: `cloud-server`, and other software that answers the same calls.
 
 `python -m benchmarks.servers NAME` starts one of the others, and prints its port.
 """
 
 import contextlib
 import os
+import pickle
 import socket
 import subprocess
 import sys
@@ -17,6 +18,8 @@ from typing import Any
 
 READY_S = 30.0
 POLL_S = 0.01
+KEPT_S = 3600  # a connection that waits for its next round
+MESSAGE_BYTES_MAX = 64 * 1024 * 1024  # of gRPC
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,10 +81,27 @@ def echo() -> None:
         router.send_multipart(router.recv_multipart(copy=False), copy=False)
 
 
+def length_of(array: Any) -> int:
+    """What the servers below compute: the bytes of an array; 0 for an empty call."""
+    return 0 if array is None else int(array.nbytes)
+
+
+def pickled() -> None:
+    """A plain ROUTER socket, with arguments and result as pickles."""
+    import zmq
+
+    router = zmq.Context.instance().socket(zmq.ROUTER)
+    print(router.bind_to_random_port("tcp://127.0.0.1"), flush=True)
+    while True:
+        robot, request = router.recv_multipart(copy=False)
+        answer = length_of(*pickle.loads(request.buffer))
+        router.send_multipart([robot, pickle.dumps(answer)])
+
+
 def http() -> None:
-    """FastAPI on uvicorn, with an empty handler."""
+    """FastAPI on uvicorn, which counts the bytes of a body."""
     import uvicorn
-    from fastapi import FastAPI
+    from fastapi import FastAPI, Request
 
     @contextlib.asynccontextmanager
     async def listening(_app: FastAPI) -> AsyncIterator[None]:
@@ -90,24 +110,27 @@ def http() -> None:
 
     port, app = free_port(), FastAPI(lifespan=listening)
 
-    @app.post("/nothing")
-    def nothing() -> None:
-        pass
+    @app.post("/length")
+    async def length(request: Request) -> int:
+        return len(await request.body())
 
-    uvicorn.run(app, host="127.0.0.1", port=port, log_level="error")
+    uvicorn.run(app, host="127.0.0.1", port=port, log_level="error", timeout_keep_alive=KEPT_S)
 
 
 def grpc() -> None:
-    """gRPC, with an empty unary call of bytes."""
+    """gRPC, with an argument and a result as pickles."""
     import grpc as library
 
-    def nothing(request: bytes, _context: Any) -> bytes:
-        return request
-
     handler = library.method_handlers_generic_handler(
-        "bench", {"nothing": library.unary_unary_rpc_method_handler(nothing)}
+        "bench",
+        {
+            "length": library.unary_unary_rpc_method_handler(
+                lambda request, _context: length_of(*request), pickle.loads, pickle.dumps
+            )
+        },
     )
-    server = library.server(ThreadPoolExecutor(2))
+    limits = [(f"grpc.max_{way}_message_length", MESSAGE_BYTES_MAX) for way in ("send", "receive")]
+    server = library.server(ThreadPoolExecutor(2), options=limits)
     server.add_generic_rpc_handlers((handler,))
     port = server.add_insecure_port("127.0.0.1:0")
     server.start()
@@ -116,4 +139,4 @@ def grpc() -> None:
 
 
 if __name__ == "__main__":
-    {"echo": echo, "http": http, "grpc": grpc}[sys.argv[1]]()
+    {"echo": echo, "pickle": pickled, "http": http, "grpc": grpc}[sys.argv[1]]()

@@ -46,8 +46,8 @@ class Executor(Protocol):
         thread if no worker can take the task.
         """
 
-    def run(self, call: Call, *, meanwhile: Callable[[], None]) -> Outcome | None:
-        """Run a task in this thread while another thread runs `meanwhile`.
+    def run(self, call: Call, *, meanwhile: Callable[[], None] | None) -> Outcome | None:
+        """Run a task in this thread while another thread runs `meanwhile`, if that is not None.
 
         Returns None, and runs nothing, if this executor does not run tasks in the calling thread.
         """
@@ -87,8 +87,9 @@ class ThreadExecutor:
         self._calls.put(lambda: outcome.set_result(run_task(call, self._states)))
         return outcome
 
-    def run(self, call: Call, *, meanwhile: Callable[[], None]) -> Outcome | None:
-        self._calls.put(meanwhile)
+    def run(self, call: Call, *, meanwhile: Callable[[], None] | None) -> Outcome | None:
+        if meanwhile is not None:
+            self._calls.put(meanwhile)
         return run_task(call, self._states)
 
     def used_s(self) -> float:

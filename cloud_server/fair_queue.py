@@ -79,7 +79,9 @@ class FairQueue:
         """The next request. Its robot is charged the usual run time, until `done` reports the true one."""
         if not self._lines:
             return None
-        robot = min(self._lines, key=lambda robot: (self._had_s[robot], self._lines[robot][0].arrived))
+        robot = next(iter(self._lines))
+        if len(self._lines) > 1:
+            robot = min(self._lines, key=lambda robot: (self._had_s[robot], self._lines[robot][0].arrived))
         self._least_s = self._had_s[robot]
         line = self._lines[robot]
         work = line.popleft()
@@ -143,7 +145,8 @@ class _HeldBytes:
 
     def add(self, work: Work) -> None:
         self.byte_count += self.more(work)
-        self._pins.update(map(id, work.blobs.values()))
+        for blob in work.blobs.values():
+            self._pins[id(blob)] += 1
 
     def drop(self, work: Work) -> None:
         for blob in work.blobs.values():

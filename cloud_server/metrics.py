@@ -6,12 +6,14 @@
 import time
 from collections.abc import Callable, Generator
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from typing import Any
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 
 from offboard.common.live.look import Look
 
+LABELS_MAX = 1024  # counters of one metric that are kept at hand: looking one up by its labels takes longer
 COUNTED_S = 10.0  # after the last look
 ROBOTS_MAX = 256  # robots that the page /live tells apart; further ones are counted together
 OTHERS = b""  # the name of the further ones
@@ -79,6 +81,7 @@ class Metrics:
         self.requests = Counter(
             "offboard_server_requests", "Requests by outcome", ["kind", "status"], registry=r
         )
+        self.requests_of = lru_cache(LABELS_MAX)(self.requests.labels)
         self.queue_depth = Gauge(
             "offboard_server_waiting_requests", "Requests waiting for a worker", registry=r
         )
@@ -93,6 +96,8 @@ class Metrics:
         self.run_s = Histogram(
             "offboard_server_run_seconds", "Time in the worker", ["kind"], buckets=SECONDS_BUCKETS, registry=r
         )
+        self.queue_s_of = lru_cache(LABELS_MAX)(self.queue_s.labels)
+        self.run_s_of = lru_cache(LABELS_MAX)(self.run_s.labels)
         self.bytes_in = Counter("offboard_server_received_bytes", "Bytes of messages received", registry=r)
         self.bytes_out = Counter("offboard_server_sent_bytes", "Bytes of messages sent", registry=r)
         self.blob_bytes = Gauge("offboard_server_blob_bytes", "Bytes of stored large arguments", registry=r)

@@ -1,12 +1,14 @@
 """Which thread reads the socket, and which thread runs a task.
 
-With a thread executor, the thread that has read a request also runs it, and another thread goes on reading:
-waking a thread would take longer than a small task (leader and followers, Schmidt et al. 2000). With worker
-processes one thread reads all the time. What a message means is decided in `server`.
+With a thread executor, the thread that has read a request also runs it, and another thread goes on reading
+(leader and followers, Schmidt et al. 2000). For a task of a short kind no other thread wakes: waking one
+takes longer than the task. If that task is not short after all, a watching thread lets another one read. With
+worker processes one thread reads all the time. What a message means is decided in `server`.
 """
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 from concurrent import futures
 from concurrent.futures import Future
@@ -16,6 +18,11 @@ from functools import partial
 from offboard.cloud_server.executors import Executor
 from offboard.cloud_server.fair_queue import Work
 from offboard.cloud_server.task_run import Call, Outcome
+
+SHORT_S = 0.0005  # tasks of a kind that usually take less are short
+USUAL_RATE = 0.1  # share of each new run time in the usual run time of a kind
+AWAY_S = 0.002  # the reading thread may run short tasks for this long; then another thread reads
+WATCHES_S = 0.1  # after the last short task, until the watching thread rests
 
 log = logging.getLogger("offboard.cloud_server")
 
@@ -51,41 +58,91 @@ class ReaderThreads:
         self._wanted = wanted
         self._over = over
         self._ended: Future[None] = Future()  # set by the thread that read last
+        self._usual_s: dict[str, float] = {}  # run time of a task, by kind
+        self._absence = Absence(self._lead_in_new_thread)
 
     def run(self) -> None:
         """Read until `over`. Raises what a turn raised."""
-        threading.Thread(target=self._lead, name="loop", daemon=True).start()
-        self._ended.result()
+        watch = partial(self._absence.watch, self._ended.done)
+        threading.Thread(target=watch, name="watch", daemon=True).start()
+        self._lead_in_new_thread()
+        try:
+            self._ended.result()
+        finally:
+            self._absence.begin()  # wakes the watching thread, which ends
 
     def leave(self, timeout_s: float) -> None:
         """Wait until no thread reads any more."""
         futures.wait([self._ended], timeout_s)
+
+    def _lead_in_new_thread(self) -> None:
+        threading.Thread(target=self._lead, name="loop", daemon=True).start()
 
     def _lead(self) -> None:
         """Read until this thread gets a task to run; then another thread leads."""
         try:
             while not self._over():
                 chosen = self._turn()
-                if chosen and self._run(chosen):
+                if chosen and (self._run_short(chosen) or (chosen and self._run(chosen))):
                     return
             self._ended.set_result(None)
         except BaseException as error:  # noqa: BLE001 - `run` raises it
             self._ended.set_exception(error)
 
     def _run(self, chosen: list[Work]) -> bool:
-        """Start this work, the last of it in this thread if possible. True if another thread leads now."""
+        """Start this work, the last of it in this thread if possible. True if another thread leads now.
+
+        Then this thread goes on with what waits: a plan that another thread has to wake up for starts later.
+        """
         *others, here = chosen
         self._start(others)
         outcome = self._executor.run(self._call(here), meanwhile=self._lead)
         if outcome is None:
             self._start([here])
             return False
+        while outcome is not None and (chosen := self._answer(here, outcome)):
+            *others, here = chosen
+            self._start(others)
+            outcome = self._executor.run(self._call(here), meanwhile=None)
+        return True
+
+    def _run_short(self, chosen: list[Work]) -> bool:
+        """Run the short tasks among this work here, and remove them. True if another thread leads now."""
+        if not any(map(self._short, chosen)):
+            return False
+        self._start([work for work in chosen if not self._short(work)])
+        chosen[:] = filter(self._short, chosen)
+        away, until_s = self._absence.begin(), time.perf_counter() + AWAY_S
+        while chosen and self._short(chosen[0]) and time.perf_counter() < until_s:
+            work = chosen.pop(0)
+            outcome = self._executor.run(self._call(work), meanwhile=None)
+            if outcome is None:
+                self._start([work])
+            else:
+                chosen += self._answer(work, outcome)
+        if self._absence.end(away):
+            return False
+        self._start(chosen)
+        return True
+
+    def _short(self, work: Work) -> bool:
+        return self._usual_s.get(work.request.kind, SHORT_S) < SHORT_S
+
+    def _answer(self, work: Work, outcome: Outcome) -> list[Work]:
+        """Send the reply of a task that ran in this thread; returns the work to start in its place.
+
+        One long task makes its kind long for a while.
+        """
+        usual_s = self._usual_s.get(work.request.kind, 0.0)
+        self._usual_s[work.request.kind] = max(
+            outcome.run_s, usual_s + USUAL_RATE * (outcome.run_s - usual_s)
+        )
         try:
-            self._start(self._answered(here, outcome))
+            return self._answered(work, outcome)
         except Exception:  # as in the callback of a future: the leading thread must go on
             text = "task %d of kind %s could not be answered; remedy: report this traceback"
-            log.exception(text, here.request.id, here.request.kind)
-        return True
+            log.exception(text, work.request.id, work.request.kind)
+            return []
 
     def _start(self, chosen: list[Work]) -> None:
         """Give work to the executor. Called in any thread."""
@@ -107,3 +164,49 @@ class ReaderThreads:
             start.chosen += chosen  # `submit` failed at once; starting here would nest calls
         else:
             self._start(chosen)
+
+
+class Absence:
+    """Notes that the reading thread is away, running short tasks. If it stays away, `take_over` is called.
+
+    `watch` runs in a thread of its own, which rests while no short tasks run.
+    """
+
+    def __init__(self, take_over: Callable[[], None]) -> None:
+        self._take_over = take_over
+        self._lock = threading.Lock()
+        self._since_s: float | None = None  # None: the reading thread is there
+        self._last_s = 0.0
+        self._watched = False
+        self._wanted = threading.Event()
+
+    def begin(self) -> float:
+        """The reading thread leaves; returns what `end` needs."""
+        self._since_s = self._last_s = now_s = time.perf_counter()
+        if not self._watched:
+            self._wanted.set()
+        return now_s
+
+    def end(self, since_s: float) -> bool:
+        """The thread is back. False if another thread reads by now."""
+        with self._lock:
+            in_time = self._since_s == since_s
+            if in_time:
+                self._since_s = None
+        return in_time
+
+    def watch(self, over: Callable[[], bool]) -> None:
+        """Call `take_over` for each absence that lasts too long, until `over`."""
+        while not over():
+            self._watched = False  # before looking: a thread that leaves from now on wakes this one
+            if time.perf_counter() - self._last_s > WATCHES_S and self._since_s is None:
+                self._wanted.wait()
+            self._watched = True
+            self._wanted.clear()
+            time.sleep(AWAY_S)
+            with self._lock:
+                late = self._since_s is not None and time.perf_counter() - self._since_s > AWAY_S
+                if late:
+                    self._since_s = None
+            if late and not over():
+                self._take_over()

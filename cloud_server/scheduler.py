@@ -195,8 +195,8 @@ class Scheduler:
             )  # fmt: skip
             self._sender.send(work.peer, reply)
         self._count(request, outcome.status if work.wanted else "cancelled", work.queue_s, outcome.run_s)
-        self._metrics.queue_s.labels(request.kind).observe(work.queue_s)
-        self._metrics.run_s.labels(request.kind).observe(outcome.run_s)
+        self._metrics.queue_s_of(request.kind).observe(work.queue_s)
+        self._metrics.run_s_of(request.kind).observe(outcome.run_s)
         if self._metrics.robots.counting:
             use = self._metrics.robots.of(work.robot)
             use.tasks += 1
@@ -228,7 +228,7 @@ class Scheduler:
     def _count(self, request: Request, status: str, queue_s: float = 0.0, run_s: float = 0.0) -> None:
         # A robot can send any name. A label for each of them would take memory without limit.
         kind = "unknown" if status == "unknown_task" else request.kind
-        self._metrics.requests.labels(kind, status).inc()
+        self._metrics.requests_of(kind, status).inc()
         if log.isEnabledFor(logging.DEBUG):
             text = "task %d of kind %s: %s after %.6f s of waiting and %.6f s of running"
             fields = {"id": request.id, "kind": kind, "status": status, "queue_s": queue_s, "run_s": run_s}

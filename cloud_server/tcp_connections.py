@@ -65,7 +65,7 @@ class UnreadLimit:
 
     def took(self, file: int, sizes: Iterable[int]) -> None:
         """A message with frames of these sizes was read. Called by one thread at a time."""
-        self._read[file] = self._read.get(file, 0) + sum(self._on_the_wire(size) for size in sizes)
+        self._read[file] = self._read.get(file, 0) + sum([self._on_the_wire(size) for size in sizes])
 
     def close(self) -> None:
         self._closed = True

@@ -89,7 +89,7 @@ class WorkerPool:
         assignment.answer.set_result(Outcome("busy", "a worker died, and the next one is not ready yet"))
         return assignment.answer
 
-    def run(self, call: Call, *, meanwhile: Callable[[], None]) -> None:  # noqa: ARG002
+    def run(self, call: Call, *, meanwhile: Callable[[], None] | None) -> None:  # noqa: ARG002
         return None
 
     def used_s(self) -> float:

@@ -1,8 +1,8 @@
 """A ZMQ socket that one thread reads and any thread sends on, and the context that it is made in.
 
 Several threads may use a ZMQ socket if a lock lets only one of them in at a time. The reader must then not
-wait inside the socket; it waits for the file descriptor on which libzmq signals. `messages` says what the
-frames mean.
+wait inside the socket; it waits for the file descriptor on which libzmq signals. A look at the socket takes a
+system call, so it is left out where its answer is known. `messages` says what the frames mean.
 """
 
 import contextlib
@@ -29,6 +29,8 @@ class Channel:
     """A socket with a lock. Hold `lock` around several calls that must not be interrupted by other threads.
 
     `wait` also returns for the file descriptors `watched`. The owner closes the socket.
+
+    watched_ready: whether one of `watched` may have been readable since somebody set this to False.
     """
 
     def __init__(self, of: "zmq.Socket[bytes]", *watched: int) -> None:
@@ -36,31 +38,37 @@ class Channel:
         self._socket = of
         self._frames: list[zmq.Frame] = []  # frames of a message whose reading was interrupted by Ctrl-C
         self._read_out = False  # all was read; libzmq signals the next message
+        self._signalled = False  # libzmq did, and nothing was read since
+        self._waits = False  # the reader waits, or is about to
+        self.watched_ready = True
         self._waker, self._woken = socket.socketpair()
         self._waker.setblocking(False)
         self._woken.setblocking(False)
         self._poll = select.poll()
-        for readable in (of.FD, self._woken.fileno(), *watched):
-            self._poll.register(readable, select.POLLIN)
+        self._signal, self._wakes = int(of.FD), self._woken.fileno()
+        for file in (self._signal, self._wakes, *watched):
+            self._poll.register(file, select.POLLIN)
 
     def send(self, frames: Sequence[Any]) -> None:
         """Send without waiting; zmq.Again if the queue is full."""
         with self.lock:
+            # libzmq signals only once for everything that happened, and sending may use up the signal.
+            # A reader that does not wait yet looks before it does.
+            self._read_out = False
             *first, last = frames
             for frame in first:
                 self._send(frame, _MORE)
             self._send(last, _NOW)
-            # libzmq signals only once for everything that happened, and sending may have used up the signal.
-            if readable(self._socket):
+            if self._waits and readable(self._socket):
                 self.wake()
 
     def receive(self) -> "list[zmq.Frame] | None":
         """The next message; None if there is none. For the reader."""
         with self.lock:
-            if not readable(self._socket):
+            if not (self._signalled or readable(self._socket)):
                 self._read_out = True
                 return None
-            self._read_out = False
+            self._signalled = self._read_out = False
             frames = self._frames
             with contextlib.suppress(zmq.Again):
                 while not frames or frames[-1].more:
@@ -70,14 +78,21 @@ class Channel:
 
     def wait(self, timeout_s: float) -> None:
         """Wait until there is a message or `wake` is called. For the reader."""
+        self._waits = True  # before looking: a thread that sends from now on wakes this one
         if not self._read_out:
             with self.lock:
                 if readable(self._socket):
+                    self._waits, self._signalled = False, True
                     return
-        self._read_out = False
         ready = self._poll.poll(max(0.0, timeout_s) * 1e3)
-        if any(descriptor == self._woken.fileno() for descriptor, _ in ready):
-            self._woken.recv(WAKE_BYTES)
+        self._waits = self._read_out = False
+        for file, _ in ready:
+            if file == self._signal:
+                self._signalled = True
+            elif file == self._wakes:
+                self._woken.recv(WAKE_BYTES)
+            else:
+                self.watched_ready = True
 
     def wake(self) -> None:
         """End the current `wait`, or else the next one. Any thread may call this at any time."""

@@ -58,6 +58,8 @@ class Fields:
         value = self.values.get(name)
         if not isinstance(value, list) or len(value) > BLOBS_MAX:
             raise self.wrong(name, f"a list of at most {BLOBS_MAX} digests")
+        if not value:
+            return ()
         if not all(isinstance(item, bytes) and len(item) == DIGEST_BYTES for item in value):
             raise self.wrong(name, f"a list of digests of {DIGEST_BYTES} bytes")
         return tuple(value)

@@ -160,10 +160,11 @@ def pack(message: Message) -> list[Buffer]:
     """The frames of a message; its buffers are not copied. BadValue if the message is too large."""
     kind, names, optional = _FIELDS[type(message)]
     fields = {field: getattr(message, field) for field in names}
-    if isinstance(message, Reply) and message.error:
-        fields["error"] = _sendable(message.error[:ERROR_LENGTH_MAX])
-    if isinstance(message, Reply) and message.traceback:
-        fields["traceback"] = _sendable(bounded(message.traceback))
+    if kind == "reply":
+        if fields["error"]:
+            fields["error"] = _sendable(fields["error"][:ERROR_LENGTH_MAX])
+        if fields["traceback"]:
+            fields["traceback"] = _sendable(bounded(fields["traceback"]))
     for name, absent in optional:
         if fields[name] == absent:
             del fields[name]
@@ -204,7 +205,7 @@ def unpack(frames: Sequence[Buffer]) -> Message:
 
 def byte_count(frames: Iterable[Buffer]) -> int:
     """The bytes in all frames, without the headers of the transport."""
-    return sum(f.nbytes if isinstance(f, memoryview) else len(f) for f in frames)
+    return sum([f.nbytes if isinstance(f, memoryview) else len(f) for f in frames])
 
 
 def _hello(fields: Fields, rest: list[Buffer]) -> Hello:

@@ -227,6 +227,8 @@ class CloudRunner:
                 if (frames := self._socket.receive()) is None:
                     break
                 self._read([frame.buffer for frame in frames], time.perf_counter())
+                if not self._expects_message():
+                    break
 
     def _follow_connection(self) -> None:
         for event in self._socket.events():

@@ -62,6 +62,9 @@ class CloudSocket(Channel):
 
     def events(self) -> "Iterator[SocketEvent | HandshakeFailure]":
         """What happened to the connection since the last call."""
+        if not self.watched_ready:
+            return
+        self.watched_ready = False
         last = 0
         while readable(self._monitor):
             last = int(zmq.utils.monitor.recv_monitor_message(self._monitor)["event"])

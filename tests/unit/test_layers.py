@@ -255,6 +255,19 @@ def test_the_robot_library_needs_no_extra() -> None:
     assert done.stdout == "Offloader\n", done.stderr
 
 
+def test_import_offboard_loads_little() -> None:
+    """`import offboard` loads no other library and none of the packages; `Offloader` loads neither zmq,
+    numba nor fastapi."""
+    say = "print(*sorted({one.partition('.')[0] for one in sys.modules} - known - sys.stdlib_module_names))\n"
+    code = (
+        f"import sys\nknown = set(sys.modules)\nimport offboard\n{say}from offboard import Offloader\n{say}"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=30)
+    first, second = done.stdout.splitlines()
+    assert first == "offboard"
+    assert set(second.split()).isdisjoint({"zmq", "numba", "fastapi", "uvicorn"}), second
+
+
 @pytest.mark.parametrize(
     "command",
     [

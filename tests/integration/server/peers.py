@@ -21,7 +21,7 @@ from tests.flags import completed
 ROOT = Path(__file__).parents[3]
 WAIT_S = 8.0
 MODULE = '''
-import os, signal
+import os, signal, threading
 from offboard.common.tasks import task
 
 started = []
@@ -48,6 +48,10 @@ def served_pipe(path):
 @task("served_count", size=lambda: 0)
 def served_count():
     return len(started)
+
+@task("served_thread", size=lambda: 0)
+def served_thread():
+    return threading.get_ident()
 
 @task("served_die", size=lambda: 0)
 def served_die():
