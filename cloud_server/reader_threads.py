@@ -13,9 +13,9 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 
-from offboard.cloud_server.executors import Executor
+from offboard.cloud_server.executors.executor import Executor
+from offboard.cloud_server.executors.task_run import Call, Outcome
 from offboard.cloud_server.fair_queue import Work
-from offboard.cloud_server.task_run import Call, Outcome
 
 log = logging.getLogger("offboard.cloud_server")
 

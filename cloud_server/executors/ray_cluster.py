@@ -1,0 +1,121 @@
+"""The Ray cluster: connects to it, starts actors on it, and calls them. Only this file imports Ray.
+
+`ray_executor` decides what runs where. Ray's own errors become ours here.
+"""
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from typing import Any
+
+import numpy as np
+
+from offboard.cloud_server.executors.ray_actor import RayActor
+from offboard.common.errors import ConfigError, MissingExtra, describe
+from offboard.common.wire.blobs import StoredBlob
+
+try:
+    import ray
+    from ray.exceptions import RayError
+except ImportError as error:
+    raise MissingExtra("--executor ray", "ray") from error
+
+CONTROL = "control"  # the group of the calls that an actor answers while its task runs
+# Without its head for so long, Ray ends the process that is connected to it. The server must go on instead.
+HEADLESS_S_MAX = 10 * 365 * 24 * 3600
+HEADLESS_VARIABLE = "RAY_gcs_rpc_server_reconnect_timeout_s"
+TEXT_MAX = 300  # characters of an error of Ray: its texts explain much, on many lines
+NODES_SHOWN = 4
+# What Ray says of an actor that died, and our word for it.
+REASONS = {"node has died": "node", "out of memory": "memory", "memory pressure": "memory"}
+MISSING = ("ModuleNotFoundError", "ImportError", "AttributeError")  # the class of the actor was not found
+
+
+class RayCluster:
+    """A connection to a cluster, through the Ray node on this computer.
+
+    Parameters: `address` is that of the head, or `auto`; `resources` is what each actor needs.
+    """
+
+    def __init__(self, address: str, resources: Mapping[str, float]) -> None:
+        self.address = address
+        self.resources = {"CPU": 1.0, **resources}
+        self._actor = ray.remote(concurrency_groups={CONTROL: 1})(RayActor)
+
+    def connect(self) -> None:
+        """ConfigError unless there is a cluster of the same versions."""
+        os.environ.setdefault(HEADLESS_VARIABLE, str(HEADLESS_S_MAX))
+        try:
+            ray.init(self.address, log_to_driver=False, logging_level="ERROR", configure_logging=False)
+        except (RayError, RuntimeError, ValueError, OSError) as error:
+            raise ConfigError(f"--ray-address: {self.address}: {_line(error)}") from error
+
+    def disconnect(self) -> None:
+        """End the actors of this server. Safe to call twice."""
+        ray.shutdown()
+
+    def check_resources(self) -> None:
+        """ConfigError unless there is a node that has what an actor needs."""
+        nodes = [node["Resources"] for node in self.alive()]
+        if any(all(node.get(name, 0) >= least for name, least in self.resources.items()) for node in nodes):
+            return
+        had = [json.dumps({name: node.get(name, 0) for name in self.resources}) for node in nodes]
+        more = f" and {len(had) - NODES_SHOWN} more" if len(had) > NODES_SHOWN else ""
+        raise ConfigError(
+            f"--ray-resources: no node of the Ray cluster has {json.dumps(self.resources)}; "
+            f"its {len(had)} nodes have {', '.join(had[:NODES_SHOWN])}{more}"
+        )
+
+    def alive(self) -> list[dict[str, Any]]:
+        """The nodes that the head counts as alive. Waits as long as the head is silent."""
+        return [node for node in ray.nodes() if node["Alive"]]
+
+    def new_actor(self) -> Any:
+        """An actor that starts as soon as a node has room for it. It never runs a task again."""
+        others = dict(self.resources)
+        cpus, gpus, memory = (others.pop(name, None) for name in ("CPU", "GPU", "memory"))
+        return self._actor.options(
+            num_cpus=cpus,
+            num_gpus=gpus,
+            memory=memory,
+            resources=others,
+            max_restarts=0,
+            max_task_retries=0,
+            scheduling_strategy="SPREAD",
+        ).remote()
+
+    def put(self, blob: StoredBlob) -> Any:
+        """A reference to a copy of the blob that all nodes can read. OSError if there is no room for it."""
+        try:
+            return ray.put(np.frombuffer(blob.data, np.uint8))
+        except RayError as error:
+            raise OSError(_line(error)) from error
+
+
+def call(
+    method: Any, *args: Any, then: Callable[["Future[Any]"], None], control: bool = False, **named: Any
+) -> None:
+    """Call a method of an actor; `then` gets the future in a thread of Ray."""
+    bound = method.options(concurrency_group=CONTROL) if control else method
+    bound.remote(*args, **named).future().add_done_callback(then)
+
+
+def end(actor: Any) -> None:
+    """Kill an actor, with what it runs."""
+    ray.kill(actor)
+
+
+def why(error: BaseException) -> tuple[str, str]:
+    """Why an actor died: one word, and a text of one line."""
+    text = str(error)
+    if any(word in text for word in MISSING):
+        return "start", f"did not start: {_line(error)}"
+    reason = next((word for part, word in REASONS.items() if part in text.lower()), "exit")
+    said = {"node": "was lost with its node", "memory": "was ended by Ray because memory was short"}
+    return reason, said.get(reason, "died, or its node does not answer")
+
+
+def _line(error: BaseException) -> str:
+    text = " ".join(describe(error).split())
+    return text if len(text) <= TEXT_MAX else f"{text[:TEXT_MAX]} .."

@@ -1,0 +1,36 @@
+"""A real Ray cluster on this computer: a head and nodes, each with its own processes and object store."""
+
+import os
+from typing import Any
+
+os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+
+from ray.cluster_utils import Cluster  # noqa: E402
+
+STORE_BYTES = 80 << 20  # of each node: the least that Ray accepts is 75 MiB
+
+
+class RayNodes:
+    """A head without room for workers, on which the server runs, and nodes with room for one worker each."""
+
+    def __init__(self, count: int = 2) -> None:
+        settings = {"object_store_memory": STORE_BYTES, "include_dashboard": False}
+        self._cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, **settings})
+        self.address: str = self._cluster.address
+        self.nodes = [self.add() for _ in range(count)]
+        self._cluster.wait_for_nodes()
+
+    def add(self) -> Any:
+        """A node joins."""
+        return self._cluster.add_node(num_cpus=1, object_store_memory=STORE_BYTES)
+
+    def kill(self, node: Any) -> None:
+        """A node is lost: all its processes are killed."""
+        self._cluster.remove_node(node, allow_graceful=False)
+
+    def kill_head(self) -> None:
+        """The process that knows the cluster is killed; the Ray node on the same computer goes on."""
+        self._cluster.head_node.kill_gcs_server()
+
+    def close(self) -> None:
+        self._cluster.shutdown()
