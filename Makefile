@@ -47,7 +47,7 @@ type: $(DEV_READY) ## check types with mypy, strict, on the unpacked wheel
 CROWDED := tests/unit tests/integration/executors tests/integration/keys tests/integration/toxiproxy $(addprefix tests/integration/test_,$(addsuffix .py,alone attacks blobs channel check compare cpu_time crashes dataset demo export fuzz own_task local_testbed robot_workload values_cross wheel))
 test: $(DEV_READY) ## run every test that this machine can run; skipped tests say why
 	$(BIN)/pytest --numprocesses 2 $(CROWDED)
-	$(BIN)/pytest --ignore tests/ros2 --ignore tests/ray $(addprefix --ignore ,$(CROWDED))
+	$(BIN)/pytest --ignore tests/ros2 $(addprefix --ignore ,$(CROWDED))
 
 unit: $(DEV_READY) ## run the tests without sockets
 	$(BIN)/pytest --numprocesses 2 tests/unit

@@ -16,6 +16,7 @@ from offboard.common.security.exposure import OPEN_REMEDY, on_loopback
 MIB = 1024 * 1024
 ROBOTS = "robots"  # default folder for the keys of robots, inside the folder of --keys
 PORT_MAX = 65535
+AUTO = "auto"  # Ray's word for the cluster that runs on this computer
 RESOURCES_EXAMPLE = '{"CPU": 1, "GPU": 1}'
 ADDRESSES, TASKS, ACCESS, OUTPUT, LIMITS = "addresses", "tasks", "access", "output", "limits"
 
@@ -61,7 +62,7 @@ class ServerConfig:
         metavar="W",
     )
     ray_address: str = setting(
-        "auto",
+        AUTO,
         "head of the Ray cluster, of which this computer is a node; auto: the cluster that runs here",
         group=TASKS,
         rare=True,
@@ -165,6 +166,8 @@ class ServerConfig:
         host_and_port("--listen", self.listen, _LISTEN, "tcp://HOST:PORT or tcp://*:PORT")
         host_and_port("--http", self.http, _HTTP, "HOST:PORT")
         assert self.resources is not None
+        if self.ray_address != AUTO:
+            host_and_port("--ray-address", self.ray_address, _HTTP, f"{AUTO} or HOST:PORT")
         if self.robots is not None and self.keys is None:
             raise ConfigError(f"--robots: {self.robots} needs --keys, the keys of the server")
         for way in () if self.insecure else self.open_ways:

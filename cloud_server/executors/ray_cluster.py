@@ -3,8 +3,11 @@
 `ray_executor` decides what runs where. Ray's own errors become ours here.
 """
 
+import contextlib
 import json
 import os
+import re
+import socket
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from typing import Any
@@ -25,11 +28,13 @@ CONTROL = "control"  # the group of the calls that an actor answers while its ta
 # Without its head for so long, Ray ends the process that is connected to it. The server must go on instead.
 HEADLESS_S_MAX = 10 * 365 * 24 * 3600
 HEADLESS_VARIABLE = "RAY_gcs_rpc_server_reconnect_timeout_s"
+CONNECT_S_MAX = 5.0  # until the port of the head has answered
 TEXT_MAX = 300  # characters of an error of Ray: its texts explain much, on many lines
 NODES_SHOWN = 4
 # What Ray says of an actor that died, and our word for it.
 REASONS = {"node has died": "node", "out of memory": "memory", "memory pressure": "memory"}
-MISSING = ("ModuleNotFoundError", "ImportError", "AttributeError")  # the class of the actor was not found
+# The class of the actor was not found, because a node has no Offboard or another one.
+MISSING = re.compile("(ModuleNotFoundError|ImportError|AttributeError): .*")
 
 
 class RayCluster:
@@ -41,19 +46,26 @@ class RayCluster:
     def __init__(self, address: str, resources: Mapping[str, float]) -> None:
         self.address = address
         self.resources = {"CPU": 1.0, **resources}
+        self._connected = False
         self._actor = ray.remote(concurrency_groups={CONTROL: 1})(RayActor)
 
     def connect(self) -> None:
         """ConfigError unless there is a cluster of the same versions."""
         os.environ.setdefault(HEADLESS_VARIABLE, str(HEADLESS_S_MAX))
         try:
+            if ":" in self.address:  # Ray itself would try for more than a minute
+                host, _, port = self.address.rpartition(":")
+                socket.create_connection((host.strip("[]"), int(port)), CONNECT_S_MAX).close()
             ray.init(self.address, log_to_driver=False, logging_level="ERROR", configure_logging=False)
         except (RayError, RuntimeError, ValueError, OSError) as error:
             raise ConfigError(f"--ray-address: {self.address}: {_line(error)}") from error
+        self._connected = True
 
     def disconnect(self) -> None:
         """End the actors of this server. Safe to call twice."""
-        ray.shutdown()
+        if self._connected:
+            self._connected = False
+            ray.shutdown()
 
     def check_resources(self) -> None:
         """ConfigError unless there is a node that has what an actor needs."""
@@ -103,14 +115,15 @@ def call(
 
 def end(actor: Any) -> None:
     """Kill an actor, with what it runs."""
-    ray.kill(actor)
+    with contextlib.suppress(RayError):  # it is dead already
+        ray.kill(actor)
 
 
 def why(error: BaseException) -> tuple[str, str]:
     """Why an actor died: one word, and a text of one line."""
     text = str(error)
-    if any(word in text for word in MISSING):
-        return "start", f"did not start: {_line(error)}"
+    if missing := MISSING.search(text):
+        return "start", f"did not start: {missing[0][:TEXT_MAX]}"
     reason = next((word for part, word in REASONS.items() if part in text.lower()), "exit")
     said = {"node": "was lost with its node", "memory": "was ended by Ray because memory was short"}
     return reason, said.get(reason, "died, or its node does not answer")

@@ -162,9 +162,7 @@ class RayWorker:
         elif said.version != VERSION:
             versions = f"{said.host} runs Offboard {said.version}, this server {VERSION}"
             failure = ConfigError(f"the Ray node {versions}; install the same version on all nodes")
-        elif differing := [
-            name for name, one in tasks.hashes().items() if dict(said.hashes).get(name) != one
-        ]:
+        elif differing := [name for name, one in said.hashes if tasks.hashes().get(name) != one]:
             others = f"{said.host} has another source of the task {differing[0]}"
             failure = ConfigError(f"the Ray node {others}; install the same version of it on all nodes")
         if failure is not None:

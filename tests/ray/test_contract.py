@@ -35,7 +35,7 @@ __all__ = [
 
 
 def test_a_worker_gets_a_blob_once(executor: Executor) -> None:
-    """It is the same array each time, also after another worker had it, until the limit of bytes is exceeded."""
+    """It is the same array each time, also after another worker had it, until blobs exceed their limit."""
     same = call("exec_where", np.ones(50_000))
     pairs = [value(executor.submit(same, lambda _: None).result(WAIT_S))[::2] for _ in range(6)]
     assert len({identity for _, identity in pairs}) == len({pid for pid, _ in pairs})
