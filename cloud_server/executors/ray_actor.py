@@ -95,10 +95,10 @@ class RayActor:
 
     def run(
         self,
+        *blobs: Any,
         number: int,
         kind: str,
         frames: list[bytes],
-        *blobs: Any,
         digests: Sequence[bytes],
         new: Sequence[bytes],
     ) -> Ran:

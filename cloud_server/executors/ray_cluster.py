@@ -18,16 +18,24 @@ from offboard.cloud_server.executors.ray_actor import RayActor
 from offboard.common.errors import ConfigError, MissingExtra, describe
 from offboard.common.wire.blobs import StoredBlob
 
+# How Ray behaves in a server; it reads this when it is imported.
+RAY_SETTINGS = {
+    # Without its head for so many seconds, Ray ends the process. The server must go on instead.
+    "RAY_gcs_rpc_server_reconnect_timeout_s": str(10 * 365 * 24 * 3600),
+    "RAY_DISABLE_FAILURE_SIGNAL_HANDLER": "1",  # SIGTERM is for the server, which then drains
+    "RAY_ENABLE_AUTO_CONNECT": "0",  # no call starts a cluster of its own
+}
+for _name, _value in RAY_SETTINGS.items():
+    os.environ.setdefault(_name, _value)
+
 try:
     import ray
+    from ray._raylet import GcsClient
     from ray.exceptions import RayError
 except ImportError as error:
     raise MissingExtra("--executor ray", "ray") from error
 
 CONTROL = "control"  # the group of the calls that an actor answers while its task runs
-# Without its head for so long, Ray ends the process that is connected to it. The server must go on instead.
-HEADLESS_S_MAX = 10 * 365 * 24 * 3600
-HEADLESS_VARIABLE = "RAY_gcs_rpc_server_reconnect_timeout_s"
 CONNECT_S_MAX = 5.0  # until the port of the head has answered
 TEXT_MAX = 300  # characters of an error of Ray: its texts explain much, on many lines
 NODES_SHOWN = 4
@@ -47,11 +55,12 @@ class RayCluster:
         self.address = address
         self.resources = {"CPU": 1.0, **resources}
         self._connected = False
+        self._head = ""
+        self._id: Any = None  # Ray's name for the cluster that the head knows
         self._actor = ray.remote(concurrency_groups={CONTROL: 1})(RayActor)
 
     def connect(self) -> None:
         """ConfigError unless there is a cluster of the same versions."""
-        os.environ.setdefault(HEADLESS_VARIABLE, str(HEADLESS_S_MAX))
         try:
             if ":" in self.address:  # Ray itself would try for more than a minute
                 host, _, port = self.address.rpartition(":")
@@ -60,6 +69,8 @@ class RayCluster:
         except (RayError, RuntimeError, ValueError, OSError) as error:
             raise ConfigError(f"--ray-address: {self.address}: {_line(error)}") from error
         self._connected = True
+        self._head = ray.get_runtime_context().gcs_address
+        self._id = GcsClient(address=self._head).cluster_id
 
     def disconnect(self) -> None:
         """End the actors of this server. Safe to call twice."""
@@ -69,7 +80,7 @@ class RayCluster:
 
     def check_resources(self) -> None:
         """ConfigError unless there is a node that has what an actor needs."""
-        nodes = [node["Resources"] for node in self.alive()]
+        nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         if any(all(node.get(name, 0) >= least for name, least in self.resources.items()) for node in nodes):
             return
         had = [json.dumps({name: node.get(name, 0) for name in self.resources}) for node in nodes]
@@ -79,9 +90,15 @@ class RayCluster:
             f"its {len(had)} nodes have {', '.join(had[:NODES_SHOWN])}{more}"
         )
 
-    def alive(self) -> list[dict[str, Any]]:
-        """The nodes that the head counts as alive. Waits as long as the head is silent."""
-        return [node for node in ray.nodes() if node["Alive"]]
+    def answers(self) -> bool:
+        """Whether the head answers, and still has our cluster. May wait for half a minute.
+
+        `ray.nodes` would wait as long as the head is silent, and end this process if a new head answers.
+        """
+        try:
+            return bool(GcsClient(address=self._head).cluster_id == self._id)
+        except Exception:  # noqa: BLE001 - Ray says it in several ways
+            return False
 
     def new_actor(self) -> Any:
         """An actor that starts as soon as a node has room for it. It never runs a task again."""

@@ -20,13 +20,13 @@ from offboard.cloud_server.executors.ray_worker import RayWorker
 from offboard.cloud_server.executors.task_run import Blobs, Call, Outcome
 from offboard.cloud_server.executors.worker import LOOK_S, START_S_MAX, Assignment, Died
 from offboard.common.errors import CloudBroken, ConfigError
-from offboard.common.threads import join_all
 
 PLACE_S_MAX = 30.0  # until the server starts with fewer workers, if the nodes have no room for more
 IDLE_LOOK_S = 0.1  # between two checks of the workers while no task runs
 HEAD_EVERY_S = 1.0  # between two questions to the head
-HEAD_SILENT_S_MAX = 5.0  # until the head counts as lost
-CLOSE_S_MAX = 5.0  # until the threads have ended
+HEAD_SILENT_S_MAX = 5.0  # of the head, until no more tasks are taken
+HEAD_LOST_S = 30.0  # of silence, until this server leaves the cluster and waits for a new head
+CLOSE_S_MAX = 5.0  # until the thread that owns the workers has ended
 
 log = logging.getLogger("offboard.cloud_server")
 
@@ -58,10 +58,8 @@ class RayExecutor:
         self._closing = threading.Event()
         self._head_at_s = time.monotonic()
         self._headless = False
-        self._threads = [
-            threading.Thread(target=self._tend, name="ray-workers", daemon=True),
-            threading.Thread(target=self._ask_head, name="ray-head", daemon=True),
-        ]
+        self._session = 0  # one for each connection to a cluster
+        self._thread = threading.Thread(target=self._tend, name="ray-workers", daemon=True)
 
     @property
     def up(self) -> int:
@@ -82,8 +80,9 @@ class RayExecutor:
 
     def warm(self, changed: Callable[[str], None] = lambda _: None) -> "Future[None]":
         self._changed = changed
-        for thread in self._threads:
-            thread.start()
+        self._head_at_s = time.monotonic()
+        self._watch_head()
+        self._thread.start()
         return self._started
 
     def submit(self, call: Call, done: "Callable[[Future[Outcome]], None]") -> "Future[Outcome]":
@@ -113,8 +112,8 @@ class RayExecutor:
     def close(self) -> None:
         self._closing.set()
         self._events.put(lambda: None)
-        started = [thread for thread in self._threads if thread.ident is not None]
-        join_all(started, CLOSE_S_MAX)
+        if self._thread.is_alive():
+            self._thread.join(CLOSE_S_MAX)
         for worker in self._workers:
             worker.end()
             worker.abandon()
@@ -133,26 +132,40 @@ class RayExecutor:
             self._look(began_s)
 
     def _look(self, began_s: float) -> None:
-        """Notice the loss of the head, tend each worker, and end the start of the server."""
+        """Notice whether the head answers, tend each worker, and end the start of the server."""
         now_s = time.monotonic()
-        headless = now_s - self._head_at_s > HEAD_SILENT_S_MAX
-        if headless != self._headless:
-            self._headless = headless
-            text = "the head of the Ray cluster %s; remedy: %s"
-            if headless:
-                log.error(
-                    text, "does not answer, so this server takes no tasks", "start it again, or its network"
-                )
-            else:
-                log.warning(text, "answers again", "none is needed")
-            self._changed("head" if headless else "")
+        silent_s = now_s - self._head_at_s
+        if (silent_s > HEAD_SILENT_S_MAX) != self._headless:
+            self._head_changed()
+        if silent_s > HEAD_LOST_S:
+            self._connect_again()
         for worker in self._workers:
-            others = [
-                one.pid for one in self._workers if one is not worker and one.host == worker.host and one.pid
-            ]
-            worker.tend(others, self._objects.keeps)
+            same = [one.pid for one in self._workers if one.pid and one.host == worker.host]
+            worker.tend([pid for pid in same if pid != worker.pid], self._objects.keeps)
         if not self._started.done():
             self._end_start(now_s - began_s)
+
+    def _head_changed(self) -> None:
+        self._headless = not self._headless
+        if self._headless:
+            text = "the head of the Ray cluster does not answer: no task is taken; remedy: start it again"
+            log.error(text)
+        else:
+            log.info("the head of the Ray cluster answers again")
+        self._changed("head" if self._headless else "")
+
+    def _connect_again(self) -> None:
+        """The head is lost, and with it the cluster: wait for a new one at the same address."""
+        for worker in self._workers:
+            worker.lose("head", "was lost with the head of the cluster")
+        self._objects.clear()
+        self._cluster.disconnect()
+        while not self._closing.wait(HEAD_EVERY_S):
+            with contextlib.suppress(ConfigError):
+                self._cluster.connect()
+                break
+        self._head_at_s = time.monotonic()
+        self._watch_head()
 
     def _end_start(self, after_s: float) -> None:
         """All workers that the nodes have room for are up, or none came up."""
@@ -167,11 +180,16 @@ class RayExecutor:
                 CloudBroken(f"no worker was up on the Ray cluster within {START_S_MAX:g} s")
             )
 
-    def _ask_head(self) -> None:
-        """A thread of its own, because a question waits as long as the head is silent."""
-        while not self._closing.wait(HEAD_EVERY_S):
-            self._cluster.alive()
-            self._head_at_s = time.monotonic()
+    def _watch_head(self) -> None:
+        self._session += 1
+        watch = threading.Thread(target=self._ask_head, args=(self._session,), name="ray-head", daemon=True)
+        watch.start()
+
+    def _ask_head(self, session: int) -> None:
+        """Ask in a thread of its own, because a question waits as long as the head is silent."""
+        while session == self._session and not self._closing.wait(HEAD_EVERY_S):
+            if self._cluster.answers() and session == self._session:
+                self._head_at_s = time.monotonic()
 
     def _free(self, worker: RayWorker) -> None:
         with self._lock:

@@ -75,10 +75,10 @@ class RayWorker:
         new = [digest for digest in references if digest not in self.known]
         self.known.update(new)
         blobs = [references[digest] for digest in new]
+        named: dict[str, Any] = {"digests": list(references), "new": new, "kind": task.kind}
         frames = [bytes(frame) for frame in task.frames]
-        named: dict[str, Any] = {"digests": list(references), "new": new}
         try:
-            self._call("run", self._ran, self._number, task.kind, frames, *blobs, **named)
+            self._call("run", self._ran, *blobs, number=self._number, frames=frames, **named)
         except Exception as error:  # noqa: BLE001 - of Ray: the task must be answered all the same
             self._post(partial(self.lose, *ray_cluster.why(error)))
 

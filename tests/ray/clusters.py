@@ -12,12 +12,12 @@ STORE_BYTES = 80 << 20  # of each node: the least that Ray accepts is 75 MiB
 class RayNodes:
     """A head without room for workers, on which the server runs, and nodes with room for one worker each."""
 
-    def __init__(self, count: int = 2) -> None:
+    def __init__(self, count: int = 2, **head: Any) -> None:
         os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
         from ray.cluster_utils import Cluster
 
         settings = {"object_store_memory": STORE_BYTES, "include_dashboard": False}
-        self._cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, **settings})
+        self._cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, **settings, **head})
         self.address: str = self._cluster.address
         self.nodes = [self.add() for _ in range(count)]
         self._cluster.wait_for_nodes()
@@ -35,6 +35,11 @@ class RayNodes:
     def kill_head(self) -> None:
         """The process that knows the cluster is killed; the Ray node on the same computer goes on."""
         self._cluster.head_node.kill_gcs_server()
+
+    def kill_all(self) -> None:
+        """All processes of all nodes are killed."""
+        for node in (self._cluster.head_node, *self._cluster.worker_nodes):
+            node.kill_all_processes(check_alive=False, allow_graceful=False)
 
     def say_version(self, ray: str) -> None:
         """From now on the head says that it was started with this version of Ray."""

@@ -1,6 +1,7 @@
 """Fixtures that make Ray clusters and executors on them, and end both."""
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 
@@ -30,8 +31,8 @@ def fresh() -> Iterator[Callable[..., RayNodes]]:
     pytest.importorskip("ray", reason="Ray is not installed here: make ray runs this test")
     made: list[RayNodes] = []
 
-    def start(count: int = 0) -> RayNodes:
-        made.append(RayNodes(count))
+    def start(count: int = 0, **head: Any) -> RayNodes:
+        made.append(RayNodes(count, **head))
         return made[-1]
 
     yield start

@@ -12,7 +12,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 START_S = 60.0
-UNTIL_S = 60.0
+UNTIL_S = 120.0
 
 
 class RayServer:

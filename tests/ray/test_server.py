@@ -74,7 +74,7 @@ def test_no_plan_is_lost_or_wrong_if_a_node_is_killed(tmp_path: Path, fresh: Cal
 
 
 def test_without_its_head_the_server_is_not_ready(tmp_path: Path, fresh: Callable[..., RayNodes]) -> None:
-    """Robots then use another site. Before that, the pages name the executor and the places of its workers."""
+    """Robots then use another site. Before that, the pages name the executor and where its workers are."""
     cluster = fresh(1)
     server = RayServer(tmp_path, "--ray-address", cluster.address, "--workers", "1")
     health = server.health()
@@ -95,3 +95,20 @@ def test_without_its_head_the_server_is_not_ready(tmp_path: Path, fresh: Callabl
     assert "the head of the Ray cluster does not answer" in server.log
     assert server.health()["healthy"]
     server.close()
+
+
+def test_a_new_head_at_the_same_address_is_used(tmp_path: Path, fresh: Callable[..., RayNodes]) -> None:
+    """After all nodes were lost, the server connects to the new cluster and is ready again."""
+    cluster = fresh(1)
+    server = RayServer(tmp_path, "--ray-address", cluster.address, "--workers", "1")
+    cluster.kill_all()
+    until(lambda: server.get("/ready")[0] == 503)
+    fresh(1, gcs_server_port=int(cluster.address.rpartition(":")[2]))
+    until(lambda: server.get("/ready")[0] == 200)
+    grid, ways = problems()
+    with Offloader.connect(server.endpoint) as offload:
+        assert not offload.wait_for_sites(plan_path, WAIT_S)
+        assert (
+            offload(plan_path, grid, None, *ways[0], where=CLOUD).cost == plan_path(grid, None, *ways[0]).cost
+        )
+    assert server.close() == 0
