@@ -83,6 +83,7 @@ def test_without_its_head_the_server_is_not_ready(tmp_path: Path, fresh: Callabl
     assert sum(health["places"].values()) == 1
     assert 'offboard_server_up_workers{executor="ray"} 1.0' in server.get("/metrics")[1]
     assert json.loads(server.get("/config")[1])["executor"] == "ray"
+    assert '"executor":"ray","places":{' in server.get("/live/looks")[1]
     assert server.get("/ready")[0] == 200
     with Offloader.connect(server.endpoint) as offload:
         grid, ways = problems()
