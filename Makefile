@@ -13,10 +13,13 @@ PEERS_READY := $(VENV)/.peers-ready
 # Some libraries of the applications need older packages than `make install`, so they have an environment of their own.
 EXAMPLES_BIN := .cache/examples/bin
 EXAMPLES_READY := .cache/examples/.ready
+# Ray is large, and only its own tests need it.
+RAY_BIN := .cache/ray/bin
+RAY_READY := .cache/ray/.ready
 
 ROS2_READY := .cache/ros2-kilted/.ready .cache/ros2-jazzy/.ready
 
-.PHONY: help demo install format lint type test unit pythons integration compose chaos state bench examples ros2 browser prometheus torch up down table lock wheel clean
+.PHONY: help demo install format lint type test unit pythons integration compose chaos state bench examples ray ros2 browser prometheus torch up down table lock wheel clean
 
 help: ## list the targets
 	@grep -E '^[a-z0-9]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -71,6 +74,9 @@ bench: $(PEERS_READY) ## measure speed next to other libraries; needs an otherwi
 
 examples: $(EXAMPLES_READY) ## measure the five applications with one seed, FULL=1: with three; needs an otherwise idle machine
 	$(EXAMPLES_BIN)/python -m benchmarks.applications $(if $(FULL),--seeds 3)
+
+ray: $(RAY_READY) ## test `--executor ray` on real Ray clusters of two nodes
+	$(RAY_BIN)/python -m pytest -s tests/ray
 
 ros2: $(DEV_READY) $(ROS2_READY) ## test with real rclpy of two releases of ROS; needs python3.11, python3.12 and a C++ compiler
 	tests/ros2/alone.sh $(BIN)/pytest -s tests/ros2/test_goals.py
@@ -135,6 +141,12 @@ $(EXAMPLES_READY): requirements/examples.txt pyproject.toml
 	test -x $(EXAMPLES_BIN)/python || $(PYTHON) -m venv .cache/examples
 	$(EXAMPLES_BIN)/python -m pip install --quiet --require-hashes -r requirements/examples.txt
 	$(EXAMPLES_BIN)/python -m pip install --quiet --no-deps --editable .
+	touch $@
+
+$(RAY_READY): requirements/ray.txt pyproject.toml
+	test -x $(RAY_BIN)/python || $(PYTHON) -m venv .cache/ray
+	$(RAY_BIN)/python -m pip install --quiet --require-hashes -r requirements/ray.txt
+	$(RAY_BIN)/python -m pip install --quiet --no-deps --editable .
 	touch $@
 
 # Nothing else may live in these environments: the wheels of ROS restart Python, and bring an old OpenSSL.

@@ -1,6 +1,7 @@
-"""Tasks that take no time, so that only the way to the server and back is measured, and one that does."""
+"""Tasks that take no time or no CPU, so that only the way to the server and back is measured, and one that does."""
 
 import hashlib
+import time
 from typing import Any
 
 from offboard.common.tasks import task
@@ -28,3 +29,9 @@ def _hash_slowly(rounds: int) -> bytes:
 def hash_near_or_far(rounds: int) -> bytes:
     """PBKDF2 with this many rounds; onboard it takes ONBOARD_FACTOR times as long."""
     return hashlib.pbkdf2_hmac("sha256", b"offboard", b"benchmark", rounds)
+
+
+@task("wait_20_ms", size=lambda: 0.0)
+def wait_20_ms() -> None:
+    """As a task that computes on a GPU: it needs its worker, and almost no CPU."""
+    time.sleep(0.02)

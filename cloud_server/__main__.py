@@ -74,10 +74,12 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
     log.info("settings: %s", as_dict(config))
     log.info("up to %d files may be open; each connected robot needs one", files_max)
     metrics = Metrics()
-    executor = EXECUTORS[config.executor]
+    of_ray = {"ray_address": config.ray_address, "ray_resources": config.resources}
+    limits = (config.blob_bytes_max, config.worker_memory_bytes)
+    executor = EXECUTORS[config.executor](config.workers, modules, *limits, **of_ray)
     server = Server(
         config.listen,
-        executor(config.workers, modules, config.blob_bytes_max, config.worker_memory_bytes),
+        executor,
         metrics,
         Limits(
             queue_max=config.queue_max,

@@ -1,5 +1,8 @@
 """The settings of `cloud-server`."""
 
+import contextlib
+import json
+import math
 import os
 import re
 from dataclasses import dataclass
@@ -13,6 +16,8 @@ from offboard.common.security.exposure import OPEN_REMEDY, on_loopback
 MIB = 1024 * 1024
 ROBOTS = "robots"  # default folder for the keys of robots, inside the folder of --keys
 PORT_MAX = 65535
+AUTO = "auto"  # Ray's word for the cluster that runs on this computer
+RESOURCES_EXAMPLE = '{"CPU": 1, "GPU": 1}'
 ADDRESSES, TASKS, ACCESS, OUTPUT, LIMITS = "addresses", "tasks", "access", "output", "limits"
 
 _LISTEN = re.compile(r"tcp://(\*|\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5})")
@@ -43,9 +48,10 @@ class ServerConfig:
     )
     executor: str = setting(
         "threads",
-        "what runs the tasks: threads share memory; processes survive a task that crashes",
+        "what runs the tasks: threads share memory; processes survive a task that crashes; "
+        "ray: actors on the nodes of a Ray cluster",
         group=TASKS,
-        choices=("threads", "processes"),
+        choices=("threads", "processes", "ray"),
     )
     workers: int = setting(
         len(os.sched_getaffinity(0)),
@@ -54,6 +60,20 @@ class ServerConfig:
         minimum=1,
         maximum=1024,
         metavar="W",
+    )
+    ray_address: str = setting(
+        AUTO,
+        "head of the Ray cluster, of which this computer is a node; auto: the cluster that runs here",
+        group=TASKS,
+        rare=True,
+        metavar="HOST:PORT",
+    )
+    ray_resources: str = setting(
+        '{"CPU": 1}',
+        "what each worker needs on a node of the Ray cluster, as JSON",
+        group=TASKS,
+        rare=True,
+        metavar="JSON",
     )
     keys: Path | None = setting(
         None,
@@ -145,6 +165,9 @@ class ServerConfig:
         check(self)
         host_and_port("--listen", self.listen, _LISTEN, "tcp://HOST:PORT or tcp://*:PORT")
         host_and_port("--http", self.http, _HTTP, "HOST:PORT")
+        assert self.resources is not None
+        if self.ray_address != AUTO:
+            host_and_port("--ray-address", self.ray_address, _HTTP, f"{AUTO} or HOST:PORT")
         if self.robots is not None and self.keys is None:
             raise ConfigError(f"--robots: {self.robots} needs --keys, the keys of the server")
         for way in () if self.insecure else self.open_ways:
@@ -154,7 +177,7 @@ class ServerConfig:
                 f"--blob-mib: {self.blob_mib} is below --message-mib {self.message_mib}; "
                 "a large argument would never fit"
             )
-        if self.executor == "processes" and self.worker_memory < self.blob_mib + 2 * self.message_mib:
+        if self.executor != "threads" and self.worker_memory < self.blob_mib + 2 * self.message_mib:
             raise ConfigError(
                 f"--worker-memory: {self.worker_memory} is below --blob-mib {self.blob_mib} and twice "
                 f"--message-mib {self.message_mib}, which a worker needs for arguments and results"
@@ -174,6 +197,15 @@ class ServerConfig:
     @property
     def robots_folder(self) -> Path | None:
         return self.robots or (self.keys / ROBOTS if self.keys else None)
+
+    @property
+    def resources(self) -> dict[str, float]:
+        """What each worker needs on a Ray node, by Ray's names."""
+        with contextlib.suppress(ValueError):
+            found = json.loads(self.ray_resources)
+            if isinstance(found, dict) and all(map(_is_amount, found.values())):
+                return {name: float(amount) for name, amount in found.items()}
+        raise ConfigError(f"--ray-resources: {self.ray_resources!r} is not JSON like {RESOURCES_EXAMPLE}")
 
     @property
     def http_on_loopback(self) -> bool:
@@ -198,6 +230,11 @@ class ServerConfig:
     @property
     def message_bytes_max(self) -> int:
         return self.message_mib * MIB
+
+
+def _is_amount(value: object) -> bool:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return number and math.isfinite(float(value)) and float(value) >= 0  # type: ignore[arg-type]
 
 
 def host_and_port(flag: str, text: str, pattern: re.Pattern[str], allowed: str) -> tuple[str, int]:

@@ -22,12 +22,17 @@ SECONDS_BUCKETS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """The state of the server at one moment. Ages are in seconds; None if nothing has happened yet."""
+    """The state of the server at one moment. Ages are in seconds; None if nothing has happened yet.
+
+    places: how many workers are up on which computer.
+    """
 
     ready: bool
     draining: bool
     queue_depth: int
     running: int
+    executor: str
+    places: dict[str, int]
     uptime_s: float
     last_turn_age_s: float
     last_task_age_s: float | None
@@ -86,6 +91,9 @@ class Metrics:
             "offboard_server_waiting_requests", "Requests waiting for a worker", registry=r
         )
         self.running = Gauge("offboard_server_running_tasks", "Tasks running", registry=r)
+        self.up = Gauge(
+            "offboard_server_up_workers", "Workers that run a task or can take one", ["executor"], registry=r
+        )
         self.queue_s = Histogram(
             "offboard_server_queue_seconds",
             "Time from arrival to start",

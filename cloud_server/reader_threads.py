@@ -15,9 +15,9 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 
-from offboard.cloud_server.executors import Executor
+from offboard.cloud_server.executors.executor import Executor
+from offboard.cloud_server.executors.task_run import Call, Outcome
 from offboard.cloud_server.fair_queue import Work
-from offboard.cloud_server.task_run import Call, Outcome
 
 SHORT_S = 0.0005  # tasks of a kind that usually take less are short
 USUAL_RATE = 0.1  # share of each new run time in the usual run time of a kind

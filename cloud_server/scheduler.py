@@ -10,11 +10,11 @@ from collections import Counter, OrderedDict
 from dataclasses import dataclass, replace
 
 from offboard.cloud_server.authorisation import Access
-from offboard.cloud_server.executors import Executor
+from offboard.cloud_server.executors.executor import Executor
+from offboard.cloud_server.executors.task_run import Outcome
 from offboard.cloud_server.fair_queue import FairQueue, Work
 from offboard.cloud_server.metrics import Metrics
 from offboard.cloud_server.robot_socket import ReplySender
-from offboard.cloud_server.task_run import Outcome
 from offboard.common import tasks
 from offboard.common.host.load_watch import LoadWatch
 from offboard.common.wire.blobs import BlobStore
@@ -186,7 +186,7 @@ class Scheduler:
         self._failures.note(request.kind, outcome)
         if work.wanted:
             self._load.hurry()  # the load during the task, not before it
-            load, capacity = self._load.latest()
+            load, capacity = outcome.load or self._load.latest()
             reply = Reply(
                 request.id, outcome.status, outcome.error, work.queue_s,
                 run_s=outcome.run_s, queue_depth=len(self._queue), server_fault=outcome.server_fault,

@@ -14,17 +14,17 @@ from typing import Any
 import zmq
 
 from offboard.cloud_server.authorisation import Access, Authorisation, Everyone
-from offboard.cloud_server.executors import Executor
+from offboard.cloud_server.executors.executor import Executor
+from offboard.cloud_server.executors.task_run import Outcome
 from offboard.cloud_server.fair_queue import Work
 from offboard.cloud_server.metrics import Metrics, RobotUse, Status
 from offboard.cloud_server.rate_limit import CUT_OFF_S, RateLimit, Verdict
 from offboard.cloud_server.reader_threads import ReaderThreads
 from offboard.cloud_server.robot_socket import ReplySender, bind_router
 from offboard.cloud_server.scheduler import Refusal, Scheduler
-from offboard.cloud_server.task_run import Outcome
 from offboard.cloud_server.tcp_connections import UnreadLimit, end, other_end
 from offboard.common import VERSION, tasks
-from offboard.common.errors import OffloadError, ProtocolError, TaskFailed, describe
+from offboard.common.errors import ConfigError, OffloadError, ProtocolError, TaskFailed, describe
 from offboard.common.host.cgroup import SELF
 from offboard.common.host.load import SERVER_EVERY_S, Load
 from offboard.common.host.load_watch import LoadWatch
@@ -121,8 +121,9 @@ class Server:
         metrics.queue_depth.set_function(lambda: self._scheduler.waiting)
         metrics.running.set_function(lambda: self._scheduler.running)
         metrics.blob_bytes.set_function(lambda: self._blobs.byte_count)
-        metrics.load.set_function(lambda: self._load.latest()[0])
-        metrics.capacity.set_function(lambda: self._load.latest()[1])
+        metrics.up.labels(executor.name).set_function(lambda: executor.up)
+        metrics.load.set_function(lambda: self._latest_load()[0])
+        metrics.capacity.set_function(lambda: self._latest_load()[1])
 
     def run(self) -> bool:
         """Serve until drained. True if every accepted request was answered."""
@@ -134,6 +135,10 @@ class Server:
                 return self._scheduler.give_up() == 0
         finally:
             self._close()
+
+    def _latest_load(self) -> tuple[float, float]:
+        """Load and capacity of the computers that run the tasks."""
+        return self._executor.load() or self._load.latest()
 
     def drain(self) -> None:
         """Accept no new requests, answer the accepted ones, then let `run` return."""
@@ -149,6 +154,8 @@ class Server:
             draining=self._scheduler.draining,
             queue_depth=self._scheduler.waiting,
             running=self._scheduler.running,
+            executor=self._executor.name,
+            places=self._executor.places(),
             uptime_s=now - self._started,
             last_turn_age_s=now - self._last_turn,
             last_task_age_s=None if last_task is None else now - last_task,
@@ -187,6 +194,8 @@ class Server:
                 if isinstance(error, TaskFailed):
                     text = "the server cannot start; remedy: correct the setup of that task\n%s"
                     log.error(text, error.traceback.rstrip())
+                if isinstance(error, ConfigError):
+                    raise error
                 raise OffloadError(
                     str(error) if isinstance(error, OffloadError) else describe(error)
                 ) from error
@@ -259,7 +268,7 @@ class Server:
             case Blob(data, int(size)):
                 self._decompress(peer, file, data, size)
             case Ping(id):
-                self._sender.send(peer, Pong(id, self._scheduler.waiting, *self._load.latest()))
+                self._sender.send(peer, Pong(id, self._scheduler.waiting, *self._latest_load()))
             case Hello():
                 # Robots repeat their hello until it is answered, and send no task before that.
                 if self._scheduler.ready and not self._scheduler.draining:

@@ -14,7 +14,7 @@ EXTRAS = {
 }
 
 # Environments of tests, each with its oldest Python; NAME.in holds what they need.
-FOR_TESTS = {"openpi": "3.11", "ros2-kilted": "3.11", "ros2-jazzy": "3.12"}
+FOR_TESTS = {"openpi": "3.11", "ray": "3.11", "ros2-kilted": "3.11", "ros2-jazzy": "3.12"}
 
 OPTIONS = (
     *("--quiet", "--universal", "--generate-hashes", "--upgrade"),

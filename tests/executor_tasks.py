@@ -3,11 +3,12 @@
 from pathlib import Path
 from typing import Any
 
-from offboard.cloud_server.executors import Executor
-from offboard.cloud_server.task_run import Call, Outcome
+from offboard.cloud_server.executors.executor import Executor
+from offboard.cloud_server.executors.task_run import Call, Outcome
 from offboard.common.wire.messages import StoredBlob, decode, encode
 
 WAIT_S = 8
+ON_THIS_COMPUTER = ("processes", "threads")  # executors; `make ray` tests the other one
 ROOT = Path(__file__).parents[1]
 MODULE = '''
 import asyncio, dataclasses, os, pathlib, threading, time

@@ -14,10 +14,9 @@ from offboard.cloud_server import (
     scheduler,
     server,
     tcp_connections,
-    worker,
-    worker_pool,
 )
 from offboard.cloud_server.config import ServerConfig
+from offboard.cloud_server.executors import worker, worker_pool
 from offboard.common import task_states, tasks, tracebacks
 from offboard.common.planning import maps, planner
 from offboard.common.security import bounded_http, private_files

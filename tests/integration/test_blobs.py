@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from offboard.cloud_server.executors import ThreadExecutor
+from offboard.cloud_server.executors.thread_executor import ThreadExecutor
 from offboard.cloud_server.metrics import Metrics
 from offboard.cloud_server.server import Limits, Server
 from offboard.common.tasks import Task, kind_of, task

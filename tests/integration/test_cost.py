@@ -5,7 +5,7 @@ from threading import Thread
 
 import pytest
 
-from offboard.cloud_server.executors import ThreadExecutor
+from offboard.cloud_server.executors.thread_executor import ThreadExecutor
 from offboard.cloud_server.metrics import Metrics
 from offboard.cloud_server.server import Limits, Server
 from offboard.common.tasks import task

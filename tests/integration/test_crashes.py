@@ -15,9 +15,9 @@ import httpx
 import numpy as np
 import pytest
 
-from offboard.cloud_server import worker
-from offboard.cloud_server.task_run import Call, Outcome
-from offboard.cloud_server.worker_pool import WorkerPool
+from offboard.cloud_server.executors import worker
+from offboard.cloud_server.executors.task_run import Call, Outcome
+from offboard.cloud_server.executors.worker_pool import WorkerPool
 from offboard.common.errors import CloudTimeout, TaskFailed
 from offboard.common.wire.messages import decode, encode
 from offboard.loadgen.testbed.local_testbed import LocalTestbed

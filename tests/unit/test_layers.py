@@ -50,6 +50,7 @@ FOLDERS: dict[str, set[str]] = {
         "robot_client/sites",
     },
     "robot_client/check": {"robot_client/sites"},
+    "cloud_server/executors": set(),
     "loadgen/robot": {"loadgen"},
     "loadgen/relay/link": set(),
     "loadgen/relay/tcp": {"loadgen/relay/link"},
@@ -138,6 +139,7 @@ OWNERS = {
     "torch": {"loadgen/rivals/lstm.py"},
     "rich": {"loadgen/progress.py"},
     "river": {"loadgen/rivals/river_model.py"},
+    "ray": {"cloud_server/executors/ray_cluster.py"},
     "rclpy": {"offboard/ros2/node.py"},
     "cyclonedds": {"offboard/ros2/bridge.py", "offboard/ros2/dds_types.py"},
     "mcap": {"loadgen/export/mcap_file.py"},
@@ -295,6 +297,7 @@ def test_help_loads_no_heavy_library(command: str) -> None:
         "websockets",
         "cyclonedds",
         "rclpy",
+        "ray",
     )
     package, *words = command.split()
     probe = (

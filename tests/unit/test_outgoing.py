@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from offboard.cloud_server.task_run import Call, run_task
+from offboard.cloud_server.executors.task_run import Call, run_task
 from offboard.common.errors import BadValue
 from offboard.common.task_states import TaskStates
 from offboard.common.tasks import Task, kind_of, task

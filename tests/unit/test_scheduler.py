@@ -2,8 +2,8 @@
 
 import pytest
 
+from offboard.cloud_server.executors.task_run import Outcome
 from offboard.cloud_server.scheduler import CRASHED_KEPT, CRASHES_MAX, FAILURES_KEPT, CrashCount, FailureLog
-from offboard.cloud_server.task_run import Outcome
 
 
 def test_a_request_is_refused_after_its_last_crash() -> None:

@@ -84,7 +84,8 @@ export function serverBusy(samples) {
   const count = change("offboard_server_run_seconds_count"), run = change("offboard_server_run_seconds_sum");
   const wait = change("offboard_server_queue_seconds_sum"), busy = seconds ? run / (seconds * now.workers) : 0;
   const refused = sum(robots.map(one => one.refused));
-  const figures = `${now.running} of ${now.workers} workers are busy now, and ${now.queue_depth} tasks wait. In ${Math.round(seconds)} s ${refused} requests were refused.`;
+  const places = Object.entries(now.places).map(([place, count]) => `${count} on ${place}`).join(", ") || "none";
+  const figures = `${now.running} of ${now.workers} workers (${now.executor}; up: ${places}) are busy now, and ${now.queue_depth} tasks wait. In ${Math.round(seconds)} s ${refused} requests were refused.`;
   if (!count) return ["No task yet.", figures];
   const means = `a task waits ${ms(wait / count)} and runs ${ms(run / count)} in the mean`;
   if (busy >= BUSY || wait > run) return [`The server: its workers were busy for ${percent(busy)} of the time, and ${means}.`, figures];

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from offboard.cloud_server.executors import EXECUTORS, Executor
-from tests.executor_tasks import MODULE, WAIT_S
+from tests.executor_tasks import MODULE, ON_THIS_COMPUTER, WAIT_S
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def make(module: str) -> Iterator[Callable[..., Executor]]:
         executor.close()
 
 
-@pytest.fixture(scope="module", params=sorted(EXECUTORS))
+@pytest.fixture(scope="module", params=ON_THIS_COMPUTER)
 def executor(request: pytest.FixtureRequest, module: str) -> Iterator[Executor]:
     """One warm executor of each kind, with two workers."""
     executor = EXECUTORS[request.param](2, [module], 1_000_000)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from offboard.cloud_server.executors import EXECUTORS, Executor
-from offboard.cloud_server.worker_pool import SPARES, WorkerPool
+from offboard.cloud_server.executors.worker_pool import SPARES, WorkerPool
 from tests.executor_tasks import ROOT, WAIT_S, call, run, value
 
 pytestmark = pytest.mark.integration
@@ -97,7 +97,7 @@ def test_workers_that_cannot_start_are_reported(module: str) -> None:
 
 SERVER = """
 import sys
-from offboard.cloud_server.worker_pool import WorkerPool
+from offboard.cloud_server.executors.worker_pool import WorkerPool
 
 if __name__ == "__main__":
     sys.path.insert(0, sys.argv[1])

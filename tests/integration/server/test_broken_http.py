@@ -53,6 +53,8 @@ def status() -> Status:
         draining=False,
         queue_depth=0,
         running=0,
+        executor="threads",
+        places={"localhost": 1},
         uptime_s=0.0,
         last_turn_age_s=0.0,
         last_task_age_s=None,

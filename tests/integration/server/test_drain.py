@@ -6,8 +6,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-from offboard.cloud_server.executors import EXECUTORS
 from offboard.common.wire import messages as wire
+from tests.executor_tasks import ON_THIS_COMPUTER
 from tests.integration.server.peers import Command, Join, Serve, until
 
 pytestmark = pytest.mark.integration
@@ -43,7 +43,7 @@ def test_draining_is_bounded(serve: Serve, join: Join, pipe: Path) -> None:
     until(lambda: running.answered is False)
 
 
-@pytest.mark.parametrize("executor", sorted(EXECUTORS))
+@pytest.mark.parametrize("executor", ON_THIS_COMPUTER)
 def test_sigterm_lets_the_running_task_finish(folder: Path, join: Join, pipe: Path, executor: str) -> None:
     """After SIGTERM the running task is answered, new ones are busy, and the exit code is 0."""
     command = Command(folder, "--executor", executor, "--workers", "1")

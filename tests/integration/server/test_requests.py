@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 
 from offboard import Offloader
-from offboard.cloud_server.executors import EXECUTORS
 from offboard.common import VERSION
 from offboard.common.errors import TaskFailed
 from offboard.common.host.load import LOADED
 from offboard.common.tasks import kind_named
 from offboard.common.wire import messages as wire
 from offboard.common.wire.messages import Cancel, Hello, Ping, Pong
+from tests.executor_tasks import ON_THIS_COMPUTER
 from tests.integration.server.peers import WAIT_S, Join, Serve, until
 
 pytestmark = pytest.mark.integration
 
 
-@pytest.mark.parametrize("executor", sorted(EXECUTORS))
+@pytest.mark.parametrize("executor", ON_THIS_COMPUTER)
 def test_a_request_is_answered(serve: Serve, join: Join, executor: str) -> None:
     """With every executor, the reply holds the result and the server's queue, run and CPU seconds."""
     peer = join(serve(executor).server.endpoint)
@@ -37,7 +37,7 @@ def test_a_request_is_answered(serve: Serve, join: Join, executor: str) -> None:
     assert reply.queue_depth == 0
 
 
-@pytest.mark.parametrize("executor", sorted(EXECUTORS))
+@pytest.mark.parametrize("executor", ON_THIS_COMPUTER)
 def test_failed_and_unknown_tasks_are_answered(serve: Serve, join: Join, executor: str) -> None:
     """A task that raises is answered `failed` with the error; an unknown task is `unknown_task`."""
     running = serve(executor)
@@ -55,7 +55,7 @@ def test_failed_and_unknown_tasks_are_answered(serve: Serve, join: Join, executo
 
 
 @pytest.mark.parametrize("where", ["cloud", "onboard"])
-@pytest.mark.parametrize("executor", sorted(EXECUTORS))
+@pytest.mark.parametrize("executor", ON_THIS_COMPUTER)
 def test_a_failed_task_comes_with_its_traceback(serve: Serve, executor: str, where: str) -> None:
     """It begins in the function of the task; the error has the text and the name of the task."""
     running, function = serve(executor), kind_named("served_raise").function
@@ -87,7 +87,7 @@ def test_hello_and_ping_are_answered(serve: Serve, join: Join) -> None:
     assert peer.receive() == hello
 
 
-@pytest.mark.parametrize("executor", sorted(EXECUTORS))
+@pytest.mark.parametrize("executor", ON_THIS_COMPUTER)
 def test_a_server_reports_its_load(serve: Serve, join: Join, executor: str) -> None:
     """If other programs compute on all CPUs, pongs, replies and metrics soon show it."""
     running = serve(executor)

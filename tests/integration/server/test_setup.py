@@ -14,14 +14,14 @@ import pytest
 
 from offboard import Offloader
 from offboard.cloud_server.executors import EXECUTORS, Executor
-from offboard.cloud_server.worker_pool import WorkerPool
+from offboard.cloud_server.executors.worker_pool import WorkerPool
 from offboard.common.errors import OffloadError
 from offboard.common.tasks import task
 from offboard.robot_client.policies import BOTH
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests import stateful_tasks
-from tests.executor_tasks import call, run, value
+from tests.executor_tasks import ON_THIS_COMPUTER, call, run, value
 from tests.integration.server.peers import WAIT_S, Serve
 from tests.stateful_tasks import Engine, engine_twice
 
@@ -143,7 +143,7 @@ def test_no_setup_time_is_recorded(serve: Serve, monkeypatch: pytest.MonkeyPatch
         assert (one.run_s or 0.0) < SETUP_S
 
 
-@pytest.mark.parametrize("name", sorted(EXECUTORS))
+@pytest.mark.parametrize("name", ON_THIS_COMPUTER)
 def test_a_setup_that_raises_stops_the_server(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The error names the task and the cause."""
     monkeypatch.setenv("BREAK_ENGINE", "1")
@@ -155,7 +155,7 @@ def test_a_setup_that_raises_stops_the_server(name: str, monkeypatch: pytest.Mon
         executor.warm().result(WAIT_S)
 
 
-@pytest.mark.parametrize("name", sorted(EXECUTORS))
+@pytest.mark.parametrize("name", ON_THIS_COMPUTER)
 @pytest.mark.parametrize("when", ["setup", "warm"])
 def test_the_log_shows_where_a_setup_raised(tmp_path: Path, name: str, when: str) -> None:
     """The last line names task and error; above it are the frames of the user, and none of Offboard."""

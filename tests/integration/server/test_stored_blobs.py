@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from offboard.cloud_server.executors import EXECUTORS
 from offboard.common.wire.compression import compress
 from offboard.common.wire.messages import Blob
+from tests.executor_tasks import ON_THIS_COMPUTER
 from tests.integration.server.peers import Join, Serve, until
 
 pytestmark = pytest.mark.integration
 
 
-@pytest.mark.parametrize("executor", sorted(EXECUTORS))
+@pytest.mark.parametrize("executor", ON_THIS_COMPUTER)
 def test_a_blob_is_asked_for_once(serve: Serve, join: Join, executor: str) -> None:
     """The server asks for a missing blob, then answers, and keeps the blob for the next robot."""
     running = serve(executor)

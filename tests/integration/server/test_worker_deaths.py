@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from offboard.cloud_server.worker_pool import SPARES
+from offboard.cloud_server.executors.worker_pool import SPARES
 from tests.integration.server.peers import Join, Serve, until
 
 pytestmark = pytest.mark.integration

@@ -1,6 +1,6 @@
 """One run of a task: the call, the running itself, and its outcome.
 
-Threads and worker processes run tasks with this module; `executors` and `worker_pool` decide where.
+Threads, worker processes and Ray actors run tasks with this module; the executors decide where.
 """
 
 import math
@@ -43,6 +43,7 @@ class Outcome:
     `run_s` is the time in the worker. `cpu_s` is the CPU time used during the run, by all processes under the
     same quota, or else by the process that ran the task. `server_fault`: the task failed, but the task is not
     the cause. `crashed`: its worker process died. `traceback`: of a task that raised, else empty.
+    `load`: load and capacity of the computer that ran the task; None: the computer of the server.
     """
 
     status: str
@@ -53,6 +54,7 @@ class Outcome:
     server_fault: bool = False
     crashed: bool = False
     traceback: str = ""
+    load: tuple[float, float] | None = None
 
 
 def run_task(call: Call, states: TaskStates) -> Outcome:

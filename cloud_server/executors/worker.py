@@ -24,9 +24,9 @@ from typing import Any, NoReturn
 
 import msgpack
 
-from offboard.cloud_server.task_run import Call, Outcome
-from offboard.cloud_server.worker_process import CHUNK_BYTES, Setup, new_unpacker
-from offboard.common.errors import TaskFailed, describe
+from offboard.cloud_server.executors.task_run import Call, Outcome
+from offboard.cloud_server.executors.worker_process import CHUNK_BYTES, Setup, new_unpacker
+from offboard.common.errors import OffloadError, TaskFailed, describe
 from offboard.common.wanted import always
 
 START_S_MAX = 300.0  # until a worker is ready, compilation included
@@ -53,7 +53,7 @@ class Died(Exception):
     """A worker process has ended, or must be ended.
 
     `reason` is one word. `outcome` is the outcome of its task, if the task ended before the process did.
-    `failure`: what a task raised when the process prepared for it, so that the process could not start.
+    `failure`: why the process could not start, for example what a task raised when it was prepared.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class Died(Exception):
         *,
         server_fault: bool = False,
         outcome: Outcome | None = None,
-        failure: TaskFailed | None = None,
+        failure: OffloadError | None = None,
     ) -> None:
         super().__init__(text)
         self.reason = reason
@@ -276,7 +276,8 @@ class _Process:
 def _spawn(pipe: int, flag: int, setup: Setup) -> "subprocess.Popen[bytes]":
     """Start a worker process. `multiprocessing` cannot: threads that start processes reap each other's."""
     path = [str(folder) for folder in sys.path]
-    code = f"import sys; sys.path[:] = {path}; from offboard.cloud_server.worker_process import Setup, work; "
+    home = "offboard.cloud_server.executors.worker_process"
+    code = f"import sys; sys.path[:] = {path}; from {home} import Setup, work; "
     code += f"work({os.getpid()}, {pipe}, {flag}, {setup!r})"
     command = [sys.executable, "-u", "-c", code]  # -u: a crash does not lose what the task has printed
     return subprocess.Popen(command, stdin=subprocess.DEVNULL, pass_fds=(pipe, flag))

@@ -20,7 +20,7 @@ from typing import Any
 
 import msgpack
 
-from offboard.cloud_server.task_run import Call, Outcome, run_task, warm_kinds
+from offboard.cloud_server.executors.task_run import Call, Outcome, run_task, warm_kinds
 from offboard.common import tasks
 from offboard.common.errors import TaskFailed, describe
 from offboard.common.task_states import TaskStates
@@ -57,7 +57,7 @@ def work(parent: int, pipe_fd: int, flag: int, setup: Setup) -> None:
         os._exit(1)  # the parent died before the line above
     for fd in (pipe_fd, flag):
         os.set_inheritable(fd, False)
-    _limit_memory(setup.memory_bytes_max)
+    limit_memory(setup.memory_bytes_max)
     if sys.stderr is not None:
         faulthandler.enable()  # the server's log then shows where a task crashed
     pipe, stop = socket.socket(fileno=pipe_fd), mmap.mmap(flag, 1)
@@ -79,7 +79,7 @@ def work(parent: int, pipe_fd: int, flag: int, setup: Setup) -> None:
         del call  # free its memory before the next one comes
 
 
-def _limit_memory(bytes_max: int) -> None:
+def limit_memory(bytes_max: int) -> None:
     """Limit the private, writable memory. The address space does not count: threads only reserve it."""
     _, most = resource.getrlimit(resource.RLIMIT_DATA)
     limit = bytes_max if most == resource.RLIM_INFINITY else min(bytes_max, most)
@@ -126,18 +126,24 @@ def _blob(store: BlobStore, folder: Path, digest: bytes) -> StoredBlob:
 
 
 def _message(outcome: Outcome) -> bytes:
+    kept, outcome = full(outcome.error), bounded(outcome)
+    fields = [outcome.status, outcome.error, outcome.run_s, outcome.cpu_s, outcome.frames]
+    fields += [outcome.server_fault, outcome.crashed, outcome.traceback]
+    message: bytes = msgpack.packb([*fields, kept], unicode_errors="replace")
+    return message
+
+
+def bounded(outcome: Outcome) -> Outcome:
+    """The same outcome, or one that says that its result is too large."""
     size = byte_count(outcome.frames)
     if size > ANSWER_BYTES_MAX:
         error = f"BadValue: the result takes {size} bytes, at most {ANSWER_BYTES_MAX} are allowed"
         outcome = replace(outcome, status="failed", error=error, frames=[], server_fault=True, traceback="")
-    error, full = outcome.error[:ERROR_LENGTH_MAX], _full(outcome.error)
-    fields = [outcome.status, error, outcome.run_s, outcome.cpu_s, outcome.frames, outcome.server_fault]
-    fields += [outcome.crashed, outcome.traceback]
-    message: bytes = msgpack.packb([*fields, full], unicode_errors="replace")
-    return message
+    outcome.error = outcome.error[:ERROR_LENGTH_MAX]
+    return outcome
 
 
-def _full(error: str) -> bool:
+def full(error: str) -> bool:
     """True if the task ran out of memory and half is still in use: the next task would have too little."""
     if not error.partition(":")[0].endswith("MemoryError"):
         return False

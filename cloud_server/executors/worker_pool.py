@@ -13,10 +13,11 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from pathlib import Path
 
-from offboard.cloud_server.task_run import Blobs, Call, Outcome
-from offboard.cloud_server.worker import Assignment, Died, Worker
-from offboard.cloud_server.worker_process import Setup
-from offboard.common.errors import CloudBroken
+from offboard.cloud_server.executors.executor import THIS_COMPUTER
+from offboard.cloud_server.executors.task_run import Blobs, Call, Outcome
+from offboard.cloud_server.executors.worker import Assignment, Died, Worker
+from offboard.cloud_server.executors.worker_process import Setup
+from offboard.common.errors import CloudBroken, TaskFailed
 from offboard.common.host.cpu_time import process_s
 
 MEMORY_BYTES_MAX = 2 << 30  # of one worker process
@@ -35,6 +36,8 @@ class WorkerPool:
     Parameters: `workers` tasks run at the same time; `modules` register the tasks; `blob_bytes_max` limits
     the files; `memory_bytes_max` limits each worker process.
     """
+
+    name = "processes"
 
     def __init__(
         self,
@@ -89,6 +92,12 @@ class WorkerPool:
         assignment.answer.set_result(Outcome("busy", "a worker died, and the next one is not ready yet"))
         return assignment.answer
 
+    def places(self) -> dict[str, int]:
+        return {THIS_COMPUTER: self.up}
+
+    def load(self) -> None:
+        return None
+
     def run(self, call: Call, *, meanwhile: Callable[[], None] | None) -> None:  # noqa: ARG002
         return None
 
@@ -125,7 +134,8 @@ class WorkerPool:
                 self._started.set_exception(death.failure or CloudBroken(text))
                 return
         if death.reason != "closed":
-            frames = f"\n{death.failure.traceback.rstrip()}" if death.failure else ""
+            failure = death.failure
+            frames = f"\n{failure.traceback.rstrip()}" if isinstance(failure, TaskFailed) else ""
             text = "worker %d %s; another worker takes its place; remedy: correct its task, or its limits%s"
             log.warning(text, worker.pid, death, frames)
             self._changed(death.reason)
