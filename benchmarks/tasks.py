@@ -1,4 +1,4 @@
-"""Tasks that take no time or no CPU, so that only the way to the server and back is measured, and one that does."""
+"""Tasks that take no time or no CPU, to measure the way to the server and back; and one that computes."""
 
 import hashlib
 import time
