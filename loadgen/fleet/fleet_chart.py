@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 
 from offboard.loadgen.fleet.fleet_figures import FleetLine
+from offboard.loadgen.replay.replay import ORACLE
 from offboard.loadgen.report.chart_parts import Drawing, Figure, key, legend, logarithmic, render
 from offboard.loadgen.report.chart_styles import FURTHER_LOOKS, LOOKS
-from offboard.loadgen.table.replay import ORACLE
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 PANEL_IN = 1.9

@@ -16,6 +16,7 @@ from offboard.loadgen.fleet.fleet_site import FleetSite, Place
 from offboard.loadgen.play.run_files import ROBOT_SEED_STEP
 from offboard.loadgen.simulation.model.simulated_cpu import SimulatedCpu
 from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks
+from offboard.loadgen.simulation.model.stepped_offloader import SteppedOffloader
 from offboard.loadgen.simulation.model.task_costs import (
     DECIDING_CPU_S,
     SITE_NOISE,
@@ -26,7 +27,6 @@ from offboard.loadgen.simulation.model.true_costs import TrueCosts
 from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
 from offboard.loadgen.simulation.model.walker import Walk, Walker
 from offboard.loadgen.simulation.simulated_onboard import SimulatedOnboard
-from offboard.loadgen.simulation.stepped_offloader import SteppedOffloader
 from offboard.robot_client.discovery.present_sites import PresentSites
 from offboard.robot_client.discovery.roster import Roster, Server
 from offboard.robot_client.policies import Probe

@@ -9,17 +9,17 @@ import math
 import operator
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 from typing import NamedTuple
 
 from offboard.common.errors import OffloadError
 from offboard.common.tasks import Size, task
 from offboard.loadgen.replay.recorded_site import RecordedSite
 from offboard.loadgen.replay.recorded_tasks import RecordedTask
-from offboard.loadgen.simulation.model.lockstep_clock import LockstepClock
+from offboard.loadgen.simulation.model.stepped_offloader import SteppedOffloader
+from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
+from offboard.loadgen.simulation.model.walker import Walk, Walker
 from offboard.robot_client.execution import batch
 from offboard.robot_client.learning.memories import Memories
-from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import ALONE, PINNED, Decision, Forecast, Hedge, Policy, observe
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.policies.objectives import by_deadline
@@ -45,13 +45,13 @@ class VirtualRobot:
         self, policy: Policy, memories: Memories, *, tells_work: bool, sites: Sequence[str] = (ONBOARD, CLOUD)
     ) -> None:
         self._function = _replayed_with_work if tells_work else _replayed
-        self._clock = LockstepClock()
+        self._clock = VirtualClock()
         self._zero_s: float | None = None  # when the first task began, on the clock of the run
         self._allowance = Allowance()
         self._sites = [RecordedSite(site, self._clock) for site in sites]
         self._chooser = _Chooser(policy)
         self._records: deque[Record] = deque(maxlen=1)
-        self._offload = Offloader(
+        self._offload = SteppedOffloader(
             self._sites,
             policy=self._chooser,
             memories=memories,
@@ -84,14 +84,16 @@ class VirtualRobot:
         decided: list[Decision | None] = [None] * len(tasks)
         under_way: dict[int, RecordedTask] = {}
 
-        def run(number: int, decision: Decision) -> None:
-            self._run(number, tasks[number], instead=decision, ask=decision.policy not in NOT_BY_A_RULE)
+        def run(number: int, decision: Decision) -> Walk:
+            one = tasks[number]
+            self._begin(number, one, instead=decision, ask=decision.policy not in NOT_BY_A_RULE)
+            yield from self._offload.steps(self._function, one.size, number, timeout_s=one.timeout_s)
             del under_way[number]
 
         for number in sorted(range(len(tasks)), key=lambda number: tasks[number].i):
             self._wait_for(tasks[number], under_way)
             under_way[number] = tasks[number]
-            self._clock.begin(partial(run, number, _carried_out(tasks[number])))
+            Walker(self._clock, run(number, _carried_out(tasks[number]))).begin()
             decided[number] = self._chooser.decided
         while under_way:
             self._clock.step(math.inf)
@@ -107,11 +109,14 @@ class VirtualRobot:
             self._clock.step(math.inf)
 
     def _run(self, number: int, recorded: RecordedTask, *, instead: Decision | None, ask: bool) -> None:
+        self._begin(number, recorded, instead=instead, ask=ask)
+        with contextlib.suppress(OffloadError):  # as in the run, no site may have answered
+            self._offload(self._function, recorded.size, number, timeout_s=recorded.timeout_s)
+
+    def _begin(self, number: int, recorded: RecordedTask, *, instead: Decision | None, ask: bool) -> None:
         self._chooser.begin(recorded.deadline_s, instead=instead, ask=ask)
         for site in self._sites:
             site.begin(number, recorded)
-        with contextlib.suppress(OffloadError):  # as in the run, no site may have answered
-            self._offload(self._function, recorded.size, number, timeout_s=recorded.timeout_s)
 
     def _as_decided(self, decision: Decision | None, recorded: RecordedTask) -> Played:
         """What would have become of a task that ran on both sites only so that both learn."""

@@ -17,10 +17,10 @@ from offboard.loadgen.scenario.outcome import Answered, Outcome, Reference
 from offboard.loadgen.scenario.outcome_files import is_probed
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks
+from offboard.loadgen.simulation.model.stepped_offloader import SteppedOffloader
 from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
 from offboard.loadgen.simulation.model.walker import Walk, Walker
 from offboard.loadgen.simulation.simulated_testbed import SimulatedTestbed
-from offboard.loadgen.simulation.stepped_offloader import SteppedOffloader
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client.policies import BOTH
 from offboard.robot_client.records.trace import Record, Trace, as_dict

@@ -13,10 +13,12 @@ from offboard.robot_client.sites.outgoing import new_task
 class SteppedOffloader(Offloader):
     """Predicts, decides, executes, learns and records as every offloader; `clock` only tells the time."""
 
-    def steps(self, function: Callable[..., Any], *args: Any) -> Generator[Wait, None, Record]:
-        """The same as a call: yields each wait, and goes on when it is over."""
+    def steps(
+        self, function: Callable[..., Any], *args: Any, timeout_s: float | None = None
+    ) -> Generator[Wait, None, Record]:
+        """The same as a call: yields each wait, and goes on when it is over. It does not raise a failure."""
         kind = kind_of(function)
-        pending = self._begin(new_task(kind, kind.bind(args, {})), None, self._timeout_s)
+        pending = self._begin(new_task(kind, kind.bind(args, {})), None, timeout_s or self._timeout_s)
         race, plan = self._runs.race(pending)
         executions = yield from race.steps(plan)
         return self._end(pending, executions)[1]
