@@ -96,6 +96,7 @@ FOLDERS: dict[str, set[str]] = {
     "loadgen/fleet": {
         "loadgen",
         "loadgen/play",
+        "loadgen/replay",
         "loadgen/report",
         "loadgen/rivals",
         "loadgen/scenario",
