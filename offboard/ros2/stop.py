@@ -100,7 +100,7 @@ class StoppableRunner:
 def connect(
     endpoint: str | None,
     *,
-    sites: Path | None,
+    sites: Path | None = None,
     policy: str,
     timeout_s: float,
     keys: Path | None,

@@ -3,12 +3,12 @@
 The times come from the memories; what is measured of the sites comes from the runners in `sites`.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 
-from offboard.common.tasks import Task
+from offboard.common.tasks import Size, Task
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.runs_in_flight import Flights
-from offboard.robot_client.policies import Forecast
+from offboard.robot_client.policies import Forecast, Outlook
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Runner
 
@@ -24,13 +24,20 @@ class Forecaster:
         self, memory: KindMemory, task: Task, sites: Mapping[str, Runner], *, timeout_s: float, now_s: float
     ) -> Forecast:
         """The forecast of one task on these sites, behind all runs that are under way."""
-        return self._forecast(
-            memory,
-            task,
-            [(runner, self._flights.count(site)) for site, runner in sites.items()],
-            timeout_s=timeout_s,
-            condition=lambda runner, in_flight: self._behind(runner, in_flight, now_s),
-        )
+        amount, outlooks, packs = memory.amount(task.size), {}, task.kind.pack is not None
+        for site, runner in sites.items():
+            known, in_flight = memory.site(site), self._flights.count(site)
+            sending = runner.to_send(task)
+            outlooks[site] = known.outlook(
+                amount,
+                self._behind(runner, in_flight, now_s) if known.measured else UNMEASURED,
+                in_flight=in_flight,
+                timeout_s=timeout_s,
+                bytes_out=sending.bytes,
+                # Most tasks have nothing to make smaller, so that is asked first.
+                packing=memory.packing.plan(sending, known.link_s) if packs or sending.large else None,
+            )
+        return self._with_allowance(memory, task.size, outlooks)
 
     def forecast_in_batch(
         self, memory: KindMemory, task: Task, own: Mapping[Runner, int], *, timeout_s: float
@@ -39,32 +46,23 @@ class Forecaster:
 
         `own` holds the runners that may be used, and how many tasks of the batch each of them has.
         """
-        return self._forecast(memory, task, own.items(), timeout_s=timeout_s, condition=_apart_from)
-
-    def _forecast(
-        self,
-        memory: KindMemory,
-        task: Task,
-        sites: Iterable[tuple[Runner, int]],
-        *,
-        timeout_s: float,
-        condition: Callable[[Runner, int], Condition],
-    ) -> Forecast:
         amount, outlooks, packs = memory.amount(task.size), {}, task.kind.pack is not None
-        for runner, in_flight in sites:
+        for runner, count in own.items():
             known, sending = memory.site(runner.site), runner.to_send(task)
             outlooks[runner.site] = known.outlook(
                 amount,
-                condition(runner, in_flight) if known.measured else UNMEASURED,
-                in_flight=in_flight,
+                _apart_from(runner, count) if known.measured else UNMEASURED,
+                in_flight=count,
                 timeout_s=timeout_s,
                 bytes_out=sending.bytes,
-                # Most tasks have nothing to make smaller, so that is asked first.
                 packing=memory.packing.plan(sending, known.link_s) if packs or sending.large else None,
             )
+        return self._with_allowance(memory, task.size, outlooks)
+
+    def _with_allowance(self, memory: KindMemory, size: Size, outlooks: Mapping[str, Outlook]) -> Forecast:
         allowance = self._allowance
         duplicates = allowance.duplicates if memory.kind.duplicate else 0.0
-        forecast = Forecast(task.size, outlooks, last_site=memory.last_site, duplicates=duplicates)
+        forecast = Forecast(size, outlooks, last_site=memory.last_site, duplicates=duplicates)
         if not allowance.capped:
             return forecast
         return forecast._replace(bytes_left=allowance.bytes_left, joules_left=allowance.joules_left)
