@@ -89,7 +89,7 @@ def test_every_task_is_answered_onboard_after_its_time_onboard(cloud_s: float) -
     assert {record.used for record in robot.records} == {ONBOARD}
     assert {record.decision.site for record in robot.records} == {ONBOARD}
     assert {len(record.executions) for record in robot.records} == {1}
-    assert {late.site for record in robot.records for late in record.late} == {CLOUD}
+    assert {late.execution.site for record in robot.records for late in record.late} == {CLOUD}
     assert len(robot.sites[ONBOARD].tasks) == 200
     assert WARM_UP < len(robot.sites[CLOUD].tasks) <= DUPLICATES_MAX + 200 * DUPLICATES
     assert not robot.sites[CLOUD].cancelled

@@ -210,5 +210,5 @@ def test_a_probe_by_hand(race: Callable[..., tuple[list[Record], float]]) -> Non
     assert records[0].waited_s == pytest.approx(CLOUD_S + HASH.sending_s / 2 / 0.2)
     assert records[0].used == "cloud"
     (late,) = records[1].late
-    assert (late.id, late.site, late.ok) == (records[0].id, "onboard", True)
-    assert late.seconds == pytest.approx(ONBOARD_S)
+    assert (late.id, late.execution.site, late.execution.ok) == (records[0].id, "onboard", True)
+    assert late.execution.seconds == pytest.approx(ONBOARD_S)
