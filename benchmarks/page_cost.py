@@ -11,17 +11,16 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 from benchmarks.decision import SIZES, WINDOW, InstantRunner, counted
 from benchmarks.measure import Requirement, Table
-from offboard.common.live import robot_live
-from offboard.robot_client import policies, predictors
+from offboard.robot_client import offloader, policies, predictors
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.records.metrics import Metrics, serve_metrics
@@ -31,7 +30,7 @@ FEW, MANY = 1_500, 4_500  # tasks
 COLLECTED = re.compile(rb"Collected : (\d+)")
 ROUNDS = 3
 BAR = 0.005
-TASK_S = 0.001
+TASK = timedelta(milliseconds=1)
 
 
 def no_port() -> list[Metrics]:
@@ -41,14 +40,14 @@ def no_port() -> list[Metrics]:
 def metrics_alone() -> list[Metrics]:
     """No record is kept for a page."""
     (served,) = metrics_and_page()
-    served.live.keep = lambda _: None
+    served.live.due_at = datetime.max.replace(tzinfo=UTC)
     return [served]
 
 
 def let_time_pass() -> None:
-    """Let a task take TASK_S for the page, as on a real robot: counting instructions slows it down."""
-    tasks = itertools.count()
-    robot_live.time = SimpleNamespace(monotonic=lambda: next(tasks) * TASK_S, time=time.time)
+    """Let a task take TASK for the page, as on a real robot: counting instructions slows it down."""
+    begun, tasks = datetime.now(UTC), itertools.count()
+    offloader.datetime = SimpleNamespace(now=lambda _: begun + next(tasks) * TASK)
 
 
 def metrics_and_page() -> list[Metrics]:

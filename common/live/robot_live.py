@@ -6,6 +6,7 @@ It reads them through protocols, so that a robot's own package stays small. `liv
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Mapping
+from datetime import UTC, datetime, timedelta
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 from offboard.common.live.look import EVERY_S, KEPT_MAX, Look
@@ -13,6 +14,7 @@ from offboard.common.tasks import Kind, kinds
 
 TASKS_MAX = 15  # of a look after the first one: a viewer costs a robot with a tenth of a CPU less than 2 %
 WATCHED_S = 2 * EVERY_S  # after a look, until the next one is due
+LONG_AGO = datetime.min.replace(tzinfo=UTC)
 SPENT = ("duplicates", "bytes_left", "joules_left")
 
 R = TypeVar("R")
@@ -30,12 +32,13 @@ class RobotLive(Generic[R]):
     """The source of a robot's page. All but `keep` is left to the viewers.
 
     line: makes the line of the trace of a record.
+    due_at: `keep` the records of tasks that start then or later. Asking for it costs a task less than a call.
     """
 
     def __init__(self, line: Callable[[R], Mapping[str, Any]]) -> None:
         self._line = line
         self._records: deque[R] = deque(maxlen=KEPT_MAX)
-        self._due_s = self._watched_until_s = 0.0
+        self.due_at = self._watched_until = LONG_AGO
         self.sites: Mapping[str, Site] = {}
         self._allowance: object = None
 
@@ -43,21 +46,20 @@ class RobotLive(Generic[R]):
         """Also show these sites, and what may be spent. They are read without a lock, for people."""
         self.sites, self._allowance = sites, allowance
 
-    def keep(self, record: R) -> None:
+    def keep(self, record: R, started_at: datetime) -> None:
         """Keep the record of a task; while nobody looks, one of each EVERY_S.
 
         Each record that is kept costs the garbage collector about 1 % of what it takes to make it.
         """
-        now_s = time.monotonic()
-        if now_s >= self._due_s:
-            self._records.append(record)
-            if now_s >= self._watched_until_s:
-                self._due_s = now_s + EVERY_S
+        self._records.append(record)
+        if started_at >= self._watched_until:
+            self.due_at = started_at + timedelta(seconds=EVERY_S)
 
     def looks(self) -> Generator[Look]:
         last, kind, most = None, None, KEPT_MAX
         while True:
-            self._due_s, self._watched_until_s = 0.0, time.monotonic() + WATCHED_S
+            self._watched_until = datetime.now(UTC) + timedelta(seconds=WATCHED_S)
+            self.due_at = LONG_AGO
             new, last = self._after(last)
             lines = [self._line(record) for record in new[-most:]]
             kind = lines[-1]["kind"] if lines else kind

@@ -56,7 +56,8 @@ class Metrics:
         registry.register(self._regret)
 
     def __call__(self, record: Record) -> None:
-        self.live.keep(record)
+        if record.started_at >= self.live.due_at:
+            self.live.keep(record, record.started_at)
         self._tasks(record.kind, record.used or "none").inc()
         self._waited(record.kind).observe(record.waited_s)
         self._decisions(record.kind, record.decision.site, record.decision.policy).inc()

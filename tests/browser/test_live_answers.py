@@ -175,3 +175,18 @@ def test_the_charts_show_the_time_of_the_reader(ask: Ask) -> None:
     labels = page.locator("#history .xtick text").all_text_contents()
     assert labels
     assert all(label.startswith("22:0") for label in labels), labels
+
+
+def test_axes_of_time_move_in_steps(ask: Ask) -> None:
+    """A quarter of an hour of looks needs few axes: plotly remembers each label at each of its places."""
+    page = ask([record()])
+    axes = page.evaluate(
+        """async () => {
+          const { timeAxis } = await import("/live/charts.js"), now = Date.parse("2026-11-26T12:00:00Z");
+          const looks = [...Array(900).keys()].map(i => now + 1000 * i);
+          return looks.map(to => timeAxis([to - 900000, to - 1000, to]).range.concat(to));
+        }"""
+    )
+    assert all(first <= to - 900_000 and to <= last for first, last, to in axes)
+    assert len({first for first, _, _ in axes}) <= 900 / 16
+    assert page.evaluate("""async () => (await import("/live/charts.js")).timeAxis([])""") == {"type": "date"}

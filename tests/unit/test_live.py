@@ -1,15 +1,14 @@
 """The page `/live`: what a viewer gets, its files, and how a run's folder is followed. No socket."""
 
 import json
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from offboard.cloud_server.metrics import RobotUses
 from offboard.common.errors import MissingExtra
-from offboard.common.live import robot_live
 from offboard.common.live.live_files import PATHS, page_file
 from offboard.common.live.look import KEPT_MAX, VIEWERS_MAX, Look, Viewers, encode
 from offboard.common.live.robot_live import TASKS_MAX, RobotLive
@@ -24,11 +23,17 @@ def decoded(look: Look) -> Any:
     return json.loads(raw[len(b"data: ") :])
 
 
+def task_at(live: RobotLive[dict[str, Any]], i: int, at: datetime) -> None:
+    """A task that starts then, as the metrics of a robot note it."""
+    if at >= live.due_at:
+        live.keep({"i": i, "kind": "no such kind"}, at)
+
+
 def records(live: RobotLive[dict[str, Any]], *numbers: int) -> None:
     """Tasks of a robot that somebody looks at."""
     next(live.looks())
     for i in numbers:
-        live.keep({"i": i, "kind": "no such kind"})
+        task_at(live, i, datetime.now(UTC))
 
 
 def test_a_look_is_json_without_infinity() -> None:
@@ -87,19 +92,16 @@ def test_records_are_read_only_for_viewers() -> None:
     assert made == list(range(10))
 
 
-def test_while_nobody_looks_few_records_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_while_nobody_looks_few_records_are_kept() -> None:
     """Then it is one a second, so that tasks cost as much as without a page; a viewer gets all again."""
     live = RobotLive[dict[str, Any]](dict)
-    now_s = 1000.0
-    monkeypatch.setattr(robot_live, "time", SimpleNamespace(monotonic=lambda: now_s, time=lambda: now_s))
+    now, step = datetime.now(UTC), timedelta(seconds=0.1)
     for i in range(30):
-        live.keep({"i": i, "kind": "no such kind"})
-        now_s += 0.1
+        task_at(live, i, now + (i - 30) * step)
     looks = live.looks()
     assert [task["i"] for task in next(looks).tasks] == [0, 10, 20]
     for i in range(30, 35):
-        live.keep({"i": i, "kind": "no such kind"})
-        now_s += 0.1
+        task_at(live, i, now + (i - 30) * step)
     assert [task["i"] for task in next(looks).tasks] == [30, 31, 32, 33, 34]
 
 

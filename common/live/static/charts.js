@@ -6,13 +6,21 @@ import { amount, answered } from "./memory.js";
 
 const SYMBOLS = ["circle", "diamond", "square", "triangle-up"];
 const BINS = 30;
-const time = { type: "date" };
+const AXIS_STEPS = 16; // at least, from one end of a time axis to the other
 const OPTIONS = { displayModeBar: false, responsive: true };
 
 export const colour = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 export const siteNumber = (sites, site) => Math.max(0, sites.indexOf(site)) % SYMBOLS.length;
 const siteColour = (sites, site) => colour(`--site-${siteNumber(sites, site)}`);
 const faded = (hex, share) => hex + Math.round(share * 255).toString(16).padStart(2, "0");
+
+// An axis of time around instants in ms. Its ends move in steps: Plotly remembers each label at each of its places.
+export function timeAxis(instants) {
+  if (!instants.length) return { type: "date" };
+  const from = Math.min(...instants), to = Math.max(...instants);
+  const step = 1000 * 2 ** Math.max(0, Math.ceil(Math.log2((to - from) / 1000 / 2 / AXIS_STEPS)));
+  return { type: "date", range: [Math.floor(from / step) * step, (Math.floor(to / step) + 1) * step] };
+}
 
 // Charts change their width when a card is added next to theirs.
 const resized = new ResizeObserver(entries => {
@@ -112,7 +120,7 @@ export function drawHistory(tasks, sites, spans, events) {
   }).filter(trace => trace.x.length);
   const out = spans.length ? ` Red: ${[...new Set(spans.map(span => span[2]))].join(", ")} silent or absent.` : "";
   draw("history", "How long each task took, by the site that answered", traces,
-    { xaxis: time, yaxis: { title: { text: "seconds" } }, shapes: [...bands(spans), ...lines(events)] },
+    { xaxis: timeAxis([...tasks.map(task => task.at), ...spans.flatMap(span => span.slice(0, 2))]), yaxis: { title: { text: "seconds" } }, shapes: [...bands(spans), ...lines(events)] },
     `The last ${tasks.length} tasks.${out}`);
 }
 
@@ -131,7 +139,7 @@ export function drawPlaces(tasks, sites) {
       marker: { color: siteColour(sites, site) } };
   });
   draw("places", "Where tasks were sent", traces,
-    { barmode: "stack", xaxis: time, yaxis: { title: { text: "tasks" } } },
+    { barmode: "stack", xaxis: timeAxis([from, tasks[tasks.length - 1].at + width]), yaxis: { title: { text: "tasks" } } },
     sites.map(site => `${site}: ${chosen(site).length}`).join(", ") + `, of ${tasks.length} tasks.`);
 }
 
@@ -168,7 +176,7 @@ export function drawLink(samples, tasks, sites, spans) {
   }
   if (!traces.some(trace => trace.x.length)) { remove("link"); return; }
   draw("link", "Link and queue, from heartbeats", traces, {
-    xaxis: time, yaxis: { title: { text: "ms" } }, shapes: bands(spans),
+    xaxis: timeAxis(traces.flatMap(trace => trace.x)), yaxis: { title: { text: "ms" } }, shapes: bands(spans),
     yaxis2: {
       overlaying: "y", side: "right", rangemode: "tozero", title: { text: "tasks" }, showgrid: false,
       automargin: true, tickformat: "d", nticks: 4, range: [0, Math.max(4, ...queues) * 1.05],
@@ -184,20 +192,14 @@ export function drawServer(samples) {
     line("waiting", samples.map(one => one.server.queue_depth), "--site-1"),
     line("running", samples.map(one => one.server.running), "--site-0"),
     line("workers", samples.map(one => one.server.workers), "--faint", "dot"),
-  ], { xaxis: time, yaxis: { title: { text: "tasks" } } }, "Since this page is open, one sample a second.");
-  const totals = samples.map(one => {
-    const found = new Map();
-    for (const [name, labels, value] of one.server.samples) {
-      if (name === "offboard_server_requests_total") found.set(labels.status, (found.get(labels.status) || 0) + value);
-    }
-    return found;
-  });
-  const statuses = [...new Set(totals.flatMap(found => [...found.keys()]))];
+  ], { xaxis: timeAxis(x), yaxis: { title: { text: "tasks" } } }, "Since this page is open, one sample a second.");
+  const statuses = [...new Set(samples.flatMap(one => Object.keys(one.server.statuses)))];
   const own = ["--site-0", "--site-1", "--site-3", "--site-2"];
-  const rate = status => totals.map((found, i) => i === 0 ? null
-    : ((found.get(status) || 0) - (totals[i - 1].get(status) || 0)) / Math.max(0.001, (x[i] - x[i - 1]) / 1000));
+  const counted = (i, status) => samples[i].server.statuses[status] || 0;
+  const rate = status => samples.map((_, i) => i === 0 ? null
+    : (counted(i, status) - counted(i - 1, status)) / Math.max(0.001, (x[i] - x[i - 1]) / 1000));
   draw("rates", "Requests a second, by outcome",
     statuses.map((status, i) => line(status, rate(status), own[i % own.length], i < own.length ? "solid" : "dash", "vh")), // a rate is that of the second before
-    { xaxis: time, yaxis: { title: { text: "a second" } } },
+    { xaxis: timeAxis(x), yaxis: { title: { text: "a second" } } },
     statuses.length ? `Outcomes: ${statuses.join(", ")}.` : "No request yet.");
 }
