@@ -21,7 +21,7 @@ pytestmark = pytest.mark.integration
         (["--listen", "tcp://x:65536"], "--listen: 'tcp://x:65536' is not tcp://HOST:PORT"),
         (["--http", "8000"], "--http: '8000' is not HOST:PORT with a port 0 to 65535"),
         (["--workers", "0"], "--workers: 0 is below 1, the minimum"),
-        (["--executor", "ray"], "--executor: 'ray' is not one of threads, processes"),
+        (["--executor", "fibres"], "--executor: 'fibres' is not one of threads, processes, ray"),
         (["--blob-mib", "1"], "--blob-mib: 1 is below --message-mib 64; a large argument would never fit"),
         (
             ["--executor", "processes", "--worker-memory", "256"],
