@@ -25,6 +25,7 @@ class PresentSites(Mapping[str, Runner]):
 
     `staying`: the runners of the sites that no list changes.
     `roster`: chooses the servers in use. `connect`: makes the runner of one of them.
+    `changing`: whether servers may come and go. If not, no task needs to be counted.
     `tended`: a thread calls `refresh` at least every few seconds. Otherwise it is called whenever the
     servers in use change, as in a simulation.
     """
@@ -65,7 +66,7 @@ class PresentSites(Mapping[str, Runner]):
 
     def count_task(self, now_s: float) -> bool:
         """Count a task; returns whether `look` should now be called. Called under the offloader's lock."""
-        return self.changing and self._roster.count_task(now_s)
+        return self._roster.count_task(now_s)
 
     def look(self, finish_s: Mapping[str, float], now_s: float) -> None:
         """Keep the servers that finish soonest; see `Roster.look`."""
