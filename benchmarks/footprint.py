@@ -7,6 +7,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import zmq
@@ -14,10 +15,11 @@ import zmq
 from benchmarks.measure import Requirement, Table, interleaved
 from benchmarks.servers import READY_S, Server, cloud_server, running
 from offboard.common.wire import messages as wire
+from offboard.robot_client.sites.heartbeat import EVERY_S, IDLE_S
 
 COMMANDS = {"robot-client check": "robot_client check", "cloud-server": "cloud_server", "loadgen": "loadgen"}
 ROBOTS = 1_000  # connected
-BEATS_A_S = 2  # heartbeats of each robot
+BEATS_A_S = {"with tasks": 1 / EVERY_S, "without tasks": 1 / IDLE_S}  # of each robot
 REST_S = 10.0
 HEAVY = ("zmq", "numba")
 NOTHING, IMPORT = "python -c pass", "import offboard"
@@ -84,13 +86,22 @@ def _rest() -> Table:
         before = _mib(server.pid)
         sockets = _connected(stack, server)
         each_kb = (_mib(server.pid) - before) * 1024 * 1.024 / ROBOTS
-        beating = _cpu_share({"server": server.pid}, meanwhile=lambda: _beat(sockets))["server"]
+        beating = {
+            name: _cpu_share({"server": server.pid}, meanwhile=partial(_beat, sockets, each))["server"]
+            for name, each in BEATS_A_S.items()
+        }
     rows = [
         ["server, cold start until ready", f"{cold.took_s:.2f} s"],
         ["server, warm start (planner compiled before)", f"{server.took_s:.2f} s"],
         *([f"{name} at rest", f"{mib[name]:.0f} MiB, {busy[name]:.2%} of a core"] for name in mib),
         [f"server, per robot ({ROBOTS} are connected)", f"{each_kb:.1f} kB"],
-        [f"server, {ROBOTS} robots with {BEATS_A_S} heartbeats a second", f"{beating:.1%} of a core"],
+        *(
+            [
+                f"server, heartbeats of {ROBOTS} robots {name}, {BEATS_A_S[name]:g} a second each",
+                f"{share:.1%} of a core",
+            ]
+            for name, share in beating.items()
+        ),
     ]
     requirements = [
         Requirement("cold start", cold.took_s, 15.0, "s"),
@@ -98,7 +109,12 @@ def _rest() -> Table:
         Requirement("robot at rest, planner compiled", mib["robot"], 200, "MiB"),
         *(Requirement(f"CPU of the {name} at rest", 100 * share, 0.5, "%") for name, share in busy.items()),
         Requirement("server memory per robot", each_kb, 50, "kB"),
-        Requirement(f"CPU of the server for the heartbeats of {ROBOTS} robots", 100 * beating, 10, "%"),
+        *(
+            Requirement(
+                f"CPU of the server for the heartbeats of {ROBOTS} robots {name}", 100 * share, 10, "%"
+            )
+            for name, share in beating.items()
+        ),
     ]
     return Table("Start and rest", ("process", "time, or memory and CPU"), rows, requirements)
 
@@ -139,11 +155,11 @@ def _connected(stack: contextlib.ExitStack, server: Server) -> "list[zmq.Socket[
     return sockets
 
 
-def _beat(sockets: "list[zmq.Socket[bytes]]") -> None:
+def _beat(sockets: "list[zmq.Socket[bytes]]", each_a_s: float) -> None:
     """Send the heartbeats of all robots, evenly spread over the time, and read the answers."""
     began_s, ping = time.perf_counter(), wire.pack(wire.Ping(1))
-    for n in range(int(REST_S * BEATS_A_S * len(sockets))):
-        time.sleep(max(0.0, began_s + n / (BEATS_A_S * len(sockets)) - time.perf_counter()))
+    for n in range(int(REST_S * each_a_s * len(sockets))):
+        time.sleep(max(0.0, began_s + n / (each_a_s * len(sockets)) - time.perf_counter()))
         socket = sockets[n % len(sockets)]
         if n >= len(sockets):
             if not socket.poll(READY_S * 1e3):

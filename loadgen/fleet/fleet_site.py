@@ -66,7 +66,7 @@ class FleetSite:
         now_s = self._clock.now_s()
         pending = self._pending[task.id] = _Pending(task, now_s)
         if self._heartbeat.due_s <= now_s + EARLY_S:
-            self._beat(self._heartbeat.due_s)
+            self._beat()
         self._send(REQUEST, task.id, self.sending_s, self._costs.cpu_s(CLOUD, task), limit_s=now_s + budget_s)
         self._clock.after(budget_s, partial(self._expire, task.id))
         return pending.future
@@ -136,12 +136,15 @@ class FleetSite:
         pending.future.set_result(Execution(self.site, seconds, failure=failure, censored=True))
 
     def _plan_beat(self) -> None:
-        self._clock.at(self._heartbeat.due_s, partial(self._beat, self._heartbeat.due_s))
+        self._clock.at(self._heartbeat.due_s, self._beat_if_due)
 
-    def _beat(self, due_s: float) -> None:
-        if self._heartbeat.due_s == due_s:  # else it was sent with a task
-            self._send(BEAT, self._heartbeat.beat(self._clock.now_s()))
-            self._plan_beat()
+    def _beat_if_due(self) -> None:
+        if self._heartbeat.due_s <= self._clock.now_s():  # else it was sent with a task
+            self._beat()
+
+    def _beat(self) -> None:
+        self._send(BEAT, self._heartbeat.beat(self._clock.now_s()))
+        self._plan_beat()
 
     def _send(
         self, sort: int, number: int, after_s: float = 0.0, cpu_s: float = 0.0, *, limit_s: float = 0.0

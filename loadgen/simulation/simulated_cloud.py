@@ -189,7 +189,7 @@ class SimulatedCloud:
         self._plan_beat()
 
     def _plan_beat(self) -> None:
-        self._clock.at(self._heartbeat.due_s, partial(self._beat, self._heartbeat.due_s))
+        self._clock.at(self._heartbeat.due_s, self._beat_if_due)
 
     def _end(
         self, pending: _Pending, failure: OffloadError, *, censored: bool = False, started: bool = True
@@ -222,8 +222,10 @@ class SimulatedCloud:
         self._heartbeat.start(self._clock.now_s())
         self._plan_beat()
 
-    def _beat(self, due_s: float) -> None:
-        if self._heartbeat.due_s == due_s:  # else it was sent with a task, or the connection is a new one
+    def _beat_if_due(self) -> None:
+        if (
+            self._heartbeat.due_s <= self._clock.now_s()
+        ):  # else it was sent with a task, or no longer connected
             self._send_beat()
 
     def _send_beat(self) -> None:

@@ -12,10 +12,9 @@ from offboard.robot_client.sites.background import Background
 from offboard.robot_client.sites.runner import Condition
 
 EVERY_S = 0.5  # between two heartbeats: an outage is noticed at most this much later
+IDLE_S = 2.0  # between two heartbeats once there was no task for as long: a fleet has many idle robots
 JITTER = 0.2  # each pause is up to this share shorter or longer, so that the robots of a fleet spread out
-EARLY_S = (
-    0.1  # a heartbeat that is due within this time is sent just before a task, so no thread must wake up
-)
+EARLY_S = 0.1  # a heartbeat that is due within this time is sent just before a task: no thread must wake up
 SILENT_S = 0.25  # a site is silent if nothing came for longer than this, and longer than round trips vary
 SLACK_S = 0.02  # an answer is late if it takes this much longer than usual, and longer than round trips vary
 UNANSWERED_MAX = 16  # heartbeats that are remembered
@@ -33,7 +32,8 @@ class ServerReport(NamedTuple):
 class Heartbeat:
     """Times the heartbeats of one connection, and measures it.
 
-    every_s: usual pause; 0: no heartbeat is sent, and nothing is measured.
+    every_s: usual pause; 0: no heartbeat is sent, and nothing is measured. Pauses are longer while
+        nobody asks for the condition of the site.
     background: makes pauses longer on a loaded robot, and knows when the robot hears late.
     """
 
@@ -43,17 +43,19 @@ class Heartbeat:
         self._random = Random(seed)
         self._next_id = 0
         self._round_trip_s: float | None = None
+        self._asked_s = self._beat_s = -float("inf")  # the condition was asked for; a heartbeat was sent
         self.stop()
 
     def start(self, now_s: float) -> None:
         """The connection is up."""
         self.stop()
+        self._asked_s = now_s
         if self._every_s:
-            self.due_s = now_s
+            self._due_s = self._idle_due_s = now_s
 
     def stop(self) -> None:
         """The connection has ended. Only the last round trip is kept: the next connection starts from it."""
-        self.due_s = float("inf")
+        self._due_s = self._idle_due_s = float("inf")
         self._sent: dict[int, float] = {}
         self._oldest_s = float("inf")  # when the oldest unanswered heartbeat was sent
         self._heard_s = -float("inf")
@@ -65,24 +67,31 @@ class Heartbeat:
         self._usual = self._condition()  # the condition while no heartbeat is unanswered
 
     @property
+    def due_s(self) -> float:
+        """When the next heartbeat is due. Whoever asks for the condition of an idle site makes it sooner."""
+        return self._idle_due_s if self._beat_s - self._asked_s > IDLE_S else self._due_s
+
+    @property
     def unanswered(self) -> int:
         """How many heartbeats have no answer yet; at most UNANSWERED_MAX are remembered."""
         return len(self._sent)
 
     def hurry(self, now_s: float) -> None:
         """A task is late: the next heartbeat is due now, unless one is unanswered already."""
-        if self._oldest_s > now_s and self.due_s < float("inf"):
-            self.due_s = now_s
+        if self._oldest_s > now_s and self._due_s < float("inf"):
+            self._due_s = self._idle_due_s = now_s
 
     def beat(self, now_s: float) -> int:
         """A heartbeat is sent now; returns its number."""
         self._next_id += 1
         self._sent[self._next_id] = now_s
         self._oldest_s = min(self._oldest_s, now_s)
-        pause_s = self._background.pause_s(self._every_s) * (1 + JITTER * self._random.uniform(-1, 1))
+        factor = 1 + JITTER * self._random.uniform(-1, 1)
         if len(self._sent) > UNANSWERED_MAX:
             del self._sent[next(iter(self._sent))]
-        self.due_s = now_s + pause_s
+        self._beat_s = now_s
+        self._due_s = now_s + factor * self._background.pause_s(self._every_s)
+        self._idle_due_s = max(self._due_s, now_s + factor * IDLE_S)
         return self._next_id
 
     def answer(self, id: int, now_s: float, report: ServerReport) -> None:
@@ -121,6 +130,7 @@ class Heartbeat:
 
     def condition(self, now_s: float) -> Condition:
         """A late answer is expected to take as long again as it has taken so far."""
+        self._asked_s = now_s
         if self._oldest_s > now_s:
             return self._usual
         unheard_s = self._unheard_s(now_s)

@@ -7,6 +7,7 @@ import pytest
 from offboard.robot_client.sites.background import LOADED_SLOWER, Background
 from offboard.robot_client.sites.heartbeat import (
     EVERY_S,
+    IDLE_S,
     JITTER,
     SILENT_S,
     SLACK_S,
@@ -99,6 +100,7 @@ def test_pauses_are_jittered() -> None:
         one.start(0.0)
         for _ in range(50):
             now_s = one.due_s
+            one.condition(now_s)
             one.answer(one.beat(now_s), now_s, IDLE)
             found.append(one.due_s - now_s)
     assert all((1 - JITTER) * EVERY_S <= pause <= (1 + JITTER) * EVERY_S for pause in pauses)
@@ -209,6 +211,7 @@ def test_unanswered_heartbeats_are_bounded() -> None:
     pauses = []
     for _ in range(100):
         now_s = heartbeat.due_s
+        heartbeat.condition(now_s)
         heartbeat.beat(now_s)
         pauses.append(heartbeat.due_s - now_s)
     assert max(pauses) <= (1 + JITTER) * EVERY_S
@@ -239,3 +242,28 @@ def test_a_lost_connection_leaves_its_round_trip_alone() -> None:
     assert heartbeat.condition(10.1) == Condition(pytest.approx(TRIP_S))
     heartbeat.answer(heartbeat.beat(10.2), 10.4, IDLE)
     assert heartbeat.condition(10.5).round_trip_s == pytest.approx(0.2)
+
+
+def test_a_robot_without_tasks_sends_rarer_heartbeats() -> None:
+    """While nobody asks for the condition, pauses are IDLE_S; once somebody has, the next one is due soon."""
+    heartbeat = beating(60.0)
+    last_s = heartbeat.due_s
+    heartbeat.answer(heartbeat.beat(last_s), last_s + TRIP_S, IDLE)
+    assert heartbeat.due_s == pytest.approx(last_s + IDLE_S, rel=0, abs=IDLE_S * JITTER)
+    heartbeat.condition(last_s + TRIP_S)
+    assert heartbeat.due_s == pytest.approx(last_s + EVERY_S, rel=0, abs=EVERY_S * JITTER)
+
+
+def test_with_tasks_heartbeats_stay_frequent() -> None:
+    """While somebody asks at least every IDLE_S, pauses stay EVERY_S."""
+    heartbeat, beats, now_s = Heartbeat(EVERY_S, seed=1), 0, 0.0
+    heartbeat.start(0.0)
+    while now_s < 60.0:
+        heartbeat.condition(now_s)
+        until_s = now_s + 0.9 * IDLE_S
+        while heartbeat.due_s < until_s:
+            due_s = heartbeat.due_s
+            heartbeat.answer(heartbeat.beat(due_s), due_s + TRIP_S, IDLE)
+            beats += 1
+        now_s = until_s
+    assert beats == pytest.approx(now_s / EVERY_S, rel=JITTER)
