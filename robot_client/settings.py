@@ -34,7 +34,7 @@ class Settings:
 
     `predictor`: how times are predicted, by name (None: the predictor that the policy is meant for).
     `window`: the last times of each kind on each site that predictors with a window use.
-    `heartbeats`: whether to ask each server twice a second if it is there (None: as the policy needs it).
+    `heartbeats`: whether to ask each server that is used if it is there (None: as the policy needs it).
     `objective`: what the policy makes small; see `policies.objectives`.
     `s_per_quality`: what the whole quality of an answer is worth, in seconds, for tasks with variants.
     `energy`: what computing, waiting and sending take from the battery, in watts and joules per byte.

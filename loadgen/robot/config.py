@@ -31,7 +31,7 @@ class ServerSettings:
     site: tuple[str, ...] = setting(
         (),
         "a further server, with a name, or GROUP/NAME for one of several equal servers; ws:// or wss:// is a "
-        "policy server; dns://HOST:PORT is a server at each address of HOST, looked up again every 2 s; "
+        "policy server; dns://HOST:PORT is a server at each address of HOST, of which 4 are used at a time; "
         "repeat the flag for more",
         group=SERVERS,
         rare=True,

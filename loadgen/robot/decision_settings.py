@@ -41,7 +41,7 @@ class DecisionSettings:
     )
     heartbeats: bool | None = setting(
         None,
-        "ask each server twice a second if it is there (default: unless the policy is meant to do without)",
+        "ask each server that is used if it is there (default: unless the policy is meant to do without)",
         group=DECISIONS,
         rare=True,
     )
