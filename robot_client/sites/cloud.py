@@ -100,7 +100,11 @@ class CloudRunner:
         self._uploads = BlobUploads()
         self._pauses = CrossingPauses()
         self._thread = threading.Thread(target=self._run, name=f"site-{site}", daemon=True)
-        self._thread.start()
+        try:
+            self._thread.start()
+        except RuntimeError as error:
+            self._socket.close()
+            raise OffloadError(f"{site}: {error}") from error
 
     def unavailable(self, kind: Kind) -> str | None:
         absent = self._connection.why_absent
