@@ -321,8 +321,8 @@ class Offloader:
             forecast = self._forecaster.forecast(
                 memory, task, sites, timeout_s=budget_s, now_s=self._clock.now_s()
             )
-            if self._sites.changing and self._sites.count_task(started_s):
-                self._sites.look(finishes_of(forecast), started_s)
+            if self._sites.changing:
+                self._sites.count_task(finishes_of(forecast), started_s)
             if deadline_s is not None:
                 forecast = by_deadline(forecast, deadline_s)
             decision = self._decide(memory, forecast, where, absent=absent, placed=placed)

@@ -64,16 +64,16 @@ class PresentSites(Mapping[str, Runner]):
             self._roster.follow(listed, source)
         self.refresh()
 
-    def count_task(self, now_s: float) -> bool:
-        """Count a task; returns whether `look` should now be called. Called under the offloader's lock."""
-        return self._roster.count_task(now_s)
+    def count_task(self, finish_s: Mapping[str, float], now_s: float) -> None:
+        """Count a task, and sometimes change the servers in use: see `Roster.look`.
 
-    def look(self, finish_s: Mapping[str, float], now_s: float) -> None:
-        """Keep the servers that finish soonest; see `Roster.look`."""
-        with self._lock:
-            self._roster.look(finish_s, now_s)
-        if not self._tended:
-            self.refresh()
+        `finish_s`: how long it should take on each site that can take it. Called under the offloader's lock.
+        """
+        if self._roster.count_task(finish_s, now_s):
+            with self._lock:
+                self._roster.look(finish_s, now_s)
+            if not self._tended:
+                self.refresh()
 
     def refresh(self) -> None:
         """Connect to the servers in use, and close what has left and has no more tasks."""
