@@ -39,7 +39,8 @@ class Roster:
     def __init__(self, known: int = KNOWN_MAX, seed: int | str = 0) -> None:
         if known < 2:
             raise ConfigError(f"known {known}: must be at least 2 servers of each group")
-        self.in_use: Mapping[str, Server] = {}  # by site; replaced and never changed
+        self.in_use: Mapping[str, Server] = {}  # by site; replaced and never changed, as `listed` is
+        self.listed: Mapping[str, Server] = {}
         self._known = known
         self._random = Random(seed)
         self._lists: dict[str, dict[str, Server]] = {}  # by source
@@ -51,6 +52,7 @@ class Roster:
     def follow(self, listed: Iterable[Server], source: str = "") -> None:
         """This is the list of this source from now on: servers that it does not name are left."""
         self._lists[source] = {one.site: one for one in listed}
+        self.listed = {site: one for servers in self._lists.values() for site, one in servers.items()}
         self._use(self.in_use)
 
     def count_task(self, able: Iterable[str], now_s: float) -> bool:
@@ -80,7 +82,7 @@ class Roster:
 
     def _use(self, kept: Iterable[str]) -> None:
         """Use the listed ones of these, and in their groups others where there is room, new ones first."""
-        listed = {site: one for servers in self._lists.values() for site, one in servers.items()}
+        listed = self.listed
         kept, in_use = set(kept), dict[str, Server]()
         for members in _groups(listed).values():
             stay = [site for site in members if site in kept]
