@@ -93,7 +93,7 @@ def test_a_long_task_ends_with_its_list_but_not_with_a_trial() -> None:
     world.sites.in_flight = lambda site: int(site != tried)
     for look in range(1, TRY_EVERY + 1):
         for _ in range(LOOK_EVERY):
-            world.sites.count_task({site: 0.1 for site in world.sites}, look * LOOK_S)
+            world.sites.count_task(dict.fromkeys(world.sites, 0.1), look * LOOK_S)
     (left,) = long.keys() - set(world.sites)
     world.pass_time(2 * LEAVING_MAX_S)
     assert not long[left].closed
@@ -133,9 +133,7 @@ def test_no_task_waits_while_servers_are_connected() -> None:
         looked.append(tasks.is_alive())
         return VirtualRunner(server.site, world.clock)
 
-    sites = PresentSites(
-        [VirtualRunner(ONBOARD, world.clock)], roster=Roster(), connect=connect, tended=True
-    )
+    sites = PresentSites([VirtualRunner(ONBOARD, world.clock)], roster=Roster(), connect=connect, tended=True)
     sites.follow([Server("a", "tcp://a.test:5555")])
     assert looked == [False]
 
