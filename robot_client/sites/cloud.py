@@ -23,6 +23,7 @@ from offboard.common.errors import (
     OffloadError,
     Overtaken,
     ProtocolError,
+    SiteClosed,
     describe,
 )
 from offboard.common.security.keys import RobotKeys
@@ -384,5 +385,5 @@ class CloudRunner:
         self._reader.close()
         with self._reader.turn, self._socket.lock:
             for request_id in list(self._pending):
-                self._give_up(request_id, CloudBroken("closed while the task was in flight"))
+                self._give_up(request_id, SiteClosed("closed while the task was in flight"))
             self._socket.close()
