@@ -204,6 +204,17 @@ def test_a_batch_goes_on_when_its_servers_leave() -> None:
     assert world.offload.map(carried, range(40)) == list(range(40))
 
 
+def test_a_batch_uses_the_servers_that_come() -> None:
+    """All names change while it runs, and the new server gets items too."""
+    world = World("a")
+    for _ in range(10):
+        world.offload(carried, 1)
+    world.clock.after(0.3, lambda: world.list("b"))
+    assert world.offload.map(carried, range(40)) == list(range(40))
+    assert world.runners["a"].tasks
+    assert world.runners["b"].tasks
+
+
 def test_a_server_that_cannot_be_connected_to_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     """The others are used; it is tried again at each refresh without a further line."""
     world = World("broken", "a")
