@@ -106,7 +106,7 @@ def test_a_surprise_does_not_end_the_thread(listed: SitesFile, caplog: pytest.Lo
 
 
 def test_servers_are_tended_between_two_reads(listed: SitesFile, tmp_path: Path) -> None:
-    """A server that left is closed soon, and one in need of files is tried again, though reads are rare."""
+    """One that lacked files is tried again soon, though the file is not read yet."""
     clock, full = VirtualClock(), [True]
 
     def connect(server: Server) -> VirtualRunner:
