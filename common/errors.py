@@ -104,6 +104,10 @@ class CannotCross(CloudBroken):
     """The arguments or the result of this task cannot be sent, or not be read on the other side."""
 
 
+class SiteClosed(CloudBroken):
+    """The robot closed its connection to the site, which is not at fault: nothing is learnt of it."""
+
+
 class Unwanted(OffloadError):
     """Raised inside a task, by `check_wanted`, if nobody waits for its answer any more."""
 

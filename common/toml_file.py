@@ -27,7 +27,7 @@ def parse_toml(path: Path, text: bytes) -> dict[str, Any]:
 
     try:
         return tomllib.loads(text.decode())
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # a number may be too long, and a list too deep
         raise DataError(f"{path}: {error}") from error
 
 

@@ -203,15 +203,13 @@ class Offloader:
         kind = kind_of(function)
         tasks = [new_task(kind, args) for args in arguments(kind, items)]
         runners = self._sites.now
-        sites = tuple(runners)
         if self._observes:
             where = where or ONBOARD
         if where is not None:
             check_where(where, kind, runners, changing=self._sites.changing)
-            sites = (*sites_at(where, runners), ONBOARD)[:1]
         batch = Batch(
             tasks,
-            sites,
+            self._sites if where is None else (*sites_at(where, runners), ONBOARD)[:1],
             predict=partial(self._expect_in_batch, budget_s, runners),
             run=partial(self._answer, where, budget_s),
             clock=self._clock,
@@ -321,8 +319,8 @@ class Offloader:
             forecast = self._forecaster.forecast(
                 memory, task, sites, timeout_s=budget_s, now_s=self._clock.now_s()
             )
-            if self._sites.changing and self._sites.count_task(started_s):
-                self._sites.look(finishes_of(forecast), started_s)
+            if self._sites.changing:
+                self._sites.count_task(finishes_of(forecast), started_s)
             if deadline_s is not None:
                 forecast = by_deadline(forecast, deadline_s)
             decision = self._decide(memory, forecast, where, absent=absent, placed=placed)
@@ -393,8 +391,9 @@ class Offloader:
         self, timeout_s: float, runners: Mapping[str, Runner], task: Task, own: Mapping[str, int]
     ) -> Forecast:
         """What a batch is placed by; `own` holds how many of its tasks each site has."""
+        runners = {**runners, **self._sites.now}  # a batch may be pinned to a site that has left
         absent = absent_sites(runners, task.kind) if len(own) > 1 else {}
-        counts = {runners[site]: count for site, count in own.items() if site not in absent}
+        counts = {runners[one]: n for one, n in own.items() if one in runners and one not in absent}
         with self._lock:
             memory = self._memories.of(task.kind, runners)
             return self._forecaster.forecast_in_batch(memory, task, counts, timeout_s=timeout_s)

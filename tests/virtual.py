@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection
 from concurrent.futures import Future
 from typing import Any
 
-from offboard.common.errors import CloudBroken, CloudTimeout, OffloadError, Overtaken
+from offboard.common.errors import CloudTimeout, OffloadError, Overtaken, SiteClosed
 from offboard.common.tasks import Kind, Task
 from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Execution, Sending
 
@@ -108,7 +108,7 @@ class VirtualRunner:
         if self.site == ONBOARD:
             self._runs.clear()
         for task in [task for task in self.tasks if task.id in self._runs]:
-            self._end(task, CloudBroken("closed while the task was in flight"))
+            self._end(task, SiteClosed("closed while the task was in flight"))
 
     def _end(self, task: Task, failure: OffloadError | None, *, censored: bool = False) -> None:
         future, began_s = self._runs.pop(task.id, (None, 0.0))

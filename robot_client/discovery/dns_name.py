@@ -54,6 +54,8 @@ class DnsName:
             if family in addresses and "%" not in str(address[0]):
                 addresses[family].add(str(address[0]))
         used = sorted(addresses[socket.AF_INET] or addresses[socket.AF_INET6])[:ADDRESSES_MAX]
+        if not used:
+            raise CloudBroken(f"{self._host}: no address that can be used; those of one link cannot")
         return [Server(f"{self._group}{IN_GROUP}{one}", self._endpoint(one), self._key) for one in used]
 
     def _endpoint(self, address: str) -> str:

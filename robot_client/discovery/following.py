@@ -11,6 +11,7 @@ from offboard.common.errors import DataError, OffloadError
 from offboard.robot_client.discovery.present_sites import PresentSites
 from offboard.robot_client.discovery.roster import Server
 
+TEND_S = 2.0  # the longest pause until the sites connect to new servers and close what has left
 SETTLE = 0.2  # of the usual pause: until a list that has just changed is read again
 
 log = logging.getLogger(__name__)
@@ -32,9 +33,9 @@ class Following:
     def __init__(self, source: Source, sites: PresentSites, every_s: float) -> None:
         self._source = source
         self._sites = sites
-        self._every_s = every_s
+        self._every_s = self._left_s = every_s  # `_left_s`: until the list is read again
         self._stop = threading.Event()
-        self._warned = ""
+        self._warned = self._failed = ""
         self._thread = threading.Thread(target=self._run, name=source.name, daemon=True)
         sites.on_close(self._stop.set)
 
@@ -59,7 +60,21 @@ class Following:
             self._warned = ""
             self._sites.follow(listed, self._source.name)
 
-    def _run(self) -> None:
-        while not self._stop.wait(self._every_s * (SETTLE if self._source.settling else 1.0)):
-            self.read()
+    def tend(self, passed_s: float) -> None:
+        """This time has passed: read the list if that is due, and let the sites connect and close."""
+        self._left_s -= passed_s
+        due = self._left_s <= 0
+        try:
+            if due:
+                self.read()
             self._sites.refresh()
+        except Exception as error:  # this thread must go on
+            if repr(error) != self._failed:
+                self._failed = repr(error)
+                log.exception("%s: it is read again; remedy: report this traceback", self._source.name)
+        if due:
+            self._left_s = self._every_s * (SETTLE if self._source.settling else 1.0)
+
+    def _run(self) -> None:
+        while not self._stop.wait(pause_s := min(self._left_s, TEND_S)):
+            self.tend(pause_s)

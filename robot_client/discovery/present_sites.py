@@ -12,7 +12,8 @@ from offboard.common.errors import ConfigError, OffloadError
 from offboard.robot_client.discovery.roster import Roster, Server
 from offboard.robot_client.sites.runner import ONBOARD, Runner
 
-LEAVING_MAX_S = 300.0  # for which a server that is no longer used may still answer the tasks that it has
+LEAVING_MIN_S = 5.0  # for which a server that is no longer used may still get tasks that began before
+LEAVING_MAX_S = 300.0  # for which a server that no list names any more may still answer the tasks that it has
 
 log = logging.getLogger(__name__)
 
@@ -21,7 +22,8 @@ class PresentSites(Mapping[str, Runner]):
     """The runner of each site now, by its name.
 
     `now` is replaced and never changed, so a task keeps the sites that were present when it began.
-    A server that leaves gets no more tasks; its runner is closed once its tasks have ended.
+    A server that leaves gets no more tasks; its runner is closed once its tasks have ended. If a server that
+    lists still name was only left for another one, its tasks have all their time.
 
     `staying`: the runners of the sites that no list changes.
     `roster`: chooses the servers in use. `connect`: makes the runner of one of them.
@@ -50,9 +52,10 @@ class PresentSites(Mapping[str, Runner]):
         self._connect = connect
         self._tended = tended
         self._clock_s = clock_s
+        self._roster_lock = threading.Lock()  # a task may wait for it, so no connection is made under it
         self._lock = threading.Lock()
         self._connected: dict[str, tuple[Server, Runner]] = {}
-        self._leaving: list[tuple[Runner, float]] = []  # with the latest time to close it
+        self._leaving: list[tuple[Server, Runner, float]] = []  # with the time when it left
         self._failed: set[Server] = set()
         self._closed = False
         self._on_close: list[Callable[[], None]] = []
@@ -60,19 +63,20 @@ class PresentSites(Mapping[str, Runner]):
 
     def follow(self, listed: Iterable[Server], source: str = "") -> None:
         """This is the list of this source from now on."""
-        with self._lock:
+        with self._roster_lock:
             self._roster.follow(listed, source)
         self.refresh()
 
-    def count_task(self, now_s: float) -> bool:
-        """Count a task; returns whether `look` should now be called. Called under the offloader's lock."""
-        return self._roster.count_task(now_s)
+    def count_task(self, finish_s: Mapping[str, float], now_s: float) -> None:
+        """Count a task, and sometimes change the servers in use: see `Roster.look`.
 
-    def look(self, finish_s: Mapping[str, float], now_s: float) -> None:
-        """Keep the servers that finish soonest; see `Roster.look`."""
-        with self._lock:
-            self._roster.look(finish_s, now_s)
-        if not self._tended:
+        `finish_s`: how long it should take on each site that can take it. Called under the offloader's lock.
+        """
+        with self._roster_lock:
+            looks = self._roster.count_task(finish_s, now_s)
+            if looks:
+                self._roster.look(finish_s, now_s)
+        if looks and not self._tended:
             self.refresh()
 
     def refresh(self) -> None:
@@ -80,19 +84,19 @@ class PresentSites(Mapping[str, Runner]):
         with self._lock:
             if self._closed:
                 return
-            ended = [one for one in self._leaving if self._may_close(*one)]
-            self._leaving = [one for one in self._leaving if one not in ended]
             wanted = self._roster.in_use
             for site, (server, runner) in list(self._connected.items()):
                 if wanted.get(site) != server:
                     del self._connected[site]
-                    self._leaving.append((runner, self._clock_s() + LEAVING_MAX_S))
+                    self._leaving.append((server, runner, self._clock_s()))
                     log.info("%s: %s is no longer used", site, server.endpoint)
             self._connect_to([wanted[site] for site in wanted.keys() - self._connected.keys()])
             self.now = {one.site: one for one in self.staying} | {
                 site: self._connected[site][1] for site in wanted if site in self._connected
             }
-        for runner, _ in ended:
+            ended = [one for one in self._leaving if self._may_close(*one)]
+            self._leaving = [one for one in self._leaving if one not in ended]
+        for _, runner, _ in ended:
             runner.close()
 
     def on_close(self, act: Callable[[], None]) -> None:
@@ -105,7 +109,7 @@ class PresentSites(Mapping[str, Runner]):
             act()
         with self._lock:
             self._closed = True
-            runners = [*self.now.values(), *(runner for runner, _ in self._leaving)]
+            runners = [*self.now.values(), *(runner for _, runner, _ in self._leaving)]
         for runner in runners:
             runner.close()
 
@@ -115,7 +119,7 @@ class PresentSites(Mapping[str, Runner]):
         for server in servers:
             assert self._connect is not None, "a roster with servers needs it"
             try:
-                self._connected[server.site] = server, self._connect(server)
+                self._connected[server.site] = server, self._taken_back(server) or self._connect(server)
                 log.info("%s: %s is used from now on", server.site, server.endpoint)
             except OffloadError as error:
                 failed.add(server)
@@ -124,8 +128,19 @@ class PresentSites(Mapping[str, Runner]):
                     log.warning(said, server.site, error)
         self._failed = failed
 
-    def _may_close(self, runner: Runner, until_s: float) -> bool:
-        return not self.in_flight(runner.site) or self._clock_s() >= until_s
+    def _taken_back(self, server: Server) -> Runner | None:
+        """The runner of this server if it is still there."""
+        for one in self._leaving:
+            if one[0] == server:
+                self._leaving.remove(one)
+                return one[1]
+        return None
+
+    def _may_close(self, server: Server, runner: Runner, left_s: float) -> bool:
+        gone_s = self._clock_s() - left_s
+        if self.in_flight(runner.site):
+            return gone_s >= LEAVING_MAX_S and self._roster.listed.get(server.site) != server
+        return gone_s >= LEAVING_MIN_S
 
     def items(self) -> ItemsView[str, Runner]:
         return self.now.items()

@@ -13,6 +13,7 @@ from offboard.common.variants import group_of
 
 KNOWN_MAX = 4  # servers of one group that a robot uses at a time
 LOOK_EVERY, LOOK_S = 20, 2.0  # tasks and seconds, both at least, between two looks at the servers in use
+SPARED_S = 15.0  # for which a server that has just come into use may still be connecting
 TRY_EVERY = 10  # looks, of which the last one lets the robot try another server
 
 
@@ -38,35 +39,42 @@ class Roster:
     def __init__(self, known: int = KNOWN_MAX, seed: int | str = 0) -> None:
         if known < 2:
             raise ConfigError(f"known {known}: must be at least 2 servers of each group")
-        self.in_use: Mapping[str, Server] = {}  # by site; replaced and never changed
+        self.in_use: Mapping[str, Server] = {}  # by site; replaced and never changed, as `listed` is
+        self.listed: Mapping[str, Server] = {}
         self._known = known
         self._random = Random(seed)
         self._lists: dict[str, dict[str, Server]] = {}  # by source
         self._tasks = self._looks = 0
+        self._able: set[str] = set()  # the sites that could take a task since the last look
+        self._since_s: dict[str, float] = {}  # when a look first found a site in use
         self._looked_s = -math.inf
 
     def follow(self, listed: Iterable[Server], source: str = "") -> None:
         """This is the list of this source from now on: servers that it does not name are left."""
         self._lists[source] = {one.site: one for one in listed}
+        self.listed = {site: one for servers in self._lists.values() for site, one in servers.items()}
         self._use(self.in_use)
 
-    def count_task(self, now_s: float) -> bool:
-        """Count a task; returns whether the robot should now `look`."""
+    def count_task(self, able: Iterable[str], now_s: float) -> bool:
+        """Count a task that these sites could take; returns whether the robot should now `look`."""
         self._tasks += 1
+        self._able.update(able)
         return self._tasks >= LOOK_EVERY and now_s - self._looked_s >= LOOK_S
 
     def look(self, finish_s: Mapping[str, float], now_s: float) -> None:
-        """Replace servers of larger groups: those that cannot take tasks, and rarely one more.
+        """Replace servers of larger groups: those that could take no task, and rarely one more.
 
-        If none of a group can, it is more likely the link of the robot that fails, so they are replaced as
+        If none of a group could, it is more likely the link of the robot that fails, so they are replaced as
         rarely. `finish_s`: how long a task should take on each site that can take it, in seconds. The site
         that is left for a trial is the later one of two drawn ones: the best one always stays.
         """
-        self._tasks, self._looked_s = 0, now_s
+        able_now = self._able | finish_s.keys()
+        self._tasks, self._looked_s, self._able = 0, now_s, set()
         self._looks += 1
-        kept: set[str] = set()
+        self._since_s = {site: self._since_s.get(site, now_s) for site in self.in_use}
+        kept = {site for site, since_s in self._since_s.items() if now_s - since_s < SPARED_S}
         for members in _groups(self.in_use).values():
-            able = [site for site in members if site in finish_s] or members
+            able = [site for site in members if site in able_now] or members
             kept.update(able)
             if self._looks % TRY_EVERY == 0 and len(able) >= self._known:
                 kept.remove(max(self._random.sample(able, 2), key=lambda site: finish_s.get(site, math.inf)))
@@ -74,7 +82,7 @@ class Roster:
 
     def _use(self, kept: Iterable[str]) -> None:
         """Use the listed ones of these, and in their groups others where there is room, new ones first."""
-        listed = {site: one for servers in self._lists.values() for site, one in servers.items()}
+        listed = self.listed
         kept, in_use = set(kept), dict[str, Server]()
         for members in _groups(listed).values():
             stay = [site for site in members if site in kept]

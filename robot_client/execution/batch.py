@@ -26,6 +26,7 @@ from offboard.robot_client.sites.clock import Clock
 from offboard.robot_client.sites.runner import ONBOARD, Execution
 
 NAME = "map"
+THREADS_MIN = 40  # calls at a time, at least: servers may come while a batch runs
 LOOK_AHEAD = 32  # waiting tasks that may be placed next
 RECHECK_S = 0.05  # the longest wait before running tasks are checked again: one may be overdue
 
@@ -51,7 +52,7 @@ Run = Callable[[Task, Placed], tuple[Execution, Record]]
 class Batch:
     """Runs all tasks once; make a new one for the next.
 
-    `sites`: the sites that may be used.
+    `sites`: those that may be used. They may change while the batch runs.
     `predict`: makes the forecast of a size, without the wait for this batch's own tasks on each site.
     `run`: runs a task to its end; called in threads.
     `timeout_s`: how long a server has for a task.
@@ -60,7 +61,7 @@ class Batch:
     def __init__(
         self,
         tasks: Sequence[Task],
-        sites: Sequence[str],
+        sites: Iterable[str],
         *,
         predict: Predict,
         run: Run,
@@ -70,7 +71,9 @@ class Batch:
         self._tasks = tasks
         # The tasks are of one kind, so the largest takes longest, by the first number of its size.
         self._waiting = sorted(range(len(tasks)), key=lambda number: -first_number(tasks[number].size))
-        self._queues = {site: Queue(site, BUDGET_SHARE * timeout_s) for site in sites}
+        self._sites = sites
+        self._within_s = BUDGET_SHARE * timeout_s
+        self._queues: dict[str, Queue] = {}  # also those of sites that have left
         self._predict = predict
         self._run = run
         self._clock = clock
@@ -81,7 +84,7 @@ class Batch:
 
     def run(self) -> list[Any]:
         """The results in the order of the tasks; if tasks failed, the first error, when all have ended."""
-        threads = CallThreads(SERVER_IN_FLIGHT_MAX * len(self._queues), NAME)
+        threads = CallThreads(max(THREADS_MIN, SERVER_IN_FLIGHT_MAX * len(self._own())), NAME)
         try:
             while self._waiting or self._running:
                 while (start := self._next()) is not None:
@@ -99,7 +102,7 @@ class Batch:
 
     def _next(self) -> tuple[int, str, str] | None:
         """The task that should start now, with its site and the reason."""
-        if not self._waiting or all(len(one.running) >= one.limit for one in self._queues.values()):
+        if not self._waiting or all(n >= self._queues[site].limit for site, n in self._own().items()):
             return None
         first = _usable(self._look(self._waiting[0]))
         for site, one in first.items():
@@ -117,8 +120,12 @@ class Batch:
         return None if start is None else (looked[start.place], start.site, self._reason(start))
 
     def _look(self, number: int) -> Forecast:
-        own = {site: len(queue.running) for site, queue in self._queues.items()}
-        return self._predict(self._tasks[number], own)
+        return self._predict(self._tasks[number], self._own())
+
+    def _own(self) -> dict[str, int]:
+        """How many tasks of the batch each site has that may be used now."""
+        queues = self._queues
+        return {one: len(queues.setdefault(one, Queue(one, self._within_s)).running) for one in self._sites}
 
     def _warm_up(self, site: str, count: int) -> tuple[int, str, str]:
         """Warm a site up with tasks of different sizes, so that its time is known for all of them."""

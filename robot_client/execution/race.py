@@ -8,7 +8,7 @@ from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from offboard.common.errors import CloudBroken, CloudError, Overtaken, TaskError
+from offboard.common.errors import CloudError, Overtaken, SiteClosed, TaskError
 from offboard.common.tasks import Kind, Task
 from offboard.robot_client.policies import Hedge, Probe
 from offboard.robot_client.sites.clock import Clock
@@ -183,7 +183,7 @@ def result_of(site: str, future: "Future[Execution]") -> Execution:
     try:
         return future.result()
     except CancelledError:
-        return Execution(site, 0.0, failure=CloudBroken("closed while the task was in flight"), started=False)
+        return Execution(site, 0.0, failure=SiteClosed("closed while the task was in flight"), started=False)
 
 
 def _is_answer(execution: Execution) -> bool:

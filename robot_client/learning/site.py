@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from offboard.common.errors import CannotCross, Overtaken, TaskError
+from offboard.common.errors import CannotCross, Overtaken, SiteClosed, TaskError
 from offboard.common.tasks import Size, first_number
 from offboard.robot_client.learning.conformal import Conformal
 from offboard.robot_client.policies.energy import Energy
@@ -20,7 +20,7 @@ from offboard.robot_client.predictors.line import RunningMean
 from offboard.robot_client.predictors.parts import Parts
 from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Execution, Sending
 
-NOT_OF_THE_SITE = (TaskError, CannotCross)  # failures that another site would have too
+NOT_OF_THE_SITE = (TaskError, CannotCross, SiteClosed)  # failures that say nothing of the site
 
 
 @dataclass(slots=True)

@@ -23,6 +23,7 @@ from offboard.common.errors import (
     OffloadError,
     Overtaken,
     ProtocolError,
+    SiteClosed,
     describe,
 )
 from offboard.common.security.keys import RobotKeys
@@ -100,7 +101,11 @@ class CloudRunner:
         self._uploads = BlobUploads()
         self._pauses = CrossingPauses()
         self._thread = threading.Thread(target=self._run, name=f"site-{site}", daemon=True)
-        self._thread.start()
+        try:
+            self._thread.start()
+        except RuntimeError as error:
+            self._socket.close()
+            raise OffloadError(f"{site}: {error}") from error
 
     def unavailable(self, kind: Kind) -> str | None:
         absent = self._connection.why_absent
@@ -380,5 +385,5 @@ class CloudRunner:
         self._reader.close()
         with self._reader.turn, self._socket.lock:
             for request_id in list(self._pending):
-                self._give_up(request_id, CloudBroken("closed while the task was in flight"))
+                self._give_up(request_id, SiteClosed("closed while the task was in flight"))
             self._socket.close()

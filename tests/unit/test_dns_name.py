@@ -41,6 +41,13 @@ def test_a_server_with_two_kinds_of_address_counts_once(monkeypatch: pytest.Monk
     assert name.read() == [Server("cloud/fd00::7", "tcp://[fd00::7]:5555")]
 
 
+def test_a_name_with_addresses_of_one_link_only_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is no empty list, which would take all servers away."""
+    answer(monkeypatch, "fe80::1%eth0")
+    with pytest.raises(CloudBroken, match=r"planners\.local: no address that can be used"):
+        DnsName("cloud", "dns://planners.local:5555", None).read()
+
+
 def test_a_name_without_address_is_an_error() -> None:
     """`.invalid` never has one (RFC 2606); the error names the host."""
     with pytest.raises(CloudBroken, match=r"planners\.invalid: "):

@@ -5,7 +5,15 @@ from random import Random
 
 import pytest
 
-from offboard.common.errors import CloudBroken, CloudBusy, CloudError, CloudTimeout, Overtaken, TaskFailed
+from offboard.common.errors import (
+    CloudBroken,
+    CloudBusy,
+    CloudError,
+    CloudTimeout,
+    Overtaken,
+    SiteClosed,
+    TaskFailed,
+)
 from offboard.common.tasks import kind_of, task
 from offboard.robot_client import predictors
 from offboard.robot_client.learning.kind import KindMemory
@@ -86,6 +94,14 @@ def test_a_site_that_refuses_at_once_does_not_look_fast(failure: CloudError) -> 
     for failure in (CloudBusy("full"), CloudBroken("gone")):
         learn(fresh, lost(failure, 0.004))
     assert outlook(fresh).predicted_s is None
+
+
+def test_a_run_that_was_closed_says_nothing_of_its_site() -> None:
+    """The list of servers changed while a second run was due: the server has not failed."""
+    one = known()
+    learn(one, lost(SiteClosed("closed"), 60.0))
+    assert outlook(one).failures == 0
+    assert outlook(one).predicted_s == pytest.approx(0.2)
 
 
 def test_a_plain_predictor_learns_every_lost_time() -> None:

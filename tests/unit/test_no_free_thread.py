@@ -10,9 +10,11 @@ from typing import Any
 import pytest
 
 from offboard import Offloader
+from offboard.common.errors import OffloadError
 from offboard.common.host.load import Load
 from offboard.common.host.load_watch import LoadWatch
 from offboard.common.tasks import Task, kind_of, task
+from offboard.robot_client.sites.cloud import CloudRunner
 from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import ONBOARD
 
@@ -134,3 +136,24 @@ def test_the_load_is_read_without_a_free_thread(no_thread: Callable[[], Any]) ->
     watch.latest()
     assert threading.active_count() == before + 1
     watch.close()
+
+
+def test_a_server_that_gets_no_thread_is_an_error_and_leaves_nothing_open(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """If the last thread is taken after the check for room, it is an OffloadError, as without room."""
+
+    start = threading.Thread.start
+
+    def refuse(thread: threading.Thread) -> None:
+        if thread.name == "site-gpu":
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    files = []
+    for _ in range(3):
+        with pytest.raises(OffloadError, match="gpu: can't start new thread"):
+            CloudRunner("tcp://127.0.0.1:5555", site="gpu")
+        files.append(len(list(Path("/proc/self/fd").iterdir())))
+    assert files[0] == files[1] == files[2]  # the first one also opens what libzmq keeps

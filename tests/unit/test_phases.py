@@ -222,7 +222,7 @@ def test_close_ends_the_task_under_way_and_nothing_is_learnt(decision: Decision,
     for site in scene.sites.values():
         site.takes = 1.0
     scene.clock.after(at_s, scene.offload.close)
-    assert scene.ask(2, decision) in ("OffloadError", "CloudBroken")
+    assert scene.ask(2, decision) in ("OffloadError", "SiteClosed")
     scene.clock.run_out()
     assert len(scene.records) <= 1
     assert scene.learnt(ONBOARD) == scene.learnt(CLOUD) == []

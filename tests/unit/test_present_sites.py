@@ -1,16 +1,20 @@
 """Sites that come and go while tasks run, with an offloader in virtual time and no thread."""
 
+import threading
+
 import pytest
 
 from offboard.common.errors import ConfigError, OffloadError
-from offboard.common.tasks import task
+from offboard.common.tasks import Task, kind_of, task
 from offboard.robot_client import policies
-from offboard.robot_client.discovery.present_sites import PresentSites
-from offboard.robot_client.discovery.roster import LOOK_EVERY, LOOK_S, Roster, Server
+from offboard.robot_client.discovery.present_sites import LEAVING_MAX_S, LEAVING_MIN_S, PresentSites
+from offboard.robot_client.discovery.roster import LOOK_EVERY, LOOK_S, TRY_EVERY, Roster, Server
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import ONBOARD
 from tests.virtual import VirtualClock, VirtualRunner
+
+WAIT_S = 5.0
 
 
 @task("carried", size=float)
@@ -46,6 +50,10 @@ class World:
         self.runners[server.site] = VirtualRunner(server.site, self.clock, self.takes_s)
         return self.runners[server.site]
 
+    def pass_time(self, seconds: float) -> None:
+        self.clock.wait([], seconds)
+        self.sites.refresh()
+
 
 def test_a_listed_server_is_used_and_one_that_left_is_not() -> None:
     """Tasks follow the list, and the runner of a server that left is closed at the next change."""
@@ -61,8 +69,73 @@ def test_a_listed_server_is_used_and_one_that_left_is_not() -> None:
         world.offload(carried, 1)
     assert world.offload.last.used == "b"
     assert len(gone.tasks) == asked
-    world.sites.refresh()
+    world.pass_time(LEAVING_MIN_S)
     assert gone.closed
+
+
+def test_a_task_that_was_decided_before_its_server_left_is_answered_there() -> None:
+    """Nothing runs on the server when it leaves: it is still there for tasks that go there a moment later."""
+    world = World("a")
+    before = world.sites["a"]
+    world.list()
+    world.pass_time(LEAVING_MIN_S / 2)
+    assert not world.runners["a"].closed
+    before.submit(Task(kind_of(carried), (1,), 1.0), 60.0)
+    world.pass_time(LEAVING_MIN_S / 2)
+    assert world.runners["a"].closed
+
+
+def test_a_long_task_ends_with_its_list_but_not_with_a_trial() -> None:
+    """It has LEAVING_MAX_S on a server that no list names, and all its time on one that a list names."""
+    world = World(*(f"planners/{n}" for n in range(5)))
+    (tried,) = {f"planners/{n}" for n in range(5)} - set(world.sites)
+    long = world.runners.copy()
+    world.sites.in_flight = lambda site: int(site != tried)
+    for look in range(1, TRY_EVERY + 1):
+        for _ in range(LOOK_EVERY):
+            world.sites.count_task(dict.fromkeys(world.sites, 0.1), look * LOOK_S)
+    (left,) = long.keys() - set(world.sites)
+    world.pass_time(2 * LEAVING_MAX_S)
+    assert not long[left].closed
+    world.list()
+    world.pass_time(LEAVING_MAX_S - 1.0)
+    assert not any(long[site].closed for site in long if site != left)
+    world.pass_time(1.0)
+    assert all(one.closed for one in long.values())
+
+
+def test_a_server_that_returns_while_it_has_tasks_keeps_its_connection() -> None:
+    """There is never a second connection beside the first one, whose tasks could not be told apart."""
+    world = World("a")
+    before = world.sites["a"]
+    world.sites.in_flight = lambda _: 1
+    world.list()
+    assert set(world.sites) == {ONBOARD}
+    world.list("a")
+    assert world.sites["a"] is before
+    world.pass_time(LEAVING_MAX_S)
+    assert not world.runners["a"].closed
+
+
+def test_no_task_waits_while_servers_are_connected() -> None:
+    """A task can be counted, and even make the robot look for other servers, while a connection is made."""
+    world = World()
+    looked: list[bool] = []
+
+    def count() -> None:
+        for number in range(LOOK_EVERY):
+            sites.count_task({}, number * LOOK_S)
+
+    def connect(server: Server) -> VirtualRunner:
+        tasks = threading.Thread(target=count, daemon=True)
+        tasks.start()
+        tasks.join(WAIT_S)
+        looked.append(tasks.is_alive())
+        return VirtualRunner(server.site, world.clock)
+
+    sites = PresentSites([VirtualRunner(ONBOARD, world.clock)], roster=Roster(), connect=connect, tended=True)
+    sites.follow([Server("a", "tcp://a.test:5555")])
+    assert looked == [False]
 
 
 def test_a_task_keeps_the_sites_that_were_present_when_it_began() -> None:
@@ -129,6 +202,17 @@ def test_a_batch_goes_on_when_its_servers_leave() -> None:
         world.offload(carried, 1)
     world.clock.after(0.3, world.list)
     assert world.offload.map(carried, range(40)) == list(range(40))
+
+
+def test_a_batch_uses_the_servers_that_come() -> None:
+    """All names change while it runs, and the new server gets items too."""
+    world = World("a")
+    for _ in range(10):
+        world.offload(carried, 1)
+    world.clock.after(0.3, lambda: world.list("b"))
+    assert world.offload.map(carried, range(40)) == list(range(40))
+    assert world.runners["a"].tasks
+    assert world.runners["b"].tasks
 
 
 def test_a_server_that_cannot_be_connected_to_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:

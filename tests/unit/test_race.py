@@ -14,6 +14,7 @@ from offboard.common.errors import (
     CloudTimeout,
     OffloadError,
     Overtaken,
+    SiteClosed,
     TaskFailed,
 )
 from offboard.common.tasks import Task, kind_of, task
@@ -263,5 +264,5 @@ def test_a_closed_runner_counts_as_broken(course: Course) -> None:
     course.take(onboard=None)
     course.clock.after(0.1, course.sites[ONBOARD].close)
     (only,) = course.run(Plan((ONBOARD,)))
-    assert isinstance(only.failure, CloudBroken)
+    assert isinstance(only.failure, SiteClosed)
     assert not only.started

@@ -3,7 +3,7 @@
 import pytest
 
 from offboard.common.errors import ConfigError
-from offboard.robot_client.discovery.roster import LOOK_EVERY, LOOK_S, TRY_EVERY, Roster, Server
+from offboard.robot_client.discovery.roster import LOOK_EVERY, LOOK_S, SPARED_S, TRY_EVERY, Roster, Server
 
 
 def servers(*sites: str) -> list[Server]:
@@ -79,10 +79,41 @@ def test_a_server_that_cannot_take_tasks_is_replaced_at_the_next_look() -> None:
     roster = Roster(known=4, seed=1)
     roster.follow([*group(5), *servers("gpu")])
     dead = next(site for site in roster.in_use if site != "gpu")
-    roster.look({site: 0.1 for site in roster.in_use if site != dead}, now_s=0.0)
+    roster.look({}, now_s=0.0)
+    roster.look({site: 0.1 for site in roster.in_use if site != dead}, now_s=SPARED_S)
     assert len(roster.in_use) == 5
     assert dead not in roster.in_use
     assert "gpu" in roster.in_use
+
+
+def test_a_server_that_takes_other_tasks_stays() -> None:
+    """Three servers cannot take the task of the look, but have taken others since the last one."""
+    roster = Roster(known=4, seed=1)
+    roster.follow(group(100))
+    roster.look({}, now_s=0.0)
+    before = set(roster.in_use)
+    one = min(before)
+    roster.count_task(before, now_s=SPARED_S)
+    roster.look({one: 0.1}, now_s=SPARED_S)
+    assert set(roster.in_use) == before
+    roster.look({one: 0.1}, now_s=2 * SPARED_S)
+    assert before & set(roster.in_use) == {one}
+
+
+def test_a_server_has_time_to_connect() -> None:
+    """On a slow link, servers that are not up yet stay for SPARED_S, though another one is up."""
+    roster = Roster(known=4, seed=1)
+    roster.follow(group(100))
+    before = set(roster.in_use)
+    up = {min(before): 0.1}
+    for now_s in (0.0, SPARED_S / 2, SPARED_S - 0.1):
+        roster.look(up, now_s)
+        assert set(roster.in_use) == before
+    roster.look(up, SPARED_S)
+    assert before & set(roster.in_use) == set(up)
+    after = set(roster.in_use)
+    roster.look(up, SPARED_S + LOOK_S)
+    assert set(roster.in_use) == after
 
 
 def test_an_outage_of_the_robot_does_not_cost_it_its_servers() -> None:
@@ -99,10 +130,10 @@ def test_a_look_is_due_after_tasks_and_time() -> None:
     """Neither many fast tasks nor a long time alone make a look due."""
     roster = Roster()
     roster.look({}, now_s=0.0)
-    assert not any(roster.count_task(LOOK_S - 0.1) for _ in range(10 * LOOK_EVERY))
-    assert roster.count_task(LOOK_S)
+    assert not any(roster.count_task([], LOOK_S - 0.1) for _ in range(10 * LOOK_EVERY))
+    assert roster.count_task([], LOOK_S)
     roster.look({}, now_s=LOOK_S)
-    assert [roster.count_task(1000.0) for _ in range(LOOK_EVERY)] == [False] * (LOOK_EVERY - 1) + [True]
+    assert [roster.count_task([], 1000.0) for _ in range(LOOK_EVERY)] == [False] * (LOOK_EVERY - 1) + [True]
 
 
 def test_two_choices_need_two_servers() -> None:

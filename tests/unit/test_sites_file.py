@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from offboard.common.errors import ConfigError, DataError
-from offboard.robot_client.discovery.following import Following
+from offboard.common.errors import ConfigError, DataError, OffloadError
+from offboard.robot_client.discovery.following import TEND_S, Following
 from offboard.robot_client.discovery.present_sites import PresentSites
 from offboard.robot_client.discovery.roster import Roster, Server
 from offboard.robot_client.discovery.sites_file import GROUPS_MAX, SitesFile
@@ -57,6 +57,8 @@ def test_a_change_counts_once_two_reads_agree(listed: SitesFile, tmp_path: Path)
     ("text", "said"),
     [
         ("", "0 servers; allowed are 1 to 1000"),
+        (f"a = {'[' * 5_000}", "sites.toml: maximum recursion depth"),
+        (f"a = {'1' * 5_000}", "sites.toml: Exceeds the limit"),
         ("[gpu", "Expected .* at the end of a table declaration"),
         ("gpu = 1", r"\[gpu\]: must be a table with `endpoint`"),
         ("[gpu]", r"\[gpu\]: `endpoint` is missing"),
@@ -81,6 +83,45 @@ def test_a_mistake_is_named(listed: SitesFile, tmp_path: Path, text: str, said: 
         listed.read()
     assert "\n" not in str(raised.value)
     assert str(raised.value).startswith(str(tmp_path / "sites.toml"))
+
+
+def test_a_surprise_does_not_end_the_thread(listed: SitesFile, caplog: pytest.LogCaptureFixture) -> None:
+    """An error that nobody expects is logged once with its traceback, and the list is read again."""
+    clock, fails = VirtualClock(), [True]
+
+    def connect(server: Server) -> VirtualRunner:
+        if fails:
+            raise RuntimeError("surprise")
+        return VirtualRunner(server.site, clock)
+
+    sites = PresentSites([VirtualRunner(ONBOARD, clock)], roster=Roster(), connect=connect)
+    following = Following(listed, sites, TEND_S)
+    for _ in range(5):
+        following.tend(TEND_S)
+    assert caplog.text.count("RuntimeError: surprise") == 1
+    assert "remedy: " in caplog.text
+    fails.clear()
+    following.tend(TEND_S)
+    assert set(sites) == {ONBOARD, "gpu"}
+
+
+def test_servers_are_tended_between_two_reads(listed: SitesFile, tmp_path: Path) -> None:
+    """One that lacked files is tried again soon, though the file is not read yet."""
+    clock, full = VirtualClock(), [True]
+
+    def connect(server: Server) -> VirtualRunner:
+        if full:
+            raise OffloadError("no file is left")
+        return VirtualRunner(server.site, clock)
+
+    sites = PresentSites([VirtualRunner(ONBOARD, clock)], roster=Roster(), connect=connect)
+    following = Following(listed, sites, 100 * TEND_S)
+    following.read()
+    full.clear()
+    (tmp_path / "sites.toml").write_text(EQUAL)
+    following.tend(TEND_S)
+    assert set(sites) == {ONBOARD, "gpu"}
+    assert not listed.settling
 
 
 def test_a_problem_is_logged_once_and_the_servers_stay(
