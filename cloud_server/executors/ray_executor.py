@@ -249,6 +249,7 @@ class _Objects:
     def clear(self) -> None:
         with self._lock:
             self._references.clear()
+            self._byte_count = 0
 
     def _trim(self) -> None:
         for digest in [one for one in self._references if not self._pins[one]]:

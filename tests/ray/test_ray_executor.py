@@ -1,0 +1,36 @@
+"""What the executor keeps and how it watches the head, without a cluster."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from offboard.cloud_server.executors.ray_actor import ActorSetup
+from offboard.cloud_server.executors.task_run import Call
+from offboard.common.wire.blobs import StoredBlob
+from tests.ray.handles import StandIn
+
+SETUP = ActorSetup((), (), 0)
+BYTES_MAX = 100
+
+
+@pytest.fixture
+def make(stand_in: StandIn) -> Callable[[], Any]:
+    """Makes executors of one worker whose thread does not run."""
+    from offboard.cloud_server.executors.ray_executor import RayExecutor
+
+    return lambda: RayExecutor(stand_in, 1, SETUP, BYTES_MAX)  # type: ignore[arg-type]
+
+
+def with_blob(data: bytes) -> Call:
+    return Call("any", (), {data[:1]: StoredBlob(data)})
+
+
+def test_blobs_of_a_lost_cluster_do_not_count(stand_in: StandIn, make: Callable[[], Any]) -> None:
+    """After all blobs were forgotten, as many bytes as before have room, and each is put once."""
+    executor, old, new, small = make(), b"o" * 80, b"n" * 80, b"s"
+    executor.submit(with_blob(old), lambda _: None)
+    executor.close()
+    for data in (new, small, new):
+        executor.submit(with_blob(data), lambda _: None)
+    assert stand_in.puts == [old, new, small]
