@@ -56,7 +56,7 @@ class RayExecutor:
         self._up: set[RayWorker] = set()
         self._idle: list[RayWorker] = []
         self._closing = threading.Event()
-        self._head_at_s = time.monotonic()
+        self._head_at_s = self._looked_at_s = time.monotonic()
         self._headless = False
         self._session = 0  # one for each connection to a cluster
         self._thread = threading.Thread(target=self._tend, name="ray-workers", daemon=True)
@@ -80,7 +80,7 @@ class RayExecutor:
 
     def warm(self, changed: Callable[[str], None] = lambda _: None) -> "Future[None]":
         self._changed = changed
-        self._head_at_s = time.monotonic()
+        self._head_at_s = self._looked_at_s = time.monotonic()
         self._watch_head()
         self._thread.start()
         return self._started
@@ -134,6 +134,9 @@ class RayExecutor:
     def _look(self, began_s: float) -> None:
         """Notice whether the head answers, tend each worker, and end the start of the server."""
         now_s = time.monotonic()
+        paused_s = now_s - self._looked_at_s
+        if paused_s > HEAD_SILENT_S_MAX:  # this process was paused, and asked the head nothing
+            self._head_at_s = min(now_s, self._head_at_s + paused_s)
         silent_s = now_s - self._head_at_s
         if (silent_s > HEAD_SILENT_S_MAX) != self._headless:
             self._head_changed()
@@ -144,6 +147,7 @@ class RayExecutor:
             worker.tend([pid for pid in same if pid != worker.pid], self._objects.keeps)
         if not self._started.done():
             self._end_start(now_s - began_s)
+        self._looked_at_s = time.monotonic()
 
     def _head_changed(self) -> None:
         self._headless = not self._headless

@@ -10,6 +10,7 @@ from offboard.cloud_server.executors.task_run import Call
 from offboard.common.wire.blobs import StoredBlob
 from tests.ray.handles import StandIn
 
+PAUSE_S, LOOK_S = 40.0, 2.0
 SETUP = ActorSetup((), (), 0)
 BYTES_MAX = 100
 
@@ -34,3 +35,30 @@ def test_blobs_of_a_lost_cluster_do_not_count(stand_in: StandIn, make: Callable[
     for data in (new, small, new):
         executor.submit(with_blob(data), lambda _: None)
     assert stand_in.puts == [old, new, small]
+
+
+class Clock:
+    """The time that the executor reads."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+
+def test_a_pause_of_the_server_is_no_silence_of_the_head(
+    stand_in: StandIn, make: Callable[[], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever pauses the server pauses its questions to the head too; real silence is noticed afterwards."""
+    from offboard.cloud_server.executors import ray_executor
+
+    clock = Clock()
+    monkeypatch.setattr(ray_executor, "time", clock)
+    executor, looks = make(), list[bool]()
+    for pause_s in (LOOK_S, PAUSE_S, LOOK_S, LOOK_S, PAUSE_S):
+        clock.now_s += pause_s
+        executor._look(0.0)
+        looks.append(executor._headless)
+    assert looks == [False, False, False, True, True]
+    assert stand_in.disconnected == 0
