@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any
 
 from offboard.cloud_server.executors import ray_cluster
-from offboard.cloud_server.executors.ray_actor import ActorSetup, Measured, Ran, Started
+from offboard.cloud_server.executors.ray_actor import NOTHING, ActorSetup, Measured, Ran, Started
 from offboard.cloud_server.executors.ray_cluster import RayCluster
 from offboard.cloud_server.executors.task_run import Outcome
 from offboard.cloud_server.executors.worker import FAILED_PAUSE_S, OVERTIME_S, Assignment, Died
@@ -52,6 +52,7 @@ class RayWorker:
         self._died = died
         self._actor: Any = None
         self._number = 0
+        self._stopped = NOTHING  # the last run that was asked to stop
         self._assignment: Assignment | None = None
         self._began_s = 0.0
         self._begin_at_s = 0.0
@@ -193,7 +194,8 @@ class RayWorker:
         over_s = ran_s - assignment.call.budget_s
         if over_s > OVERTIME_S:
             self.lose("budget", f"was killed {OVERTIME_S:g} s after the budget was over")
-        elif over_s > 0 or not assignment.call.wanted():
+        elif self._stopped != self._number and (over_s > 0 or not assignment.call.wanted()):
+            self._stopped = self._number
             self._call("stop", lambda _: None, self._number, control=True)
 
     def _answer(self, died: Died) -> None:
