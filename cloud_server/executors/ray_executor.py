@@ -98,7 +98,7 @@ class RayExecutor:
         with self._lock:
             worker = self._idle.pop() if self._idle else None
             if worker is not None:
-                worker.give(assignment, references)
+                worker.give(assignment, references, self._objects.keeps)
         if worker is None:
             assignment.answer.set_result(Outcome("busy", "a worker died, and the next one is not ready yet"))
         return assignment.answer
@@ -144,7 +144,7 @@ class RayExecutor:
             self._connect_again()
         for worker in self._workers:
             same = [one.pid for one in self._workers if one.pid and one.host == worker.host]
-            worker.tend([pid for pid in same if pid != worker.pid], self._objects.keeps)
+            worker.tend([pid for pid in same if pid != worker.pid])
         if not self._started.done():
             self._end_start(now_s - began_s)
         self._looked_at_s = time.monotonic()

@@ -68,25 +68,33 @@ class RayWorker:
         """CPU seconds of this actor and of those before it."""
         return self._used_before_s + self._used_s
 
-    def give(self, assignment: Assignment, references: Mapping[bytes, Any]) -> None:
-        """Run this call, whose blobs have these references. Called once after `free`, not after `died`."""
+    def give(
+        self, assignment: Assignment, references: Mapping[bytes, Any], kept: Callable[[bytes], bool]
+    ) -> None:
+        """Run this call, whose blobs have these references. Called once after `free`, not after `died`.
+
+        `kept`: whether a blob is kept. The actor forgets the others in the same call, so that none that it
+        needs is forgotten too late.
+        """
         self._number += 1
         self._began_s, self._assignment = time.monotonic(), assignment
         task = assignment.call
+        dropped = [digest for digest in self.known if not kept(digest)]
+        self.known.difference_update(dropped)
         new = [digest for digest in references if digest not in self.known]
         self.known.update(new)
         blobs = [references[digest] for digest in new]
-        named: dict[str, Any] = {"digests": list(references), "new": new, "kind": task.kind}
+        named: dict[str, Any] = {"digests": list(references), "new": new, "dropped": dropped}
         frames = [bytes(frame) for frame in task.frames]
         try:
-            self._call("run", self._ran, *blobs, number=self._number, frames=frames, **named)
+            self._call("run", self._ran, *blobs, number=self._number, kind=task.kind, frames=frames, **named)
         except Exception as error:  # noqa: BLE001 - of Ray: the task must be answered all the same
             self._post(partial(self.lose, *ray_cluster.why(error)))
 
-    def tend(self, siblings: Sequence[int], kept: Callable[[bytes], bool]) -> None:
+    def tend(self, siblings: Sequence[int]) -> None:
         """Do what is due: start an actor, end a run that is not wanted or too long, look at the actor.
 
-        `siblings`: the processes of the other workers on the same computer. `kept`: whether a blob is kept.
+        `siblings`: the processes of the other workers on the same computer.
         """
         now_s = time.monotonic()
         if self._actor is None:
@@ -102,9 +110,7 @@ class RayWorker:
             self.lose("silent", f"did not answer for {SILENT_S_MAX:g} s")
             return
         self._looked_at_s = now_s
-        dropped = [digest for digest in tuple(self.known) if not kept(digest)]
-        self.known.difference_update(dropped)
-        self._call("look", self._measured, list(siblings), dropped, control=True)
+        self._call("look", self._measured, list(siblings), control=True)
 
     def lose(self, reason: str, text: str, failure: TaskFailed | ConfigError | None = None) -> None:
         """This actor is dead, or has to die; another one takes its place."""

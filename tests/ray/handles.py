@@ -41,7 +41,7 @@ class Handle:
     def __init__(self) -> None:
         self.sent: list[Sent] = []
         self.refuses = False
-        self._actor = RayActor()
+        self.process = RayActor()
 
     def __getattr__(self, method: str) -> "_Method":
         return _Method(self, method)
@@ -49,7 +49,7 @@ class Handle:
     def send(self, method: str, args: tuple[Any, ...], named: Mapping[str, Any]) -> Sent:
         if self.refuses:
             raise RuntimeError("this process is not connected")
-        self.sent.append(Sent(self._actor, method, args, named))
+        self.sent.append(Sent(self.process, method, args, named))
         return self.sent[-1]
 
     def take(self, method: str) -> list[Sent]:

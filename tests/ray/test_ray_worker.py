@@ -1,14 +1,16 @@
 """What one worker sends to its actor, with an actor in this process."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from queue import SimpleQueue
 from typing import Any
 
+import numpy as np
 import pytest
 
 from offboard.cloud_server.executors.ray_actor import ActorSetup
 from offboard.cloud_server.executors.task_run import Call
 from offboard.cloud_server.executors.worker import Assignment, Died
+from tests.executor_tasks import call, value
 from tests.ray.handles import Handle, StandIn
 
 SETUP = ActorSetup((), (), 0)
@@ -45,12 +47,21 @@ class Place:
         """What the executor does all the time."""
         while not self._events.empty():
             self._events.get()()
-        self.worker.tend((), lambda _: True)
+        self.worker.tend(())
 
-    def give(self, call: Call, references: Mapping[bytes, Any]) -> Assignment:
-        assignment = Assignment(call)
-        self.worker.give(assignment, references)
+    def give(self, call: Call, *kept: bytes) -> Assignment:
+        """The executor keeps these blobs now, and has none else."""
+        assignment, references = Assignment(call), {one: call.blobs[one].data for one in call.blobs}
+        self.worker.give(assignment, references, kept.__contains__)
         return assignment
+
+    def finish(self, assignment: Assignment) -> Any:
+        """The actor answers everything, the newest call first; what the task returned."""
+        for one in reversed(self.actor.sent):
+            one.answer()
+        self.actor.sent.clear()
+        self.look()
+        return value(assignment.answer.result(0))
 
 
 @pytest.fixture
@@ -64,7 +75,7 @@ def place(stand_in: StandIn) -> Place:
 def test_an_unwanted_run_is_asked_to_stop_once(place: Place) -> None:
     """Also if the task goes on: the answer to `stop` wakes the thread, which would send the next one."""
     for number in (1, 2):
-        place.give(Call("any", (), wanted=lambda: False), {})
+        place.give(Call("any", (), wanted=lambda: False))
         asked = list[Any]()
         for _ in range(3):
             place.look()
@@ -74,3 +85,18 @@ def test_an_unwanted_run_is_asked_to_stop_once(place: Place) -> None:
         assert asked == [(number,)]
         place.actor.take("run")[0].answer()
         place.look()
+
+
+@pytest.mark.usefixtures("module")
+def test_a_blob_that_comes_back_is_sent_again(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was forgotten for another blob. Looks at the actor, in whatever order they arrive, change nothing."""
+    from offboard.cloud_server.executors import ray_worker
+
+    monkeypatch.setattr(ray_worker, "LOOK_EVERY_S", 0.0)
+    first, second = (call("exec_sum", np.full(50_000, number, float)) for number in (1, 2))
+    for one, total in ((first, 50_000), (second, 100_000), (first, 50_000), (first, 50_000)):
+        assignment = place.give(one, *one.blobs)
+        place.look()
+        assert place.finish(assignment) == total
+        assert place.worker.known == set(place.actor.process._blobs) == set(one.blobs)
+    assert not place.deaths
