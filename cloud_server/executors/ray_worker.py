@@ -19,7 +19,7 @@ from offboard.cloud_server.executors.ray_cluster import RayCluster
 from offboard.cloud_server.executors.task_run import Outcome
 from offboard.cloud_server.executors.worker import FAILED_PAUSE_S, OVERTIME_S, Assignment, Died
 from offboard.common import VERSION, tasks
-from offboard.common.errors import ConfigError, TaskFailed
+from offboard.common.errors import ConfigError, TaskFailed, describe
 
 LOOK_EVERY_S = 1.0  # between two looks at the load of an actor and at whether it lives
 SILENT_S_MAX = 10.0  # until an idle actor that does not answer counts as dead
@@ -86,10 +86,7 @@ class RayWorker:
         blobs = [references[digest] for digest in new]
         named: dict[str, Any] = {"digests": list(references), "new": new, "dropped": dropped}
         frames = [bytes(frame) for frame in task.frames]
-        try:
-            self._call("run", self._ran, *blobs, number=self._number, kind=task.kind, frames=frames, **named)
-        except Exception as error:  # noqa: BLE001 - of Ray: the task must be answered all the same
-            self._post(partial(self.lose, *ray_cluster.why(error)))
+        self._call("run", self._ran, *blobs, number=self._number, kind=task.kind, frames=frames, **named)
 
     def tend(self, siblings: Sequence[int]) -> None:
         """Do what is due: start an actor, end a run that is not wanted or too long, look at the actor.
@@ -135,19 +132,32 @@ class RayWorker:
         self._answer(Died("closed", "was ended with the server", server_fault=True))
 
     def _begin(self) -> None:
-        self._actor = self._cluster.new_actor()
+        try:
+            self._actor = self._cluster.new_actor()
+        except Exception as error:  # noqa: BLE001 - of Ray, for example because its head is lost
+            self._begin_at_s = time.monotonic() + FAILED_PAUSE_S
+            self._died(self, Died("start", f"did not start: {describe(error)}", server_fault=True))
+            return
         self._call("start", self._started, self._setup)
 
     def _call(
         self, method: str, then: Callable[[Any], None], *args: Any, control: bool = False, **named: Any
     ) -> None:
-        """Call the actor; `then` gets the answer in the thread of the executor, if there is one."""
+        """Call the actor; `then` gets the answer in the thread of the executor, if there is one.
+
+        If Ray refuses the call, the actor counts as dead.
+        """
         actor = self._actor
 
         def answered(future: "Future[Any]") -> None:
             self._post(partial(self._take, actor, then, future))
 
-        ray_cluster.call(getattr(actor, method), *args, then=answered, control=control, **named)
+        try:
+            ray_cluster.call(getattr(actor, method), *args, then=answered, control=control, **named)
+        except Exception as error:  # noqa: BLE001 - of Ray: a task must be answered all the same
+            refused: Future[Any] = Future()
+            refused.set_exception(error)
+            answered(refused)
 
     def _take(self, actor: Any, then: Callable[[Any], None], future: "Future[Any]") -> None:
         if actor is not self._actor:

@@ -101,3 +101,13 @@ class StandIn:
 
     def disconnect(self) -> None:
         self.disconnected += 1
+
+
+class Clock:
+    """The time that the module under test reads; the test sets it."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def monotonic(self) -> float:
+        return self.now_s

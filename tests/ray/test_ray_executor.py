@@ -8,7 +8,7 @@ import pytest
 from offboard.cloud_server.executors.ray_actor import ActorSetup
 from offboard.cloud_server.executors.task_run import Call
 from offboard.common.wire.blobs import StoredBlob
-from tests.ray.handles import StandIn
+from tests.ray.handles import Clock, StandIn
 
 PAUSE_S, LOOK_S = 40.0, 2.0
 SETUP = ActorSetup((), (), 0)
@@ -35,16 +35,6 @@ def test_blobs_of_a_lost_cluster_do_not_count(stand_in: StandIn, make: Callable[
     for data in (new, small, new):
         executor.submit(with_blob(data), lambda _: None)
     assert stand_in.puts == [old, new, small]
-
-
-class Clock:
-    """The time that the executor reads."""
-
-    def __init__(self) -> None:
-        self.now_s = 100.0
-
-    def monotonic(self) -> float:
-        return self.now_s
 
 
 def test_a_pause_of_the_server_is_no_silence_of_the_head(

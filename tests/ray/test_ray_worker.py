@@ -9,9 +9,9 @@ import pytest
 
 from offboard.cloud_server.executors.ray_actor import ActorSetup
 from offboard.cloud_server.executors.task_run import Call
-from offboard.cloud_server.executors.worker import Assignment, Died
+from offboard.cloud_server.executors.worker import FAILED_PAUSE_S, Assignment, Died
 from tests.executor_tasks import call, value
-from tests.ray.handles import Handle, StandIn
+from tests.ray.handles import PID, Clock, Handle, StandIn
 
 SETUP = ActorSetup((), (), 0)
 
@@ -89,7 +89,7 @@ def test_an_unwanted_run_is_asked_to_stop_once(place: Place) -> None:
 
 @pytest.mark.usefixtures("module")
 def test_a_blob_that_comes_back_is_sent_again(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It was forgotten for another blob. Looks at the actor, in whatever order they arrive, change nothing."""
+    """Another blob displaced it. Looks at the actor change nothing, in whatever order they arrive."""
     from offboard.cloud_server.executors import ray_worker
 
     monkeypatch.setattr(ray_worker, "LOOK_EVERY_S", 0.0)
@@ -100,3 +100,40 @@ def test_a_blob_that_comes_back_is_sent_again(place: Place, monkeypatch: pytest.
         assert place.finish(assignment) == total
         assert place.worker.known == set(place.actor.process._blobs) == set(one.blobs)
     assert not place.deaths
+
+
+@pytest.mark.parametrize("at_once", [True, False])
+def test_a_call_that_ray_refuses_loses_only_the_actor(place: Place, at_once: bool) -> None:
+    """Its task is answered, and the next actor starts."""
+    if not at_once:
+        assignment = place.give(Call("any", (), wanted=lambda: False))
+    place.actor.refuses = True
+    if at_once:
+        assignment = place.give(Call("any", ()))
+    place.look()  # sends a stop if the run was sent
+    place.look()
+    assert assignment.answer.result(0).crashed
+    assert [one.reason for one in place.deaths] == ["exit"]
+    assert place.cluster.ended == [place.cluster.actors[0]]
+    place.start()
+    assert (len(place.cluster.actors), place.worker.pid) == (2, PID)
+
+
+def test_an_actor_that_ray_does_not_make_is_asked_for_again(
+    stand_in: StandIn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every FAILED_PAUSE_S, and the reason is said each time."""
+    from offboard.cloud_server.executors import ray_worker
+
+    clock = Clock()
+    monkeypatch.setattr(ray_worker, "time", clock)
+    place, stand_in.refuses = Place(stand_in), True
+    for deaths in (1, 1, 2):
+        place.look()
+        clock.now_s += FAILED_PAUSE_S / 2
+        assert len(place.deaths) == deaths
+    assert str(place.deaths[0]) == "did not start: RuntimeError: the head does not answer"
+    stand_in.refuses = False
+    clock.now_s += FAILED_PAUSE_S
+    place.start()
+    assert place.worker.pid == PID
