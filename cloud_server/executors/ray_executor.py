@@ -162,9 +162,9 @@ class RayExecutor:
         """The head is lost, and with it the cluster: wait for a new one at the same address."""
         for worker in self._workers:
             worker.lose("head", "was lost with the head of the cluster")
-        self._objects.clear()
         self._cluster.disconnect()
         while not self._closing.wait(HEAD_EVERY_S):
+            self._objects.clear()  # also those of a connection that failed half-way
             with contextlib.suppress(ConfigError):
                 self._cluster.connect()
                 break

@@ -7,6 +7,7 @@ import pytest
 
 from offboard.cloud_server.executors.ray_actor import ActorSetup
 from offboard.cloud_server.executors.task_run import Call
+from offboard.common.errors import ConfigError
 from offboard.common.wire.blobs import StoredBlob
 from tests.ray.handles import Clock, StandIn
 
@@ -52,3 +53,24 @@ def test_a_pause_of_the_server_is_no_silence_of_the_head(
         looks.append(executor._headless)
     assert looks == [False, False, False, True, True]
     assert stand_in.disconnected == 0
+
+
+def test_blobs_of_a_connection_that_failed_are_put_again(
+    stand_in: StandIn, make: Callable[[], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ray may take blobs before the head is found dead again; the next cluster does not have them."""
+    from offboard.cloud_server.executors import ray_executor
+
+    executor, data, attempts = make(), b"data", [1, 2]
+
+    def connect() -> None:
+        executor.submit(with_blob(data), lambda _: None)
+        if attempts.pop() == 2:
+            raise ConfigError("the head died again")
+
+    monkeypatch.setattr(ray_executor, "HEAD_EVERY_S", 0.001)
+    monkeypatch.setattr(stand_in, "connect", connect)
+    executor._connect_again()
+    executor.close()
+    assert attempts == []
+    assert stand_in.puts == [data, data]
