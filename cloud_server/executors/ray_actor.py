@@ -101,8 +101,14 @@ class RayActor:
         frames: list[bytes],
         digests: Sequence[bytes],
         new: Sequence[bytes],
+        dropped: Sequence[bytes],
     ) -> Ran:
-        """Run one task. `digests` name its blobs; `new` names `blobs`, which this actor did not have."""
+        """Run one task. `digests` name its blobs; `new` names `blobs`, which this actor does not have.
+
+        The blobs that were `dropped` are forgotten first.
+        """
+        for digest in dropped:
+            self._blobs.pop(digest, None)
         for digest, data in zip(new, blobs, strict=True):
             self._blobs[digest] = StoredBlob(memoryview(data))
         known = {digest: self._blobs[digest] for digest in digests}
@@ -116,11 +122,9 @@ class RayActor:
         """Nobody wants the answer of this run any more."""
         self._stopped = number
 
-    def look(self, siblings: Sequence[int], dropped: Sequence[bytes]) -> Measured:
-        """Measure this computer, whose other workers are `siblings`; forget the blobs that were dropped."""
+    def look(self, siblings: Sequence[int]) -> Measured:
+        """Measure this computer, whose other workers are `siblings`."""
         self._siblings = tuple(siblings)
-        for digest in dropped:
-            self._blobs.pop(digest, None)
         return Measured(*self._load.latest(), process_s(os.getpid()))
 
     def _own_s(self) -> float:

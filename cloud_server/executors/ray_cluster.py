@@ -65,12 +65,13 @@ class RayCluster:
             if ":" in self.address:  # Ray itself would try for more than a minute
                 host, _, port = self.address.rpartition(":")
                 socket.create_connection((host.strip("[]"), int(port)), CONNECT_S_MAX).close()
+            self._connected = True  # also if only a part of the following succeeds
             ray.init(self.address, log_to_driver=False, logging_level="ERROR", configure_logging=False)
-        except (RayError, RuntimeError, ValueError, OSError) as error:
+            self._head = ray.get_runtime_context().gcs_address
+            self._id = GcsClient(address=self._head).cluster_id
+        except Exception as error:  # Ray says it in several ways
+            self.disconnect()
             raise ConfigError(f"--ray-address: {self.address}: {_line(error)}") from error
-        self._connected = True
-        self._head = ray.get_runtime_context().gcs_address
-        self._id = GcsClient(address=self._head).cluster_id
 
     def disconnect(self) -> None:
         """End the actors of this server. Safe to call twice."""
@@ -132,7 +133,7 @@ def call(
 
 def end(actor: Any) -> None:
     """Kill an actor, with what it runs."""
-    with contextlib.suppress(RayError):  # it is dead already
+    with contextlib.suppress(Exception):  # it is dead already, or its cluster is
         ray.kill(actor)
 
 

@@ -56,7 +56,7 @@ class RayExecutor:
         self._up: set[RayWorker] = set()
         self._idle: list[RayWorker] = []
         self._closing = threading.Event()
-        self._head_at_s = time.monotonic()
+        self._head_at_s = self._looked_at_s = time.monotonic()
         self._headless = False
         self._session = 0  # one for each connection to a cluster
         self._thread = threading.Thread(target=self._tend, name="ray-workers", daemon=True)
@@ -80,7 +80,7 @@ class RayExecutor:
 
     def warm(self, changed: Callable[[str], None] = lambda _: None) -> "Future[None]":
         self._changed = changed
-        self._head_at_s = time.monotonic()
+        self._head_at_s = self._looked_at_s = time.monotonic()
         self._watch_head()
         self._thread.start()
         return self._started
@@ -98,7 +98,7 @@ class RayExecutor:
         with self._lock:
             worker = self._idle.pop() if self._idle else None
             if worker is not None:
-                worker.give(assignment, references)
+                worker.give(assignment, references, self._objects.keeps)
         if worker is None:
             assignment.answer.set_result(Outcome("busy", "a worker died, and the next one is not ready yet"))
         return assignment.answer
@@ -134,6 +134,9 @@ class RayExecutor:
     def _look(self, began_s: float) -> None:
         """Notice whether the head answers, tend each worker, and end the start of the server."""
         now_s = time.monotonic()
+        paused_s = now_s - self._looked_at_s
+        if paused_s > HEAD_SILENT_S_MAX:  # this process was paused, and asked the head nothing
+            self._head_at_s = min(now_s, self._head_at_s + paused_s)
         silent_s = now_s - self._head_at_s
         if (silent_s > HEAD_SILENT_S_MAX) != self._headless:
             self._head_changed()
@@ -141,9 +144,10 @@ class RayExecutor:
             self._connect_again()
         for worker in self._workers:
             same = [one.pid for one in self._workers if one.pid and one.host == worker.host]
-            worker.tend([pid for pid in same if pid != worker.pid], self._objects.keeps)
+            worker.tend([pid for pid in same if pid != worker.pid])
         if not self._started.done():
             self._end_start(now_s - began_s)
+        self._looked_at_s = time.monotonic()
 
     def _head_changed(self) -> None:
         self._headless = not self._headless
@@ -158,9 +162,9 @@ class RayExecutor:
         """The head is lost, and with it the cluster: wait for a new one at the same address."""
         for worker in self._workers:
             worker.lose("head", "was lost with the head of the cluster")
-        self._objects.clear()
         self._cluster.disconnect()
         while not self._closing.wait(HEAD_EVERY_S):
+            self._objects.clear()  # also those of a connection that failed half-way
             with contextlib.suppress(ConfigError):
                 self._cluster.connect()
                 break
@@ -249,6 +253,7 @@ class _Objects:
     def clear(self) -> None:
         with self._lock:
             self._references.clear()
+            self._byte_count = 0
 
     def _trim(self) -> None:
         for digest in [one for one in self._references if not self._pins[one]]:

@@ -14,12 +14,12 @@ from functools import partial
 from typing import Any
 
 from offboard.cloud_server.executors import ray_cluster
-from offboard.cloud_server.executors.ray_actor import ActorSetup, Measured, Ran, Started
+from offboard.cloud_server.executors.ray_actor import NOTHING, ActorSetup, Measured, Ran, Started
 from offboard.cloud_server.executors.ray_cluster import RayCluster
 from offboard.cloud_server.executors.task_run import Outcome
 from offboard.cloud_server.executors.worker import FAILED_PAUSE_S, OVERTIME_S, Assignment, Died
 from offboard.common import VERSION, tasks
-from offboard.common.errors import ConfigError, TaskFailed
+from offboard.common.errors import ConfigError, TaskFailed, describe
 
 LOOK_EVERY_S = 1.0  # between two looks at the load of an actor and at whether it lives
 SILENT_S_MAX = 10.0  # until an idle actor that does not answer counts as dead
@@ -52,6 +52,7 @@ class RayWorker:
         self._died = died
         self._actor: Any = None
         self._number = 0
+        self._stopped = NOTHING  # the last run that was asked to stop
         self._assignment: Assignment | None = None
         self._began_s = 0.0
         self._begin_at_s = 0.0
@@ -67,25 +68,30 @@ class RayWorker:
         """CPU seconds of this actor and of those before it."""
         return self._used_before_s + self._used_s
 
-    def give(self, assignment: Assignment, references: Mapping[bytes, Any]) -> None:
-        """Run this call, whose blobs have these references. Called once after `free`, not after `died`."""
+    def give(
+        self, assignment: Assignment, references: Mapping[bytes, Any], kept: Callable[[bytes], bool]
+    ) -> None:
+        """Run this call, whose blobs have these references. Called once after `free`, not after `died`.
+
+        `kept`: whether a blob is kept. The actor forgets the others in the same call, so that none that it
+        needs is forgotten too late.
+        """
         self._number += 1
         self._began_s, self._assignment = time.monotonic(), assignment
         task = assignment.call
+        dropped = [digest for digest in self.known if not kept(digest)]
+        self.known.difference_update(dropped)
         new = [digest for digest in references if digest not in self.known]
         self.known.update(new)
         blobs = [references[digest] for digest in new]
-        named: dict[str, Any] = {"digests": list(references), "new": new, "kind": task.kind}
+        named: dict[str, Any] = {"digests": list(references), "new": new, "dropped": dropped}
         frames = [bytes(frame) for frame in task.frames]
-        try:
-            self._call("run", self._ran, *blobs, number=self._number, frames=frames, **named)
-        except Exception as error:  # noqa: BLE001 - of Ray: the task must be answered all the same
-            self._post(partial(self.lose, *ray_cluster.why(error)))
+        self._call("run", self._ran, *blobs, number=self._number, kind=task.kind, frames=frames, **named)
 
-    def tend(self, siblings: Sequence[int], kept: Callable[[bytes], bool]) -> None:
+    def tend(self, siblings: Sequence[int]) -> None:
         """Do what is due: start an actor, end a run that is not wanted or too long, look at the actor.
 
-        `siblings`: the processes of the other workers on the same computer. `kept`: whether a blob is kept.
+        `siblings`: the processes of the other workers on the same computer.
         """
         now_s = time.monotonic()
         if self._actor is None:
@@ -101,9 +107,7 @@ class RayWorker:
             self.lose("silent", f"did not answer for {SILENT_S_MAX:g} s")
             return
         self._looked_at_s = now_s
-        dropped = [digest for digest in tuple(self.known) if not kept(digest)]
-        self.known.difference_update(dropped)
-        self._call("look", self._measured, list(siblings), dropped, control=True)
+        self._call("look", self._measured, list(siblings), control=True)
 
     def lose(self, reason: str, text: str, failure: TaskFailed | ConfigError | None = None) -> None:
         """This actor is dead, or has to die; another one takes its place."""
@@ -128,19 +132,32 @@ class RayWorker:
         self._answer(Died("closed", "was ended with the server", server_fault=True))
 
     def _begin(self) -> None:
-        self._actor = self._cluster.new_actor()
+        try:
+            self._actor = self._cluster.new_actor()
+        except Exception as error:  # noqa: BLE001 - of Ray, for example because its head is lost
+            self._begin_at_s = time.monotonic() + FAILED_PAUSE_S
+            self._died(self, Died("start", f"did not start: {describe(error)}", server_fault=True))
+            return
         self._call("start", self._started, self._setup)
 
     def _call(
         self, method: str, then: Callable[[Any], None], *args: Any, control: bool = False, **named: Any
     ) -> None:
-        """Call the actor; `then` gets the answer in the thread of the executor, if there is one."""
+        """Call the actor; `then` gets the answer in the thread of the executor, if there is one.
+
+        If Ray refuses the call, the actor counts as dead.
+        """
         actor = self._actor
 
         def answered(future: "Future[Any]") -> None:
             self._post(partial(self._take, actor, then, future))
 
-        ray_cluster.call(getattr(actor, method), *args, then=answered, control=control, **named)
+        try:
+            ray_cluster.call(getattr(actor, method), *args, then=answered, control=control, **named)
+        except Exception as error:  # noqa: BLE001 - of Ray: a task must be answered all the same
+            refused: Future[Any] = Future()
+            refused.set_exception(error)
+            answered(refused)
 
     def _take(self, actor: Any, then: Callable[[Any], None], future: "Future[Any]") -> None:
         if actor is not self._actor:
@@ -193,7 +210,8 @@ class RayWorker:
         over_s = ran_s - assignment.call.budget_s
         if over_s > OVERTIME_S:
             self.lose("budget", f"was killed {OVERTIME_S:g} s after the budget was over")
-        elif over_s > 0 or not assignment.call.wanted():
+        elif self._stopped != self._number and (over_s > 0 or not assignment.call.wanted()):
+            self._stopped = self._number
             self._call("stop", lambda _: None, self._number, control=True)
 
     def _answer(self, died: Died) -> None:

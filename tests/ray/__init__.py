@@ -1,1 +1,1 @@
-"""Tests of `--executor ray` on real clusters; `make ray` runs them in an environment of its own."""
+"""Tests of `--executor ray`, most of them on real clusters; `make ray` runs them."""

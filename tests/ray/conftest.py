@@ -9,6 +9,7 @@ from offboard.cloud_server.executors import EXECUTORS, Executor
 from offboard.cloud_server.executors.worker_pool import MEMORY_BYTES_MAX
 from tests.integration.executors.conftest import module
 from tests.ray.clusters import RayNodes
+from tests.ray.handles import StandIn
 
 __all__ = ["module"]
 
@@ -68,3 +69,10 @@ def connect(module: str) -> Iterator[Callable[..., Executor]]:
 def executor(nodes: RayNodes, connect: Callable[..., Executor]) -> Executor:
     """One warm executor with a worker on each of the two nodes."""
     return connect(nodes)
+
+
+@pytest.fixture
+def stand_in(monkeypatch: pytest.MonkeyPatch) -> StandIn:
+    """A cluster whose actors are in this process."""
+    pytest.importorskip("ray", reason="Ray is not installed here: make ray runs this test")
+    return StandIn(monkeypatch)
