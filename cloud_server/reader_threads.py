@@ -59,7 +59,7 @@ class ReaderThreads:
         self._over = over
         self._ended: Future[None] = Future()  # set by the thread that read last
         self._usual_s: dict[str, float] = {}  # run time of a task, by kind
-        self._absence = Absence(self._lead_in_new_thread)
+        self._absence = Absence(self._lead_in_new_thread, self._start)
 
     def run(self) -> None:
         """Read until `over`. Raises what a turn raised."""
@@ -69,7 +69,7 @@ class ReaderThreads:
         try:
             self._ended.result()
         finally:
-            self._absence.begin()  # wakes the watching thread, which ends
+            self._absence.begin([])  # wakes the watching thread, which ends
 
     def leave(self, timeout_s: float) -> None:
         """Wait until no thread reads any more."""
@@ -112,18 +112,14 @@ class ReaderThreads:
             return False
         self._start([work for work in chosen if not self._short(work)])
         chosen[:] = filter(self._short, chosen)
-        away, until_s = self._absence.begin(), time.perf_counter() + AWAY_S
-        while chosen and self._short(chosen[0]) and time.perf_counter() < until_s:
-            work = chosen.pop(0)
+        away, until_s = self._absence.begin(chosen), time.perf_counter() + AWAY_S
+        while time.perf_counter() < until_s and (work := self._absence.next(away, self._short)) is not None:
             outcome = self._executor.run(self._call(work), meanwhile=None)
             if outcome is None:
                 self._start([work])
-            else:
-                chosen += self._answer(work, outcome)
-        if self._absence.end(away):
-            return False
-        self._start(chosen)
-        return True
+            elif (more := self._answer(work, outcome)) and not self._absence.add(away, more):
+                self._start(more)
+        return not self._absence.end(away)
 
     def _short(self, work: Work) -> bool:
         return self._usual_s.get(work.request.kind, SHORT_S) < SHORT_S
@@ -131,12 +127,13 @@ class ReaderThreads:
     def _answer(self, work: Work, outcome: Outcome) -> list[Work]:
         """Send the reply of a task that ran in this thread; returns the work to start in its place.
 
-        One long task makes its kind long for a while.
+        One long task makes its kind long for a while. A failed one may have ended before its work began.
         """
-        usual_s = self._usual_s.get(work.request.kind, 0.0)
-        self._usual_s[work.request.kind] = max(
-            outcome.run_s, usual_s + USUAL_RATE * (outcome.run_s - usual_s)
-        )
+        if outcome.status == "ok" or outcome.run_s >= SHORT_S:
+            usual_s = self._usual_s.get(work.request.kind, 0.0)
+            self._usual_s[work.request.kind] = max(
+                outcome.run_s, usual_s + USUAL_RATE * (outcome.run_s - usual_s)
+            )
         try:
             return self._answered(work, outcome)
         except Exception:  # as in the callback of a future: the leading thread must go on
@@ -167,25 +164,43 @@ class ReaderThreads:
 
 
 class Absence:
-    """Notes that the reading thread is away, running short tasks. If it stays away, `take_over` is called.
+    """Notes that the reading thread is away, running short tasks.
 
-    `watch` runs in a thread of its own, which rests while no short tasks run.
+    If it stays away, `take_over` is called, and `start` with the rest of its work. `watch` runs in a thread of
+    its own, which rests while no short tasks run.
     """
 
-    def __init__(self, take_over: Callable[[], None]) -> None:
+    def __init__(self, take_over: Callable[[], None], start: Callable[[list[Work]], None]) -> None:
         self._take_over = take_over
-        self._lock = threading.Lock()
+        self._start = start
+        self._lock = threading.Lock()  # protects the rest, and who reads
+        self._rest: list[Work] = []
         self._since_s: float | None = None  # None: the reading thread is there
         self._last_s = 0.0
         self._watched = False
         self._wanted = threading.Event()
 
-    def begin(self) -> float:
-        """The reading thread leaves; returns what `end` needs."""
+    def begin(self, rest: list[Work]) -> float:
+        """The reading thread leaves to run `rest`; returns what the next methods need."""
+        self._rest = rest
         self._since_s = self._last_s = now_s = time.perf_counter()
         if not self._watched:
             self._wanted.set()
         return now_s
+
+    def next(self, since_s: float, fits: Callable[[Work], bool]) -> Work | None:
+        """The first of the rest. None if it does not fit, and if nothing is left or another thread reads."""
+        with self._lock:
+            mine = self._since_s == since_s and self._rest
+            return self._rest.pop(0) if mine and fits(self._rest[0]) else None
+
+    def add(self, since_s: float, more: list[Work]) -> bool:
+        """Add work to the rest. False if another thread reads by now."""
+        with self._lock:
+            in_time = self._since_s == since_s
+            if in_time:
+                self._rest += more
+        return in_time
 
     def end(self, since_s: float) -> bool:
         """The thread is back. False if another thread reads by now."""
@@ -196,7 +211,7 @@ class Absence:
         return in_time
 
     def watch(self, over: Callable[[], bool]) -> None:
-        """Call `take_over` for each absence that lasts too long, until `over`."""
+        """Let another thread take over after each absence that lasts too long, until `over`."""
         while not over():
             self._watched = False  # before looking: a thread that leaves from now on wakes this one
             if time.perf_counter() - self._last_s > WATCHES_S and self._since_s is None:
@@ -206,7 +221,10 @@ class Absence:
             time.sleep(AWAY_S)
             with self._lock:
                 late = self._since_s is not None and time.perf_counter() - self._since_s > AWAY_S
+                rest: list[Work] = []
                 if late:
+                    rest, self._rest[:] = self._rest[:], []
                     self._since_s = None
             if late and not over():
                 self._take_over()
+                self._start(rest)
