@@ -219,12 +219,18 @@ class Absence:
             self._watched = True
             self._wanted.clear()
             time.sleep(AWAY_S)
-            with self._lock:
-                late = self._since_s is not None and time.perf_counter() - self._since_s > AWAY_S
-                rest: list[Work] = []
-                if late:
-                    rest, self._rest[:] = self._rest[:], []
-                    self._since_s = None
-            if late and not over():
+            self._start(self._let_take_over(over))
+
+    def _let_take_over(self, over: Callable[[], bool]) -> list[Work]:
+        """If the absence lasts too long, let another thread read; returns the work that nobody has begun."""
+        with self._lock:
+            since_s = self._since_s
+            if since_s is None or time.perf_counter() - since_s <= AWAY_S or over():
+                return []
+            rest, self._rest[:] = self._rest[:], []
+            self._since_s = None  # before the other thread reads: it may leave at once
+            try:
                 self._take_over()
-                self._start(rest)
+            except RuntimeError:  # no thread can be started: the one that is away goes on reading later
+                self._since_s = since_s
+        return rest

@@ -45,8 +45,8 @@ def run_fleets(config: FleetConfig) -> int:
 
 
 def _shares(fleet: Fleet) -> list[float]:
-    """The share of each server in the time that all servers were used, in percent."""
-    found: list[float] = (100 * fleet.busy_s / fleet.busy_s.sum()).round(3).tolist()
+    """The share of each server in the time that all servers were used, in percent; 0 if none was used."""
+    found: list[float] = (100 * fleet.busy_s / (fleet.busy_s.sum() or 1.0)).round(3).tolist()
     return found
 
 
@@ -54,7 +54,7 @@ def _write(
     out: Path, config: FleetConfig, lines: Sequence[FleetLine], shares: Sequence[Sequence[float]]
 ) -> None:
     fleets = [{**asdict(line), "shares": share} for line, share in zip(lines, shares, strict=True)]
-    text = json.dumps({"settings": as_dict(config), "fleets": fleets}, indent=2)
+    text = json.dumps({"settings": as_dict(config), "fleets": fleets}, indent=2, allow_nan=False)
     try:
         out.mkdir(parents=True, exist_ok=True)
         replace_file(out / FIGURES, text.encode())

@@ -35,8 +35,8 @@ class FleetLine:
     p99_ms: float
     regret_ms: float
     settled_ms: float
-    busiest: float
-    idlest: float
+    busiest: float | None
+    idlest: float | None
     uneven: float | None
     repeats: float | None
     onboard_percent: float
@@ -49,7 +49,7 @@ def line_of(fleet: Fleet, start_s: float, took_s: float) -> FleetLine:
     """The figures of a fleet whose simulation took `took_s` seconds."""
     waited_s = np.array([[one.waited_s for one in robot] for robot in fleet.done])
     regret_s, half = waited_s - fleet.oracle_s, waited_s.shape[1] // 2
-    busy = fleet.busy_s / fleet.busy_s.mean()
+    mean_s = float(fleet.busy_s.mean())
     uneven, repeats = herding(_while_all_work(fleet, start_s))
     done = [one for robot in fleet.done for one in robot]
     return FleetLine(
@@ -61,8 +61,8 @@ def line_of(fleet: Fleet, start_s: float, took_s: float) -> FleetLine:
         p99_ms=1e3 * float(quantile(waited_s.ravel(), 99)),
         regret_ms=1e3 * float(regret_s.mean()),
         settled_ms=1e3 * float(regret_s[:, half:].mean()),
-        busiest=float(busy.max()),
-        idlest=float(busy.min()),
+        busiest=float(fleet.busy_s.max()) / mean_s if mean_s else None,
+        idlest=float(fleet.busy_s.min()) / mean_s if mean_s else None,
         uneven=uneven,
         repeats=repeats,
         onboard_percent=100 * sum(one.server < 0 for one in done) / len(done),

@@ -19,7 +19,7 @@ def compare(
     """
     found = []
     for process in by_process(tasks):
-        sites = max((task.sites for task in process), key=len)
+        sites = tuple(dict.fromkeys(site for task in process for site in task.sites))
         for task, decision in zip(process, make(sites).follow(process), strict=True):
             if decision is not None:
                 found.append((task, decision))

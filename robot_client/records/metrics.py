@@ -5,7 +5,7 @@ The records are made in `offloader`.
 
 import logging
 from collections.abc import Iterator
-from functools import cache
+from typing import Generic, TypeVar
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
@@ -19,13 +19,17 @@ from offboard.robot_client.sites.runner import Execution
 
 SECONDS_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
 
+GONE_MAX = 16  # servers that have left, of which metrics are kept
+
 log = logging.getLogger(__name__)
+
+M = TypeVar("M", Counter, Gauge, Histogram)
 
 
 class Metrics:
     """An observer of the offloader that counts into `registry`, and keeps records for the page /live.
 
-    Finding a metric by its labels takes most of the time of counting, so what was found is cached.
+    Of a server that has left, the metrics stay until GONE_MAX others have left after it.
     """
 
     def __init__(self, registry: CollectorRegistry) -> None:
@@ -34,46 +38,70 @@ class Metrics:
         self.live = RobotLive(as_dict)
         site = ["kind", "site"]
         about = "Tasks, by the site whose answer was used"
-        self._tasks = cache(Counter("offboard_robot_tasks", about, site, registry=r).labels)
+        self._tasks = _ByLabels(Counter("offboard_robot_tasks", about, site, registry=r))
         about, labels = "Executions by site and outcome", [*site, "outcome"]
-        self._executions = cache(Counter("offboard_robot_executions", about, labels, registry=r).labels)
+        self._executions = _ByLabels(Counter("offboard_robot_executions", about, labels, registry=r))
         about, name = "Seconds that the caller waited", "offboard_robot_wait_seconds"
         waits = Histogram(name, about, ["kind"], buckets=SECONDS_BUCKETS, registry=r)
-        self._waited = cache(waits.labels)
+        self._waited = _ByLabels(waits)
         about = "Last prediction, in seconds"
-        self._predicted = cache(Gauge("offboard_robot_predicted_seconds", about, site, registry=r).labels)
+        self._predicted = _ByLabels(Gauge("offboard_robot_predicted_seconds", about, site, registry=r))
         about = "Answers, by whether their time was inside the 90 % interval of the prediction"
         labels = [*site, "inside"]
-        self._interval = cache(Counter("offboard_robot_interval_checks", about, labels, registry=r).labels)
+        self._interval = _ByLabels(Counter("offboard_robot_interval_checks", about, labels, registry=r))
         about, labels = "Tasks, by the site that was chosen", [*site, "policy"]
-        self._decisions = cache(Counter("offboard_robot_decisions", about, labels, registry=r).labels)
+        self._decisions = _ByLabels(Counter("offboard_robot_decisions", about, labels, registry=r))
         about = "Executions beyond the first of a task: warm-up, measuring, probes, hedges, fallbacks"
         name = "offboard_robot_duplicate_executions"
-        self._duplicates = cache(Counter(name, about, ["kind"], registry=r).labels)
+        self._duplicates = _ByLabels(Counter(name, about, ["kind"], registry=r))
         about = "1 if the last task of this kind could use the site; 0 if it was silent or absent"
-        self._usable = cache(Gauge("offboard_robot_site_usable", about, site, registry=r).labels)
+        self._usable = _ByLabels(Gauge("offboard_robot_site_usable", about, site, registry=r))
+        self._sites: set[str] = set()  # of the last record
+        self._gone: dict[str, None] = {}  # the oldest first
         self._regret = _LatestRegret()
         registry.register(self._regret)
 
     def __call__(self, record: Record) -> None:
         if record.started_at >= self.live.due_at:
             self.live.keep(record, record.started_at)
-        self._tasks(record.kind, record.used or "none").inc()
-        self._waited(record.kind).observe(record.waited_s)
-        self._decisions(record.kind, record.decision.site, record.decision.policy).inc()
-        self._duplicates(record.kind).inc(len(record.executions) - 1)
+        self._tasks[record.kind, record.used or "none"].inc()
+        self._waited[record.kind,].observe(record.waited_s)
+        self._decisions[record.kind, record.decision.site, record.decision.policy].inc()
+        self._duplicates[record.kind,].inc(len(record.executions) - 1)
         for execution in record.executions:
             outcome = "ok" if execution.failure is None else type(execution.failure).__name__
-            self._executions(record.kind, execution.site, outcome).inc()
+            self._executions[record.kind, execution.site, outcome].inc()
             self._judge(record, execution)
         for site, outlook in record.sites.items():
             if outlook.predicted_s is not None:
-                self._predicted(record.kind, site).set(outlook.predicted_s)
-        for site in {**self.live.sites, **record.sites}:  # a server that never answered is shown too
+                self._predicted[record.kind, site].set(outlook.predicted_s)
+        sites = {*self.live.sites, *record.sites}  # a server that never answered is shown too
+        for site in sites:
             found = record.sites.get(site)
-            self._usable(record.kind, site).set(found is not None and not found.condition.silent)
+            self._usable[record.kind, site].set(found is not None and not found.condition.silent)
+        sites.update(execution.site for execution in record.executions)
+        if sites != self._sites:
+            self._change(sites)
         if record.regret is not None:
             self._regret.latest = record.regret
+
+    def _change(self, sites: set[str]) -> None:
+        """The sites are these from now on."""
+        for site in self._sites - sites:
+            self._gone[site] = None
+        for site in sites:
+            self._gone.pop(site, None)
+        self._sites = sites
+        for (_, site), usable in self._usable.items():
+            if site in self._gone:
+                usable.set(0)
+        while len(self._gone) > GONE_MAX:
+            oldest = next(iter(self._gone))
+            del self._gone[oldest]
+            for metric in (self._tasks, self._executions, self._interval, self._decisions):
+                metric.forget(oldest)
+            for gauge in (self._predicted, self._usable):
+                gauge.forget(oldest)
 
     def _judge(self, record: Record, execution: Execution) -> None:
         """Count whether the time was inside its interval. A run without an answer has no time to compare."""
@@ -81,7 +109,7 @@ class Metrics:
         if not execution.ok or outlook is None or outlook.low_s is None or outlook.high_s is None:
             return
         inside = str(outlook.low_s <= execution.seconds <= outlook.high_s).lower()
-        self._interval(record.kind, execution.site, inside).inc()
+        self._interval[record.kind, execution.site, inside].inc()
 
     def watch(self, trace: Trace) -> None:
         """Also serve how many records `trace` has lost."""
@@ -96,6 +124,23 @@ class Metrics:
         """Stop serving."""
         if self._port is not None:
             self._port.close()
+
+
+class _ByLabels(dict[tuple[str, ...], M], Generic[M]):
+    """The metrics of a family by their labels. To find one there takes most of the time of counting."""
+
+    def __init__(self, family: M) -> None:
+        self._family = family
+
+    def __missing__(self, labels: tuple[str, ...]) -> M:
+        found = self[labels] = self._family.labels(*labels)
+        return found
+
+    def forget(self, site: str) -> None:
+        """Remove the metrics of this site. Their labels begin with the kind and the site."""
+        for labels in [one for one in self if one[1] == site]:
+            del self[labels]
+            self._family.remove(*labels)
 
 
 class _Lost(Collector):

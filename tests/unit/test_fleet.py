@@ -93,7 +93,9 @@ def test_robots_learn_and_share_equal_servers() -> None:
     line = line_of(played(), CONFIG.start_s, 1.0)
     assert line.tasks == 60 * 24
     assert 0 <= line.settled_ms < 0.1 * line.mean_ms
+    assert line.busiest is not None
     assert line.busiest < 2
+    assert line.idlest is not None
     assert line.idlest > 0.5
 
 
@@ -115,6 +117,15 @@ def test_the_command_prints_a_table_and_writes_figures_and_chart(
     fleets = json.loads((tmp_path / "fleet.json").read_text())["fleets"]
     assert [sum(one["shares"]) for one in fleets] == pytest.approx([100, 100], abs=0.01)
     assert (tmp_path / "fleet.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_fleet_may_use_no_server(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Onboard alone: no server has a share, the load of the servers is undefined, and the file is JSON."""
+    flags = ["--robots", "8", "--servers", "2", "--tasks", "6", "--policy", "onboard", "--out", str(tmp_path)]
+    assert main(["fleet", *flags]) == 0
+    assert "nan" not in capsys.readouterr().out
+    (fleet,) = json.loads((tmp_path / "fleet.json").read_text(), parse_constant=pytest.fail)["fleets"]
+    assert (fleet["shares"], fleet["busiest"], fleet["idlest"]) == ([0, 0], None, None)
 
 
 @pytest.mark.parametrize(

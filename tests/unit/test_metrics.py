@@ -1,5 +1,6 @@
 """The metrics of the robot."""
 
+from collections import UserDict
 from dataclasses import replace
 
 import pytest
@@ -8,7 +9,7 @@ from prometheus_client import CollectorRegistry
 from offboard.common.errors import CloudBroken
 from offboard.robot_client.learning.regret import Regret
 from offboard.robot_client.policies import Outlook
-from offboard.robot_client.records.metrics import Metrics
+from offboard.robot_client.records.metrics import GONE_MAX, Metrics
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution
 from tests.fakes import ScriptedRunner
 from tests.unit.test_trace import record
@@ -86,3 +87,35 @@ def test_a_site_that_is_silent_or_absent_is_not_usable() -> None:
     for sites, cloud in (({CLOUD: answering}, 1), ({CLOUD: silent}, 0), ({CLOUD: answering}, 1), ({}, 0)):
         observe(replace(record(0), sites={ONBOARD: answering, **sites}))
         assert usable() == [1, cloud, 0]
+
+
+def test_the_metrics_of_servers_that_left_are_bounded() -> None:
+    """The last ones are not usable any more and keep their counts; all metrics of older ones are removed."""
+    registry = CollectorRegistry()
+    observe = Metrics(registry)
+    servers = [f"server-{n}" for n in range(GONE_MAX + 3)]
+    for server in servers:
+        observe.live.show({server: ScriptedRunner(server, lambda _: Execution(CLOUD, 0.1))}, allowance=None)
+        outlook = Outlook(0.1, low_s=0.0, high_s=1.0)
+        decision = record(0).decision._replace(site=server)
+        runs = (Execution(server, 0.1),)
+        sites = {server: outlook}
+        observe(replace(record(0), used=server, sites=sites, executions=runs, decision=decision))
+
+    samples = [one for family in registry.collect() for one in family.samples if "site" in one.labels]
+    assert {one.labels["site"] for one in samples} == set(servers[2:])
+    usable = {one.labels["site"]: one.value for one in samples if one.name == "offboard_robot_site_usable"}
+    assert usable == {**dict.fromkeys(servers[2:], 0), servers[-1]: 1}
+
+
+def test_a_server_may_leave_while_a_task_is_counted() -> None:
+    """The names of the sites are read, and never looked up: the next look may be without one of them."""
+
+    class Leaving(UserDict[str, ScriptedRunner]):
+        def __getitem__(self, site: str) -> ScriptedRunner:
+            raise KeyError(site)
+
+    observe = Metrics(CollectorRegistry())
+    there = {"edge": ScriptedRunner("edge", lambda _: Execution("edge", 0.1))}
+    observe.live.show(Leaving(there), allowance=None)
+    observe(record(0))

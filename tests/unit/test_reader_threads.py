@@ -15,6 +15,7 @@ from offboard.common.tasks import task
 from offboard.common.wire.messages import Request, encode
 
 WAIT_S = 5.0
+AWAY_S = 0.1  # long enough for a busy computer to begin a task
 go = threading.Event()
 
 
@@ -54,7 +55,7 @@ class Reading:
             wanted=lambda _: True,
             over=lambda: self._over,
         )
-        self._thread = threading.Thread(target=readers.run)
+        self._thread = threading.Thread(target=readers.run, daemon=True)
         self._thread.start()
 
     def bring(self, *arguments: tuple[str, ...]) -> None:
@@ -84,6 +85,7 @@ def _work(id: int, values: tuple[str, ...]) -> Work:
 def reading(monkeypatch: pytest.MonkeyPatch) -> Iterator[Reading]:
     """Here each kind is short after its first task, on a slow computer too."""
     monkeypatch.setattr(reader_threads, "SHORT_S", 2 * WAIT_S)
+    monkeypatch.setattr(reader_threads, "AWAY_S", AWAY_S)
     go.clear()
     made = Reading()
     yield made
@@ -105,3 +107,25 @@ def test_a_task_that_fails_does_not_make_its_kind_short(reading: Reading) -> Non
     reading.bring(("",))
     assert reading.outcome() == (0, "ok")
     assert reading.executor.hand_overs == [True, True]
+
+
+def test_the_server_reads_on_after_no_thread_could_take_over(
+    reading: Reading, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other work of the turn starts nevertheless; the thread that was away then reads again."""
+    refused = threading.Event()
+
+    def refuse(*_: object, **__: object) -> None:
+        refused.set()
+        raise RuntimeError("can't start new thread")
+
+    reading.bring(("",))
+    assert reading.outcome() == (0, "ok")
+    with monkeypatch.context() as patch:
+        for name in ("_start_new_thread", "_start_joinable_thread"):  # by the version of Python
+            patch.setattr(threading, name, refuse, raising=False)
+        reading.bring(("wait",), ("go",))
+        assert refused.wait(WAIT_S)
+        assert {reading.outcome() for _ in range(2)} == {(0, "ok"), (1, "ok")}
+    reading.bring(("",))
+    assert reading.outcome() == (0, "ok")

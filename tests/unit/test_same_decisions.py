@@ -1,21 +1,24 @@
 """Replay against the run, task by task: the policy of the run decides as it did there."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
 
 from offboard.common.errors import DataError
-from offboard.loadgen.replay.recorded_tasks import of_rows, read_tasks
+from offboard.loadgen.replay.recorded_tasks import RecordedTask, of_rows, read_tasks
 from offboard.loadgen.replay.replay import ReplayConfig, measured_tasks, replay, tables
-from offboard.loadgen.replay.same_decisions import same
+from offboard.loadgen.replay.same_decisions import compare, same
+from offboard.loadgen.replay.virtual_robot import VirtualRobot
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks, find_tasks
 from offboard.loadgen.simulation.simulated_run import simulate
 from offboard.loadgen.table.measured_rows import read
+from offboard.robot_client import policies
 from offboard.robot_client.policies import Decision, Hedge, Probe
 from offboard.robot_client.records.trace import Trace
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD
+from offboard.robot_client.settings import Settings
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.mazes import warm
 
 warm()
@@ -108,6 +111,31 @@ def test_a_line_that_cannot_be_replayed_is_named(
     with pytest.raises(DataError, match=r"trace\.jsonl:2: cannot be replayed: ") as raised:
         read_tasks(path, None)
     assert error in str(raised.value)
+
+
+def test_servers_may_change_during_a_run() -> None:
+    """The replay knows each server that any task could use, also if no task could use all of them."""
+    tasks = [
+        RecordedTask(
+            1.0,
+            {server: Execution(server, 0.1)},
+            sites=(ONBOARD, server),
+            decision=Decision(server, "", "greedy"),
+            i=i,
+            started_s=float(i),
+            waited_s=0.1,
+        )
+        for i, server in enumerate(("one", "other"))
+    ]
+    known: list[Sequence[str]] = []
+
+    def make(sites: Sequence[str]) -> VirtualRobot:
+        known.append(sites)
+        memories = Settings().make_memories("default")
+        return VirtualRobot(policies.make("greedy", 0), memories, tells_work=False, sites=sites)
+
+    assert [task for task, _ in compare(tasks, make)] == tasks
+    assert known == [(ONBOARD, "one", "other")]
 
 
 def test_decisions_are_equal_if_they_start_the_same_sites_at_the_same_time() -> None:
