@@ -166,8 +166,8 @@ class ReaderThreads:
 class Absence:
     """Notes that the reading thread is away, running short tasks.
 
-    If it stays away, `take_over` is called, and `start` with the rest of its work. `watch` runs in a thread of
-    its own, which rests while no short tasks run.
+    If it stays away, `take_over` is called, and `start` with the rest of its work. `watch` runs in a thread
+    of its own, which rests while no short tasks run.
     """
 
     def __init__(self, take_over: Callable[[], None], start: Callable[[list[Work]], None]) -> None:

@@ -30,7 +30,10 @@ from offboard.common.wire.messages import ERROR_LENGTH_MAX, byte_count
 CHUNK_BYTES = 1 << 16
 ANSWER_BYTES_MAX = (1 << 31) - (1 << 20)  # no message is larger
 PR_SET_PDEATHSIG = 1
-STOPS = (signal.SIGINT, signal.SIGTERM)  # Ctrl-C, and some service managers, reach all processes of the server
+STOPS = (
+    signal.SIGINT,
+    signal.SIGTERM,
+)  # Ctrl-C, and some service managers, reach all processes of the server
 # Prepared in advance, for the case that no memory is left to build an answer.
 NOTHING_LEFT: bytes = msgpack.packb(
     ["failed", "MemoryError: too little memory is left for an answer", 0.0, None, [], True, False, "", True]
