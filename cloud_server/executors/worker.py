@@ -25,7 +25,7 @@ from typing import Any, NoReturn
 import msgpack
 
 from offboard.cloud_server.executors.task_run import Call, Outcome
-from offboard.cloud_server.executors.worker_process import CHUNK_BYTES, Setup, new_unpacker
+from offboard.cloud_server.executors.worker_process import CHUNK_BYTES, STOPS, Setup, new_unpacker
 from offboard.common.errors import OffloadError, TaskFailed, describe
 from offboard.common.wanted import always
 
@@ -280,4 +280,8 @@ def _spawn(pipe: int, flag: int, setup: Setup) -> "subprocess.Popen[bytes]":
     code = f"import sys; sys.path[:] = {path}; from {home} import Setup, work; "
     code += f"work({os.getpid()}, {pipe}, {flag}, {setup!r})"
     command = [sys.executable, "-u", "-c", code]  # -u: a crash does not lose what the task has printed
-    return subprocess.Popen(command, stdin=subprocess.DEVNULL, pass_fds=(pipe, flag))
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)  # until the process has its own handlers
+    try:
+        return subprocess.Popen(command, stdin=subprocess.DEVNULL, pass_fds=(pipe, flag))
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

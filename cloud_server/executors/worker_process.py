@@ -30,6 +30,10 @@ from offboard.common.wire.messages import ERROR_LENGTH_MAX, byte_count
 CHUNK_BYTES = 1 << 16
 ANSWER_BYTES_MAX = (1 << 31) - (1 << 20)  # no message is larger
 PR_SET_PDEATHSIG = 1
+STOPS = (
+    signal.SIGINT,
+    signal.SIGTERM,
+)  # Ctrl-C, and some service managers, reach all processes of the server
 # Prepared in advance, for the case that no memory is left to build an answer.
 NOTHING_LEFT: bytes = msgpack.packb(
     ["failed", "MemoryError: too little memory is left for an answer", 0.0, None, [], True, False, "", True]
@@ -51,7 +55,7 @@ def work(parent: int, pipe_fd: int, flag: int, setup: Setup) -> None:
 
     Its first message says why it cannot start, and with which traceback; both are empty if it is ready.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes
+    outlive_stops()
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)  # the parent died before the line above
@@ -77,6 +81,17 @@ def work(parent: int, pipe_fd: int, flag: int, setup: Setup) -> None:
     while (call := _receive(pipe)) is not None:
         pipe.sendall(_answer(call, store, Path(setup.folder), wanted=lambda: not stop[0], run=run))
         del call  # free its memory before the next one comes
+
+
+def outlive_stops() -> None:
+    """End with the pipe and not by STOPS, which the server has blocked: its drain still needs this worker.
+
+    They are not ignored, as programs that a task starts would then ignore them too.
+    """
+    for number in STOPS:
+        signal.signal(number, lambda *_: None)
+        os.register_at_fork(after_in_child=partial(signal.signal, number, signal.SIG_DFL))
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
 
 
 def limit_memory(bytes_max: int) -> None:

@@ -5,7 +5,7 @@ The records are made in `offloader`.
 
 import logging
 from collections.abc import Iterator
-from typing import Generic, TypeVar
+from typing import Any
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
@@ -22,8 +22,6 @@ SECONDS_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0,
 GONE_MAX = 16  # servers that have left, of which metrics are kept
 
 log = logging.getLogger(__name__)
-
-M = TypeVar("M", Counter, Gauge, Histogram)
 
 
 class Metrics:
@@ -42,8 +40,7 @@ class Metrics:
         about, labels = "Executions by site and outcome", [*site, "outcome"]
         self._executions = _ByLabels(Counter("offboard_robot_executions", about, labels, registry=r))
         about, name = "Seconds that the caller waited", "offboard_robot_wait_seconds"
-        waits = Histogram(name, about, ["kind"], buckets=SECONDS_BUCKETS, registry=r)
-        self._waited = _ByLabels(waits)
+        self._waited = _ByLabels(Histogram(name, about, ["kind"], buckets=SECONDS_BUCKETS, registry=r))
         about = "Last prediction, in seconds"
         self._predicted = _ByLabels(Gauge("offboard_robot_predicted_seconds", about, site, registry=r))
         about = "Answers, by whether their time was inside the 90 % interval of the prediction"
@@ -56,6 +53,8 @@ class Metrics:
         self._duplicates = _ByLabels(Counter(name, about, ["kind"], registry=r))
         about = "1 if the last task of this kind could use the site; 0 if it was silent or absent"
         self._usable = _ByLabels(Gauge("offboard_robot_site_usable", about, site, registry=r))
+        counted = self._tasks, self._executions, self._interval, self._decisions
+        self._by_site = (*counted, self._predicted, self._usable)
         self._sites: set[str] = set()  # of the last record
         self._gone: dict[str, None] = {}  # the oldest first
         self._regret = _LatestRegret()
@@ -92,16 +91,14 @@ class Metrics:
         for site in sites:
             self._gone.pop(site, None)
         self._sites = sites
-        for (_, site), usable in self._usable.items():
-            if site in self._gone:
-                usable.set(0)
+        for labels in self._usable:
+            if labels[1] in self._gone:
+                self._usable[labels].set(0)
         while len(self._gone) > GONE_MAX:
             oldest = next(iter(self._gone))
             del self._gone[oldest]
-            for metric in (self._tasks, self._executions, self._interval, self._decisions):
+            for metric in self._by_site:
                 metric.forget(oldest)
-            for gauge in (self._predicted, self._usable):
-                gauge.forget(oldest)
 
     def _judge(self, record: Record, execution: Execution) -> None:
         """Count whether the time was inside its interval. A run without an answer has no time to compare."""
@@ -126,13 +123,13 @@ class Metrics:
             self._port.close()
 
 
-class _ByLabels(dict[tuple[str, ...], M], Generic[M]):
+class _ByLabels(dict[tuple[str, ...], Any]):
     """The metrics of a family by their labels. To find one there takes most of the time of counting."""
 
-    def __init__(self, family: M) -> None:
+    def __init__(self, family: Any) -> None:
         self._family = family
 
-    def __missing__(self, labels: tuple[str, ...]) -> M:
+    def __missing__(self, labels: tuple[str, ...]) -> Any:
         found = self[labels] = self._family.labels(*labels)
         return found
 

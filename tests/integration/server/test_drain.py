@@ -1,5 +1,6 @@
 """How a server stops."""
 
+import os
 import signal
 from pathlib import Path
 
@@ -62,6 +63,31 @@ def test_sigterm_lets_the_running_task_finish(folder: Path, join: Join, pipe: Pa
     code, rest = command.end(0)
     assert (code, "every accepted request was answered" in rest) == (0, True)
     assert "Traceback" not in rest
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_for_all_processes_leaves_the_workers_alive(
+    folder: Path, join: Join, pipe: Path, number: int
+) -> None:
+    """Ctrl-C in a terminal and some service managers signal the workers too: tasks are answered first."""
+    command = Command(folder, "--executor", "processes", "--workers", "1")
+    peer = join(command.endpoint)
+    peer.request(1, "served_pipe", str(pipe))
+    peer.request(2, "served_count")
+    until(lambda: httpx.get(f"{command.http}/health").json()["queue_depth"] == 1)
+    for pid in children(command.process.pid):
+        os.kill(pid, number)
+    command.process.send_signal(number)
+    until(lambda: httpx.get(f"{command.http}/ready").status_code == 503)
+    pipe.write_text("the answer")
+    assert [(reply.id, reply.status) for reply in (peer.reply(), peer.reply())] == [(1, "ok"), (2, "ok")]
+    assert command.end(0)[0] == 0
+
+
+def children(pid: int) -> list[int]:
+    """The processes that its threads have started."""
+    found = Path(f"/proc/{pid}/task").glob("*/children")
+    return [int(child) for one in found for child in one.read_text().split()]
 
 
 def test_a_hanging_task_does_not_delay_the_exit(folder: Path, join: Join, pipe: Path) -> None:
