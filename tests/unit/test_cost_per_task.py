@@ -55,7 +55,9 @@ def test_servers_and_money_follow_from_figures_and_prices(
 def test_the_page_shows_what_the_program_prints(capsys: pytest.CaptureFixture[str]) -> None:
     """The tables of docs/scale.md are those of its command and of the measured figures in the repository."""
     page = (ROOT / "docs" / "scale.md").read_text()
-    (command,) = re.findall(r"^python -m benchmarks.cost_per_task benchmarks/(.*)$", page, re.MULTILINE)
+    (command,) = re.findall(
+        r"^\.venv/bin/python -m benchmarks.cost_per_task benchmarks/(.*)$", page, re.MULTILINE
+    )
     name, *flags = command.split()
     assert main([str(ROOT / "benchmarks" / name), *flags]) == 0
     printed = rows(capsys.readouterr().out)
