@@ -49,7 +49,7 @@ def failing(scenario: Scenario) -> dict[str, list[str]]:
 
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_every_check_names_what_it_fails_with(name: str) -> None:
-    """Every check fails with a policy or a broken part, or notes why with none; lost and wrong are checked."""
+    """Every check fails with a policy or a broken part, or notes why not; lost and wrong ones are checked."""
     scenario = read_scenario(find_scenario(name))
     assert failing(scenario).keys() <= {*policies.names(), *BREAKS}
     assert [str(check) for check in scenario.checks if not check.fails_with and not check.note] == []
