@@ -20,7 +20,7 @@ from offboard.common.wire.blobs import StoredBlob
 
 # How Ray behaves in a server; it reads this when it is imported.
 RAY_SETTINGS = {
-    # Without its head for so many seconds, Ray ends the process. The server must go on instead.
+    # Ray ends this process if the head is away for this many seconds. The server must go on instead.
     "RAY_gcs_rpc_server_reconnect_timeout_s": str(10 * 365 * 24 * 3600),
     "RAY_DISABLE_FAILURE_SIGNAL_HANDLER": "1",  # SIGTERM is for the server, which then drains
     "RAY_ENABLE_AUTO_CONNECT": "0",  # no call starts a cluster of its own

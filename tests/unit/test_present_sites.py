@@ -105,7 +105,7 @@ def test_a_long_task_ends_with_its_list_but_not_with_a_trial() -> None:
 
 
 def test_a_server_that_returns_while_it_has_tasks_keeps_its_connection() -> None:
-    """There is never a second connection beside the first one, whose tasks could not be told apart."""
+    """One server never has two connections at once, because the tasks on them could not be told apart."""
     world = World("a")
     before = world.sites["a"]
     world.sites.in_flight = lambda _: 1

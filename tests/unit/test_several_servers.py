@@ -1,4 +1,4 @@
-"""Scenarios with several servers: how they are written, what events change, and what is told of them."""
+"""Scenarios with several servers: their format, their events, and the figures of each server."""
 
 from collections.abc import Callable
 from pathlib import Path
