@@ -7,6 +7,7 @@ import contextlib
 import gc
 import logging
 import multiprocessing
+import signal
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -100,13 +101,18 @@ class Shard:
 
 
 class ShardProcess:
-    """A shard in a process of its own."""
+    """A shard in a process of its own, which ends with its pipe."""
 
     def __init__(self, settings: ShardSettings) -> None:
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, settings), daemon=True)
-        self._process.start()
+        # Ctrl-C reaches all processes of a terminal. A child keeps the signals that are blocked at its start.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self._process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()
 
     def begin(self, messages: Sequence[ToRobot], until_s: float) -> None:
