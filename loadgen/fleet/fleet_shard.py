@@ -7,7 +7,6 @@ import contextlib
 import gc
 import logging
 import multiprocessing
-import signal
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from offboard.common.errors import OffloadError
 from offboard.loadgen.fleet.fleet_messages import ToRobot, ToServer
 from offboard.loadgen.fleet.fleet_robot import Common, Done, FleetNoise, FleetRobot, server_of
 from offboard.loadgen.fleet.fleet_settings import FleetConfig
+from offboard.loadgen.simulation.child_processes import end_quietly, starting
 from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks
 from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
 
@@ -101,18 +101,14 @@ class Shard:
 
 
 class ShardProcess:
-    """A shard in a process of its own, which ends with its pipe."""
+    """A shard in a process of its own."""
 
     def __init__(self, settings: ShardSettings) -> None:
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, settings), daemon=True)
-        # Ctrl-C reaches all processes of a terminal. A child keeps the signals that are blocked at its start.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
+        with starting():
             self._process.start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()
 
     def begin(self, messages: Sequence[ToRobot], until_s: float) -> None:
@@ -143,6 +139,7 @@ class ShardProcess:
 
 def _serve(pipe: Connection, settings: ShardSettings) -> None:
     """Move a shard on until the other side closes the pipe."""
+    end_quietly()
     threading.current_thread().name = "fleet"
     shard = Shard(settings)
     while True:

@@ -13,6 +13,7 @@ from offboard.loadgen.play.run_files import ROBOT_SEED_STEP
 from offboard.loadgen.progress import progress
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.scenario import Scenario, Workload
+from offboard.loadgen.simulation.child_processes import end_quietly, starting
 from offboard.loadgen.simulation.model.simulated_tasks import OTHERS_TASKS_MAX, RobotTasks, find_tasks
 from offboard.loadgen.simulation.simulated_run import simulate
 from offboard.loadgen.testbed.testbed import ROBOT
@@ -32,7 +33,7 @@ class SimulationPool:
         if self._jobs > 1:
             # A planner that was compiled in this process does not survive a fork.
             context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(self._jobs, context, initializer=_silence)
+            self._pool = ProcessPoolExecutor(self._jobs, context, initializer=_begin_child)
         _silence()
         return self
 
@@ -43,7 +44,10 @@ class SimulationPool:
 
     def map(self, do: Callable[..., Any], *units: Sequence[Any]) -> Iterator[Any]:
         """The built-in `map`, on all processes."""
-        return self._pool.map(do, *units) if self._pool else map(do, *units)
+        if self._pool is None:
+            return map(do, *units)
+        with starting():  # the pool starts its processes with the first units
+            return self._pool.map(do, *units)
 
     def play(self, scenarios: Sequence[Scenario], strategies: Mapping[str, Any]) -> dict[str, list[Outcome]]:
         """Play every scenario with every strategy; the scenarios differ only in their seed.
@@ -84,6 +88,11 @@ class SimulationPool:
             name: self._known[_key(workload, seed)].first(workload.tasks)
             for name, (workload, seed) in robots.items()
         }
+
+
+def _begin_child() -> None:
+    end_quietly()
+    _silence()
 
 
 def _silence() -> None:

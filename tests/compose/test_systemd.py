@@ -1,6 +1,7 @@
 """The units of deploy/systemd under a real systemd, installed by the commands of docs/deployment.md."""
 
 import json
+import os
 import re
 import subprocess
 from collections.abc import Callable, Iterator
@@ -102,6 +103,8 @@ def run(engine: None) -> Iterator[Callable[..., str]]:  # noqa: ARG001 - skips w
         try:
             until(lambda: script("systemctl is-system-running", check=False) in STARTED, "systemd runs")
         except AssertionError:
+            if os.environ.get("CI") == "true":
+                raise
             pytest.skip("systemd does not start in a container of this machine")
         yield script
     finally:

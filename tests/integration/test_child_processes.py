@@ -1,0 +1,57 @@
+"""Commands that compute in several processes, in which Ctrl-C arrives."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from offboard.common.command_line import INTERRUPTED_EXIT
+from tests.curves import until
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(90)]
+
+JOBS = 2
+COMMANDS = {
+    "fleet": ["fleet", "--robots", "5000", "--out"],
+    "compare": ["compare", "calm", "outage", "--simulate", "--seeds", "100", "--out"],
+}
+# CPU time of each process: it imports its modules, or it computes.
+IMPORTING_S, COMPUTING_S = 0.05, 2.0
+
+
+def children(command: int) -> list[Path]:
+    """The folders in /proc of the processes that compute for a command."""
+    found = Path(f"/proc/{command}/task/{command}/children").read_text().split()
+    return [
+        Path("/proc", one) for one in found if b"spawn_main" in Path("/proc", one, "cmdline").read_bytes()
+    ]
+
+
+def cpu_s(process: Path) -> float:
+    used = (process / "stat").read_text().rpartition(")")[2].split()[11:13]
+    return sum(map(int, used)) / os.sysconf("SC_CLK_TCK")
+
+
+@pytest.mark.parametrize("after_s", [IMPORTING_S, COMPUTING_S])
+@pytest.mark.parametrize("name", COMMANDS)
+def test_ctrl_c_ends_all_processes_with_one_line(name: str, after_s: float, tmp_path: Path) -> None:
+    """The signal reaches all processes, as in a terminal; only the command itself says so."""
+    with subprocess.Popen(
+        [sys.executable, "-m", "offboard.loadgen", *COMMANDS[name], str(tmp_path), "--jobs", str(JOBS)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    ) as command:
+        try:
+            until(lambda: sum(cpu_s(one) >= after_s for one in children(command.pid)) == JOBS)
+            os.killpg(command.pid, signal.SIGINT)
+            said = command.communicate(timeout=30)[1]
+        finally:
+            command.kill()
+    assert command.returncode == INTERRUPTED_EXIT, said
+    assert said == f"loadgen {name}: interrupted\n"
