@@ -111,6 +111,10 @@ def _quality(run: Outcome) -> float | None:
     return sum(known) / len(known) if known else None
 
 
+def _cost(run: Outcome) -> float | None:
+    return float(run.costing.over(np.array(run.costs()))) if run.answered else None
+
+
 def _overhead_ms(run: Outcome) -> float | None:
     known = [one.overhead_s for one in run.answered if one.overhead_s is not None]
     return 1e3 * statistics.median(known) if known else None
@@ -154,6 +158,12 @@ FIGURES: dict[str, Figure] = {
     "p99_ms": Figure("ms", "99 % of the tasks are answered within this time", _quantile_ms(99)),
     "late_percent": Figure("%", "tasks answered after their deadline", _percent(_late), "deadline_ms"),
     "quality": Figure("of 1", "mean quality of the variants that answered", _quality),
+    "cost": Figure(
+        "per task",
+        "what the robot's objective makes small: mean seconds, P95 in seconds, share of late tasks, or mean"
+        " seconds with the worth of joules and megabytes",
+        _cost,
+    ),
     SHARE: Figure(
         "%", "share of the servers in the tasks that were sent to one site", _percent(_in_the_cloud)
     ),

@@ -16,6 +16,7 @@ from offboard.loadgen.scenario.interval_coverage import intervals_of, late_secon
 from offboard.loadgen.scenario.outcome import Answered, Outcome, Reference
 from offboard.loadgen.scenario.outcome_files import is_probed
 from offboard.loadgen.scenario.scenario import Scenario
+from offboard.loadgen.scenario.task_cost import late_executions, spent_of
 from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks
 from offboard.loadgen.simulation.model.stepped_offloader import SteppedOffloader
 from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
@@ -52,12 +53,12 @@ def simulate(
     run = _Run(scenario, tasks, noise, trace)
     with run.offload:
         run.play()
-    deadline_ms = scenario.workload.deadline_ms
     return Outcome(
         asked={ROBOT: scenario.workload.tasks},
         answered=run.answered(),
         references=run.references,
-        deadline_s=None if deadline_ms is None else deadline_ms / 1e3,
+        deadline_s=scenario.workload.deadline_s,
+        costing=scenario.costing(),
     )
 
 
@@ -91,7 +92,12 @@ class _Run:
         robot = scenario.robot
         policy, predictor = robot.names()
         settings = Settings(
-            predictor=predictor, window=robot.window, heartbeats=robot.heartbeats, seed=scenario.seed
+            predictor=predictor,
+            window=robot.window,
+            heartbeats=robot.heartbeats,
+            objective=scenario.objective(),
+            energy=robot.energy(),
+            seed=scenario.seed,
         )
         heartbeat_s = heartbeat.EVERY_S if settings.beats(policy) else 0.0
         self._testbed = SimulatedTestbed(scenario, tasks, self._clock, heartbeat_s=heartbeat_s, noise=noise)
@@ -165,6 +171,7 @@ class _Run:
     def answered(self) -> list[Answered]:
         """All tasks, each with the runs that ended after the task itself."""
         late = late_seconds(ended.line for ended in self._ended)
+        ended_late = late_executions(ended.line for ended in self._ended)
         return [
             Answered(
                 i=ended.number,
@@ -178,6 +185,7 @@ class _Run:
                 sites=tuple(execution["site"] for execution in ended.line["executions"]),
                 intervals=intervals_of(ended.line, late),
                 probed=is_probed(ended.line),
+                spent=spent_of(ended.line, ended_late),
             )
             for ended in self._ended
         ]
