@@ -119,7 +119,9 @@ class SiteMemory:
         if condition.silent:
             seconds = max(seconds, timeout_s)
         low_s, high_s = self._conformal.interval(seconds, found.spread_s) or (None, None)
-        joules, errors, quality = self._joules(seconds, moved), self._conformal.errors, self._quality
+        energy, errors, quality = self._energy, self._conformal.errors, self._quality
+        onboard_s = self._cpu_s.value or seconds
+        joules = energy.onboard_j(onboard_s) if self._site == ONBOARD else energy.remote_j(seconds, moved)
         cost = self._objective.cost(Expected(seconds, found.spread_s, joules, quality, moved), errors)
         # All fields in their order: with keywords, it takes three times as long.
         return Outlook._make((
@@ -240,7 +242,7 @@ class SiteMemory:
         if one.predicted_s is not None and one.ok:
             self._conformal.learn(one.predicted_s, one.seconds + one.waited_s)
         elif one.predicted_s is not None:
-            self._conformal.miss()
+            self._conformal.miss(one.predicted_s, one.seconds + one.waited_s)
         self._teach(one)
 
     def _teach(self, one: Observation) -> None:
@@ -261,8 +263,3 @@ class SiteMemory:
             )
         else:
             model.learn_late(number, one.seconds, moved=moved, condition=one.condition)
-
-    def _joules(self, seconds: float, moved: float) -> float:
-        if self._site == ONBOARD:
-            return self._energy.onboard_j(self._cpu_s.value or seconds)
-        return self._energy.remote_j(seconds, moved)
