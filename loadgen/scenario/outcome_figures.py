@@ -11,6 +11,7 @@ import numpy as np
 
 from offboard.loadgen.scenario.outcome import Outcome, Reading
 from offboard.loadgen.table.table_two_figures import quantile
+from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client.sites.runner import ONBOARD
 
 GROWTH_FROM = 1 / 3  # share of the run that is left out: a process needs it to reach its usual size
@@ -101,6 +102,13 @@ def _time_over_oracle(run: Outcome) -> float | None:
     return sum(one.sent_s for one in run.references) / oracle_s if oracle_s else None
 
 
+def _wait_over_oracle(run: Outcome) -> float | None:
+    waited_s = {one.i: one.response_s for one in run.answered if one.robot == ROBOT}
+    known = [one for one in run.references if one.i in waited_s]
+    oracle_s = sum(one.oracle_s for one in known)
+    return sum(waited_s[one.i] for one in known) / oracle_s if oracle_s else None
+
+
 def _regret_ms(run: Outcome) -> float | None:
     regrets = [one.sent_s - one.oracle_s for one in run.references]
     return 1e3 * sum(regrets) / len(regrets) if regrets else None
@@ -179,6 +187,13 @@ FIGURES: dict[str, Figure] = {
         "times",
         "time of the reference tasks on the chosen site, divided by their time on the faster site",
         _time_over_oracle,
+        "reference",
+    ),
+    "wait_over_oracle": Figure(
+        "times",
+        "time that the robot waited for the reference tasks, with hedges, divided by their time on the"
+        " faster site",
+        _wait_over_oracle,
         "reference",
     ),
     "regret_ms": Figure("ms", "mean time that the faster site would have saved", _regret_ms, "reference"),
