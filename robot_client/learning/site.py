@@ -122,7 +122,7 @@ class SiteMemory:
         energy, errors, quality = self._energy, self._conformal.errors, self._quality
         onboard_s = self._cpu_s.value or seconds
         joules = energy.onboard_j(onboard_s) if self._site == ONBOARD else energy.remote_j(seconds, moved)
-        cost = self._objective.cost(Expected(seconds, found.spread_s, joules, quality, moved), errors)
+        cost = self._objective.cost(Expected(seconds, found.spread_s, joules, quality, bytes=moved), errors)
         # All fields in their order: with keywords, it takes three times as long.
         return Outlook._make((
             seconds, found.spread_s, predictor.full, self.age, self._failures, len(predictor),
