@@ -30,6 +30,9 @@ from offboard.robot_client.sites import heartbeat
 from offboard.robot_client.sites.runner import ONBOARD
 
 
+HEARD_S = 1.0  # from connecting to the first task: a real robot has heard from its servers by then
+
+
 @dataclass(frozen=True, slots=True)
 class SimulatedReference(Reference):
     """The time that each site alone would have taken for a task, and the time that the robot waited."""
@@ -117,6 +120,7 @@ class _Run:
         self._play_events()
         self._testbed.begin()
         if self._scenario.workload.arrivals == CLOSED:
+            self._clock.pass_by(HEARD_S)
             for number in range(self._scenario.workload.tasks):
                 self._offload(number, self._clock.now_s())
         else:
