@@ -29,7 +29,6 @@ from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites import heartbeat
 from offboard.robot_client.sites.runner import ONBOARD
 
-
 HEARD_S = 1.0  # from connecting to the first task: a real robot has heard from its servers by then
 
 
