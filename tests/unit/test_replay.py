@@ -239,7 +239,7 @@ def test_window_and_predictor_are_those_of_the_run(
 
     def caption(**settings: Any) -> str:
         assert run_replay(path, ReplayConfig(policies=("paper",), **settings)) == 0
-        return capsys.readouterr().out.splitlines()[0]
+        return " ".join(capsys.readouterr().out.partition("\n\n")[0].split())
 
     own = "predictor each policy's own"
     assert f"{own}, window 50, feedback" in caption()
