@@ -11,6 +11,7 @@ from offboard.loadgen.testbed.container_part import IMAGES
 
 ASK_S = 30.0
 NONE = "none"
+WRITTEN = tuple(f":(top,exclude){folder}" for folder in ("loadgen/datasets", "docs"))
 ROOT = Path("/")
 # Devices of graphics processors: NVIDIA, any with a kernel driver, AMD compute, Jetson, Windows with WSL.
 GPU_DEVICES = ("nvidia[0-9]*", "dri/renderD*", "kfd", "nvhost-gpu", "dxg")
@@ -53,8 +54,13 @@ def gpu(root: Path) -> str:
 
 
 def commit_here() -> str | None:
-    """The commit of the checkout in the current folder, marked `-dirty` if files were changed."""
-    return output_of(("git", "describe", "--always", "--dirty", "--abbrev=12"))
+    """The commit of the checkout in the current folder, marked `-dirty` if files were changed.
+
+    Files that a measurement writes do not count: datasets and figures.
+    """
+    commit = output_of(("git", "describe", "--always", "--abbrev=12"))
+    changed = ("git", "status", "--porcelain", "--untracked-files=no", "--", ":/")
+    return f"{commit}-dirty" if commit and output_of((*changed, *WRITTEN)) else commit
 
 
 def output_of(command: Sequence[str]) -> str | None:
