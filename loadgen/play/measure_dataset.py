@@ -1,4 +1,4 @@
-"""`loadgen dataset`: measures the plans of a scenario on both sites and records how they were measured.
+"""`loadgen dataset`: measures the tasks of a scenario on both sites and records how they were measured.
 
 NAME.csv holds the rows; NAME.json holds machine, Table I, settings, commit, disturbance and CPU use.
 """
@@ -38,9 +38,9 @@ class DatasetConfig:
     testbed: str = setting(
         "docker", "where to measure: in local processes or in Docker containers", choices=tuple(TESTBEDS)
     )
-    rows: int = setting(1000, "number of plans; each runs on both sites", minimum=1)
+    rows: int = setting(1000, "number of tasks; each runs on both sites", minimum=1)
     alone: int = setting(
-        100, "number of extra plans that measure how much the two sites disturb each other", minimum=0
+        100, "number of extra tasks that measure how much the two sites disturb each other", minimum=0
     )
     seed: int | None = setting(None, "random seed (default: the scenario's seed)", minimum=0)
 
