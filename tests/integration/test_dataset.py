@@ -8,8 +8,10 @@ from pathlib import Path
 import pytest
 
 from offboard.loadgen.replay.dataset_file import read_dataset
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.table.measured_rows import read
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED
+from tests.chaos.plays import skip_if_unplayable
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
 
@@ -65,3 +67,19 @@ def check_replay(folder: Path) -> None:
         json.loads(loadgen("replay", file, *flags, cwd=folder))["tables"][0]["scores"] for file in files
     )
     assert [line | {"same_percent": None} for line in of_trace] == of_csv
+
+
+def test_a_dataset_of_an_application_tells_its_work_and_bytes(tmp_path: Path) -> None:
+    """Scans of different sizes send different bytes; work and parts of both times are there."""
+    skip_if_unplayable(read_scenario(find_scenario("registration")))
+    loadgen(
+        *("dataset", "registration", "--testbed", "local", "--rows", "8", "--alone", "1"),
+        *("--out", str(tmp_path), "--run", str(tmp_path / "run")),
+    )
+    tasks = read_dataset(tmp_path / "registration.csv")
+    assert len(tasks) == len({task.size for task in tasks}) == 8
+    assert all(task.work and task.runs[CLOUD].network_s for task in tasks)
+    by_size = sorted(tasks, key=lambda task: task.size)
+    sent = [task.sendings[CLOUD].bytes for task in by_size]
+    assert sent == sorted(sent)
+    assert sent[0] < sent[-1]
