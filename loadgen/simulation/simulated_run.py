@@ -89,6 +89,7 @@ class _Run:
         self._scenario = scenario
         self._clock = VirtualClock()
         self._timeline = Timeline(scenario.timeline())
+        self._zero_s = HEARD_S if scenario.workload.arrivals == CLOSED else 0.0  # when the first task is due
         self._in_flight = 0
         self._queue: deque[tuple[int, float]] = deque()  # tasks that are due, while too many are in flight
         robot = scenario.robot
@@ -115,11 +116,11 @@ class _Run:
 
     def play(self) -> None:
         for at_s in {event.at_s for event in self._timeline.left() if event.at_s is not None}:
-            self._clock.at(at_s, self._play_events)
+            self._clock.at(self._zero_s + at_s, self._play_events)
         self._play_events()
         self._testbed.begin()
         if self._scenario.workload.arrivals == CLOSED:
-            self._clock.pass_by(HEARD_S)
+            self._clock.pass_by(self._zero_s)
             for number in range(self._scenario.workload.tasks):
                 self._offload(number, self._clock.now_s())
         else:
@@ -154,7 +155,7 @@ class _Run:
 
     def _play_events(self) -> None:
         """Make all events happen that are due."""
-        for event in self._timeline.due(self._clock.now_s(), len(self._ended)):
+        for event in self._timeline.due(self._clock.now_s() - self._zero_s, len(self._ended)):
             self._testbed.happen(event)
 
     def _offload(self, number: int, due_s: float) -> None:
@@ -179,8 +180,8 @@ class _Run:
             Answered(
                 i=ended.number,
                 robot=ROBOT,
-                due_s=ended.due_s,
-                ended_s=ended.ended_s,
+                due_s=ended.due_s - self._zero_s,
+                ended_s=ended.ended_s - self._zero_s,
                 error=None,
                 answer=None,
                 chosen=ended.line["decision"]["site"],
