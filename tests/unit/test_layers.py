@@ -134,7 +134,7 @@ OWNERS = {
     "PIL": {"common/planning/map_files.py", "loadgen/map_picture.py"},
     "yaml": {"common/planning/map_files.py"},
     "matplotlib": {"loadgen/report/chart_parts.py"},
-    "sklearn": {"loadgen/rivals/random_forest.py"},
+    "sklearn": {"loadgen/rivals/k_means.py", "loadgen/rivals/random_forest.py"},
     "statsmodels": {"loadgen/rivals/arima.py"},
     "threadpoolctl": {"loadgen/rivals/arima.py"},
     "torch": {"loadgen/rivals/lstm.py"},

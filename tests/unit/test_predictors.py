@@ -19,12 +19,14 @@ NAMES = (*rivals.PREDICTORS, BAYES)
 WINDOWED = tuple(name for name in NAMES if name != predictors.PARTS)
 
 # Limits of the error on a straight line, as a share of the error of the mean time.
-GAINS = dict.fromkeys(NAMES, 0.05) | {predictors.PARTS: 0.1, "random-forest": 0.2, "lstm": 0.3}
+GAINS = dict.fromkeys(NAMES, 0.05) | {predictors.PARTS: 0.1, "random-forest": 0.2} | {"k-means": 0.2, "lstm": 0.3, "lstm-sequence": 0.3}
 EXTRAS = {  # for each predictor, the library that it needs, and the extra that installs it
+    "k-means": ("sklearn", "learned"),
     "random-forest": ("sklearn", "learned"),
     "arima": ("statsmodels", "learned"),
     "sarima": ("statsmodels", "learned"),
     "lstm": ("torch", "lstm"),
+    "lstm-sequence": ("torch", "lstm"),
     BAYES: ("river", "river"),
 }
 BASE = tuple(name for name in rivals.PREDICTORS if name not in EXTRAS)
