@@ -61,4 +61,4 @@ def clusters(count: int) -> int:
     With more clusters a step is smaller, but its mean has fewer observations; both errors are equal if k
     grows with the cube root.
     """
-    return math.ceil(2 * count ** (1 / 3))
+    return math.ceil(2 * math.cbrt(count))

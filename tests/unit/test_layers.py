@@ -59,6 +59,7 @@ FOLDERS: dict[str, set[str]] = {
     "loadgen/testbed": {"loadgen", "loadgen/relay", "loadgen/relay/link"},
     "loadgen/rivals": set(),
     "loadgen/table": {"loadgen", "loadgen/rivals"},
+    "loadgen/claims": {"loadgen", "loadgen/rivals", "loadgen/table"},
     "loadgen/replay": {"loadgen", "loadgen/rivals", "loadgen/simulation/model", "loadgen/table"},
     "loadgen/export": {"loadgen", "loadgen/play", "loadgen/robot", "loadgen/table"},
     "loadgen/scenario": {

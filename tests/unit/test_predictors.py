@@ -19,7 +19,11 @@ NAMES = (*rivals.PREDICTORS, BAYES)
 WINDOWED = tuple(name for name in NAMES if name != predictors.PARTS)
 
 # Limits of the error on a straight line, as a share of the error of the mean time.
-GAINS = dict.fromkeys(NAMES, 0.05) | {predictors.PARTS: 0.1, "random-forest": 0.2} | {"k-means": 0.2, "lstm": 0.3, "lstm-sequence": 0.3}
+GAINS = (
+    dict.fromkeys(NAMES, 0.05)
+    | {predictors.PARTS: 0.1, "random-forest": 0.2}
+    | {"k-means": 0.2, "lstm": 0.3, "lstm-sequence": 0.3}
+)
 EXTRAS = {  # for each predictor, the library that it needs, and the extra that installs it
     "k-means": ("sklearn", "learned"),
     "random-forest": ("sklearn", "learned"),
