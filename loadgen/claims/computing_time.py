@@ -33,7 +33,8 @@ def computing_time(
 
     Training is to learn the first 80 % of the onboard times and to make the first prediction, because most
     predictors fit when they are asked. In each round every predictor has its turn, so that a slow minute of
-    the machine counts for all; it is CPU time, so that other programs do not count. `step` is called after each of the ROUNDS + 1 rounds.
+    the machine counts for all. It is CPU time, so that other programs do not count. `step` is called after
+    each of the ROUNDS + 1 rounds.
     """
     split = len(rows) * 4 // 5
     if not 2 <= split < len(rows):
