@@ -1,6 +1,7 @@
 """Clusters of sizes, each with its mean time: the k-means that the paper names."""
 
 import math
+import threading
 
 import numpy as np
 
@@ -10,10 +11,14 @@ from offboard.robot_client.predictors.base import Prediction
 
 try:
     from sklearn.cluster import KMeans
+    from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
 except ImportError as error:
     raise MissingExtra("predictor k-means", "learned") from error
 
 REFIT_SHARE = 10  # as of the random forest
+FITTING = threading.Lock()  # a fit changes the number of threads of the whole process, and restores it
+# With several threads, a fit took 20 times as long: they wait for each other.
+THREADS = ThreadpoolController()
 
 
 class KMeansOfSizes(Refitted):
@@ -33,7 +38,8 @@ class KMeansOfSizes(Refitted):
         self._range = float(sizes.max()) - self._low
         places = self._places(sizes)
         count = min(clusters(len(sizes)), len(np.unique(places)))
-        found = KMeans(count, n_init=1, random_state=self.seed).fit(places[:, np.newaxis])
+        with FITTING, THREADS.limit(limits=1):
+            found = KMeans(count, n_init=1, random_state=self.seed).fit(places[:, np.newaxis])
         centres = np.sort(found.cluster_centers_.ravel())
         self._limits = (centres[1:] + centres[:-1]) / 2
         cluster = np.searchsorted(self._limits, places)

@@ -137,7 +137,7 @@ OWNERS = {
     "matplotlib": {"loadgen/report/chart_parts.py"},
     "sklearn": {"loadgen/rivals/k_means.py", "loadgen/rivals/random_forest.py"},
     "statsmodels": {"loadgen/rivals/arima.py"},
-    "threadpoolctl": {"loadgen/rivals/arima.py"},
+    "threadpoolctl": {"loadgen/rivals/arima.py", "loadgen/rivals/k_means.py"},
     "torch": {"loadgen/rivals/lstm.py"},
     "rich": {"loadgen/progress.py"},
     "river": {"loadgen/rivals/river_model.py"},

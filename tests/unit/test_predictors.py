@@ -9,9 +9,10 @@ import pytest
 
 from offboard.common.errors import ConfigError, MissingExtra
 from offboard.loadgen import rivals
-from offboard.robot_client import predictors
+from offboard.robot_client import policies, predictors
 from offboard.robot_client.predictors import Predictor
 from tests import checks
+from tests.table_loops import section
 
 ROOT = Path(__file__).parents[2]
 BAYES = "river:linear_model.BayesianLinearRegression"
@@ -85,6 +86,15 @@ def test_an_unknown_name_is_refused_with_all_names() -> None:
             refuse("theil-send")
         for part in ("'theil-send'", *names, "or MODULE.CLASS of your own"):
             assert part in str(refused.value)
+
+
+def test_the_evaluation_page_lists_every_name() -> None:
+    """Its table has a line for every predictor, and each rule of a rival is named."""
+    table = section("Predictors")
+    for listed in rivals.PREDICTORS:
+        assert f"`{listed}`" in table, listed
+    for rule in set(rivals.RULES) - set(policies.names()):
+        assert f"`{rule}`" in section("Replay"), rule
 
 
 def test_a_robot_knows_a_rival_by_its_path(name: str) -> None:
