@@ -3,28 +3,29 @@
 Only what is known before a task is an input: what is measured of its site, and the bytes that it sends.
 """
 
-import csv
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from offboard.common.errors import DataError
 from offboard.loadgen.claims.claim import Claim, claim, mean_of, ratio, unknown
 from offboard.loadgen.claims.claims_settings import ClaimsConfig
 from offboard.loadgen.claims.prediction_claims import SITES, errors_of, right
-from offboard.loadgen.table.measured_rows import Column, Rows, is_csv
+from offboard.loadgen.replay.dataset_file import FEATURES
+from offboard.loadgen.table.measured_rows import Column, Rows, is_csv, number, read_cells
 from offboard.loadgen.table.table_two_figures import Scored
 from offboard.robot_client.predictors.least_squares import LeastSquares
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 CLAIM = 7
-SENT = "_send_bytes"  # after the name of a site: what a task would send there
 
 
 def several_inputs(path: Path, rows: Rows, config: ClaimsConfig) -> Iterator[Claim]:
     """All inputs against the size alone, at 80:20: accuracy in points, and the ratio of the mean errors."""
-    inputs = read_inputs(path) if is_csv(path) else {}
-    split = len(rows) * 4 // 5
+    if not is_csv(path):
+        yield unknown(CLAIM, "several inputs", "only a dataset has inputs: loadgen export RUN --csv FILE")
+        return
+    inputs, split = read_inputs(path), len(rows) * 4 // 5
     if not inputs or not 2 <= split < len(rows):
         yield unknown(CLAIM, "several inputs", "the file has only sizes" if not inputs else "not enough rows")
         return
@@ -34,7 +35,7 @@ def several_inputs(path: Path, rows: Rows, config: ClaimsConfig) -> Iterator[Cla
     names = ", ".join(inputs)
     yield claim(CLAIM, "several inputs: accuracy points", gain, note=f"the size and {names}")
     for site in SITES:
-        if of_site(inputs, site):
+        if any(name in inputs for name in of_site(site)):
             (error_s, _), (alone_s, _) = errors_of(several, site), errors_of(alone, site)
             yield claim(
                 CLAIM, f"several inputs: {site} MAE, ratio", ratio(blocks, abs(error_s), abs(alone_s))
@@ -42,29 +43,27 @@ def several_inputs(path: Path, rows: Rows, config: ClaimsConfig) -> Iterator[Cla
 
 
 def read_inputs(path: Path) -> dict[str, Column]:
-    """The columns of a dataset that are known before a task, without those that have an empty cell."""
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        reader = csv.reader(file)
-        header = [name.strip() for name in next(reader)]
-        places = {name: at for at, name in enumerate(header) if any(of_site([name], site) for site in SITES)}
-        lines = [(reader.line_num, cells) for cells in reader if cells]
-    return {
-        name: np.array([_number(f"{path}:{line}: {name}", cells[at]) for line, cells in lines])
-        for name, at in places.items()
-        if all(cells[at].strip() for _, cells in lines)
-    }
+    """The columns of a dataset that are known before a task. An empty cell holds the last known value."""
+    names = [name for site in SITES for name in of_site(site)]
+    found: dict[str, list[float | None]] = {}
+    for where, cells in read_cells(path, names):
+        for name in filter(cells.__contains__, names):
+            text = cells[name].strip()
+            found.setdefault(name, []).append(number(where, name, text) if text else None)
+    return {name: _filled(values) for name, values in found.items() if any(one is not None for one in values)}
 
 
-def of_site(names: Iterator[str] | Sequence[str] | Mapping[str, object], site: str) -> list[str]:
-    """The inputs among these columns that say something about one site."""
-    return [name for name in names if name.startswith(f"{site}.") or name == f"{site}{SENT}"]
+def of_site(site: str) -> tuple[str, ...]:
+    """The columns that may be inputs for the time of one site."""
+    sent = (f"{site}_send_bytes",) if site != ONBOARD else ()
+    return (*(f"{site}.{name}" for name in FEATURES[site]), *sent)
 
 
 def _predicted(rows: Rows, split: int, inputs: Mapping[str, Column]) -> Scored:
     """The rows after the split, predicted by least squares on the rows before it."""
     predicted = {}
     for site in SITES:
-        columns = [rows.size, *(inputs[name] for name in of_site(inputs, site))]
+        columns = [rows.size, *(inputs[name] for name in of_site(site) if name in inputs)]
         sizes = list(zip(*(column.tolist() for column in columns), strict=True))
         line = LeastSquares(split)
         for size, seconds in zip(sizes[:split], getattr(rows, f"{site}_s").tolist(), strict=False):
@@ -75,17 +74,17 @@ def _predicted(rows: Rows, split: int, inputs: Mapping[str, Column]) -> Scored:
     return Scored(
         onboard_s=scored.onboard_s,
         cloud_s=scored.cloud_s,
-        to_cloud=predicted["cloud"] < predicted["onboard"],  # Eq. 1; a tie stays onboard
-        onboard_predicted_s=predicted["onboard"],
-        cloud_predicted_s=predicted["cloud"],
+        to_cloud=predicted[CLOUD] < predicted[ONBOARD],  # Eq. 1; a tie stays onboard
+        onboard_predicted_s=predicted[ONBOARD],
+        cloud_predicted_s=predicted[CLOUD],
     )
 
 
-def _number(where: str, text: str) -> float:
-    try:
-        number = float(text)
-    except ValueError:
-        number = -1.0
-    if not 0 <= number < np.inf:
-        raise DataError(f"{where}: {text!r} is not a finite number from 0 up")
-    return number
+def _filled(values: Sequence[float | None]) -> Column:
+    """Each unknown value is the one before; at the start, the first known one."""
+    last = next(one for one in values if one is not None)
+    filled = []
+    for one in values:
+        last = last if one is None else one
+        filled.append(last)
+    return np.array(filled)

@@ -59,9 +59,9 @@ FOLDERS: dict[str, set[str]] = {
     "loadgen/testbed": {"loadgen", "loadgen/relay", "loadgen/relay/link"},
     "loadgen/rivals": set(),
     "loadgen/table": {"loadgen", "loadgen/rivals"},
-    "loadgen/claims": {"loadgen", "loadgen/rivals", "loadgen/table"},
+    "loadgen/claims": {"loadgen", "loadgen/replay", "loadgen/rivals", "loadgen/table"},
     "loadgen/replay": {"loadgen", "loadgen/rivals", "loadgen/simulation/model", "loadgen/table"},
-    "loadgen/export": {"loadgen", "loadgen/play", "loadgen/robot", "loadgen/table"},
+    "loadgen/export": {"loadgen", "loadgen/play", "loadgen/replay", "loadgen/robot", "loadgen/table"},
     "loadgen/scenario": {
         "loadgen",
         "loadgen/relay/link",
@@ -70,7 +70,14 @@ FOLDERS: dict[str, set[str]] = {
         "loadgen/table",
         "loadgen/testbed",
     },
-    "loadgen/play": {"loadgen", "loadgen/robot", "loadgen/scenario", "loadgen/table", "loadgen/testbed"},
+    "loadgen/play": {
+        "loadgen",
+        "loadgen/replay",
+        "loadgen/robot",
+        "loadgen/scenario",
+        "loadgen/table",
+        "loadgen/testbed",
+    },
     "loadgen/simulation/model": {
         "loadgen/relay/link",
         "loadgen/robot",
