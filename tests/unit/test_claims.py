@@ -81,6 +81,13 @@ def test_every_claim_has_lines_that_fit(print_claims: Print) -> None:
     assert all(line["more"] for line in found_in(print_claims(format="json")).values())
 
 
+def test_latex_has_signs_and_words(print_claims: Print) -> None:
+    """Signs are set as in mathematics, and the words between them are not."""
+    printed = print_claims(format="latex", windows=("50",))
+    assert r"1 & cloud: p of r, all rows & $<$ 0.005 & " in printed
+    assert re.search(r"sequential - shuffled: accuracy & \$>\$ 0 & \$-[\d.]+\$ & \$-[\d.]+\$ to ", printed)
+
+
 def test_the_longest_names_fit(print_claims: Print) -> None:
     """The table with the predictor that has the longest name fits 100 columns, too."""
     printed = print_claims(predictors=("recursive-least-squares",))
