@@ -60,8 +60,7 @@ class Line:
     def learn(self, x: float, y: float, known: float = 0.0) -> None:
         """An amount `x` took `y` seconds beyond `known`."""
         self.count += 1
-        # A first run that took far longer than the second one, at any slope, was a cold start or a stall.
-        if self.count == 1 or (self.count == 2 and self._together and ODD * y < self._usual * min(1.0, x)):
+        if self.count == 1:
             self._begin(x, y, known)
             return
         rate = max(RATE, 1.0 / self.count)

@@ -252,21 +252,3 @@ def test_a_running_mean_is_plain_at_first_and_forgets_later() -> None:
     for _ in range(100):
         mean.add(10.0)
     assert mean.value == pytest.approx(10.0, rel=0.01)
-
-
-@pytest.mark.parametrize("first_x", [0.2, 1.0, 3.0])
-def test_a_first_time_that_was_a_stall_is_forgotten(first_x: float) -> None:
-    """If the second run is far shorter than any slope explains, the first one was a cold start or a stall."""
-    line = Line(together=True)
-    line.learn(first_x, 20 * (0.1 + 0.3 * first_x))
-    for x in (1.0, 1.5, 0.7, 1.2, 0.9):
-        line.learn(x, 0.1 + 0.3 * x)
-    assert line.at(1.0) == pytest.approx(0.4, rel=0.15)
-
-
-def test_a_large_first_task_is_no_stall() -> None:
-    """A small second task after a large one does not make the line forget how steep it is."""
-    line = Line(together=True)
-    line.learn(1.0, 1.0)
-    line.learn(0.1, 0.1)
-    assert line.at(1.0) == pytest.approx(1.0, rel=0.3)
