@@ -6,7 +6,6 @@ NAME.csv holds the rows; NAME.json holds machine, settings, commit, disturbance 
 import json
 import os
 import platform
-import subprocess
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -15,14 +14,13 @@ from typing import Any
 
 from offboard.common import VERSION
 from offboard.common.config import check, setting
+from offboard.loadgen.play.code_commit import commit_here, output_of
 from offboard.loadgen.play.play_scenario import TESTBEDS, play
 from offboard.loadgen.play.run_files import TRACE
 from offboard.loadgen.scenario.scenario import Scenario, Workload
 from offboard.loadgen.scenario.scenario_file import check_calls, find_scenario, read_scenario
 from offboard.loadgen.table.measured_rows import write_csv, write_whole
 from offboard.loadgen.table.measurement_notes import disturbance, read_noted
-
-ASK_S = 10
 
 
 @dataclass(frozen=True)
@@ -110,7 +108,7 @@ def _machine(testbed: str) -> dict[str, Any]:
         "python": platform.python_version(),
     }
     if testbed == "docker":
-        machine["docker"] = _output_of(("docker", "version", "--format", "{{.Server.Version}}"))
+        machine["docker"] = output_of(("docker", "version", "--format", "{{.Server.Version}}"))
     return machine
 
 
@@ -122,17 +120,3 @@ def _cpu_model() -> str:
         lines = []
     models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return next(models, platform.machine())
-
-
-def commit_here() -> str | None:
-    """The commit of the checkout in the current folder, marked `-dirty` if files were changed."""
-    return _output_of(("git", "describe", "--always", "--dirty", "--abbrev=12"))
-
-
-def _output_of(command: Sequence[str]) -> str | None:
-    """What a command printed; None if it failed or printed nothing."""
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=ASK_S, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return done.stdout.strip() or None
