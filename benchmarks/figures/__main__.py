@@ -5,6 +5,7 @@ call it again later or on another machine. The files are up to date if no code w
 """
 
 import os
+import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -70,7 +71,7 @@ def _measure(units: Sequence[Unit], commit: str) -> int:
         _say(f"{number} of {len(units)}: {unit.name}, about {unit.step.minutes:g} minutes")
         try:
             measured = measure(unit, commit)
-        except (OffloadError, OSError) as error:
+        except (OffloadError, OSError, subprocess.SubprocessError) as error:
             failed.append(f"{unit.name} is not measured: {error}")
             _say(failed[-1])
             continue

@@ -48,7 +48,7 @@ class MarkdownTable:
         return table.chosen({}, [one for one in self.headings if one != BOUND])
 
     def pivoted(self, column: str, cell: str) -> "MarkdownTable":
-        """One row for each first cell, one column for each value of `column`; the cells are those of `cell`."""
+        """A row for each first cell, a column for each value of `column`, and in it the values of `cell`."""
         first, at, value = 0, self.headings.index(column), self.headings.index(cell)
         columns = list(dict.fromkeys(row[at] for row in self.rows))
         cells = {(row[first], row[at]): row[value] for row in self.rows}

@@ -60,6 +60,7 @@ def measure(unit: Unit, commit: str) -> Measured:
     """Run the commands of a step, copy its pictures and return what it printed; OffloadError if one fails."""
     for target in unit.step.ready:
         _build(target)
+    here = machine(_environment(unit.step))
     reads, stolen, began = unit.reads(ROOT), StolenCpuTime(), time.monotonic()
     date, output = f"{datetime.now(UTC):%Y-%m-%d}", ""
     for command in unit.commands():
@@ -74,7 +75,7 @@ def measure(unit: Unit, commit: str) -> Measured:
     return Measured(
         commit=commit,
         date=date,
-        machine=machine(_environment(unit.step)),
+        machine=here,
         stolen_percent=None if percent is None else round(percent, 1),
         commands=unit.commands(),
         reads=reads,
@@ -103,17 +104,27 @@ def read_all(units: Sequence[Unit], root: Path = ROOT) -> dict[str, Measured]:
 
 
 def machine(environment: Mapping[str, str]) -> dict[str, str | int | float]:
-    """The machine and the Python of an environment."""
-    code = "import platform; print(platform.python_version())"
+    """The machine and the Python of an environment; OffloadError if it runs the code of another checkout."""
+    code = "import platform, offboard; print(platform.python_version(), offboard.__file__)"
     python = shutil.which("python", path=environment["PATH"]) or "python"
-    version = subprocess.run([python, "-c", code], capture_output=True, text=True, check=True, timeout=END_S)
+    asked = subprocess.run(  # -P: what a program of the environment imports, whatever the folder
+        [python, "-P", "-c", code],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=END_S,
+    )
+    version, module = asked.stdout.strip().split(maxsplit=1)
+    if not Path(module).is_relative_to(ROOT):
+        raise OffloadError(f"{python} runs the code of {Path(module).parents[1]}")
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return {
         "cpu": processor(),
         "cores": os.cpu_count() or 1,
         "memory_gib": round(memory / 2**30, 1),
         "kernel": platform.release(),
-        "python": version.stdout.strip(),
+        "python": version,
     }
 
 

@@ -5,14 +5,16 @@ What is between them comes from the first table of the step, and only rows with 
 """
 
 import re
+import textwrap
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from benchmarks.figures.markdown_tables import MarkdownTable, blocks_of, joined, notes_of, tables_of
 from benchmarks.figures.measured import Measured
-from benchmarks.figures.step import Section, Step, Unit, units_of
+from benchmarks.figures.step import PART, Section, Step, Unit, units_of
 from offboard.common.errors import DataError
+from offboard.loadgen.table.table_columns import WIDTH
 
 RESULTS = Path("docs/results.md")
 BLOCK = re.compile(r"<!-- figure: (?P<what>[^\n]*?) -->\n(?P<shown>.*?)<!-- end -->", re.DOTALL)
@@ -156,9 +158,13 @@ def _section(step: Step, files: Mapping[str, Measured]) -> Iterator[str]:
 
 def _commands(step: Step) -> Iterator[str]:
     for command in step.run:
-        yield command.replace("{part}", "NAME")
+        yield " \\\n  ".join(_wrapped(command.replace(PART, "NAME"), WIDTH - 4))
     if step.parts:
-        yield f"# NAME: {', '.join(step.parts)}"
+        yield from (f"# {line}" for line in _wrapped(f"NAME: {', '.join(step.parts)}", WIDTH - 2))
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    return textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False)
 
 
 def _output(step: Step, one: Measured) -> Iterator[str]:
