@@ -66,6 +66,7 @@ def _run(argv: Sequence[str]) -> int:
 
 def _measure(units: Sequence[Unit], commit: str) -> int:
     """Measure one after the other. A step that fails leaves its older file; the others go on."""
+    write_pages()  # an error in a page is better known before than after hours
     failed = []
     for number, unit in enumerate(units, 1):
         _say(f"{number} of {len(units)}: {unit.name}, about {unit.step.minutes:g} minutes")

@@ -29,6 +29,7 @@ BUILD_S = 3600.0
 OUTPUT_MAX = 1_000_000  # characters
 SAID_LINES = 3  # of a command that failed
 LOGS = Path("out/figures")
+OTHER_ROWS = "of rows that were measured again since"
 
 
 @dataclass(frozen=True)
@@ -92,9 +93,16 @@ def why_old(unit: Unit, measured: Measured | None, commit: str) -> str:
         return f"of commit {measured.commit}"
     if list(measured.commands) != unit.commands():
         return "of other commands"
-    if {name: about["sha256"] for name, about in measured.reads.items()} != _digests(unit):
-        return "of other rows"
-    return ""
+    return OTHER_ROWS if of_other_rows(unit, measured) else ""
+
+
+def of_other_rows(unit: Unit, measured: Measured) -> bool:
+    """Whether the rows that a step read have changed since."""
+    try:
+        now = {name: about["sha256"] for name, about in unit.reads(ROOT).items()}
+    except OffloadError:
+        return True
+    return now != {name: about["sha256"] for name, about in measured.reads.items()}
 
 
 def read_all(units: Sequence[Unit], root: Path = ROOT) -> dict[str, Measured]:
@@ -126,13 +134,6 @@ def machine(environment: Mapping[str, str]) -> dict[str, str | int | float]:
         "kernel": platform.release(),
         "python": version,
     }
-
-
-def _digests(unit: Unit) -> dict[str, str]:
-    try:
-        return {name: about["sha256"] for name, about in unit.reads(ROOT).items()}
-    except OffloadError:
-        return {}
 
 
 def _environment(step: Step) -> dict[str, str]:

@@ -1,7 +1,8 @@
 """The pages: docs/results.md as a whole, and the marked blocks of other pages, from the files of the steps.
 
 A block is a line `<!-- figure: NAME | COLUMN: CELL, .. | show: COLUMN, .. -->` and a line `<!-- end -->`.
-What is between them comes from the first table of the step, and only rows with these cells are shown.
+What is between them comes from the first table of the step, or of its part with NAME/PART, and only rows with
+these cells are shown.
 """
 
 import re
@@ -11,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from benchmarks.figures.markdown_tables import MarkdownTable, blocks_of, joined, notes_of, tables_of
-from benchmarks.figures.measured import Measured
+from benchmarks.figures.measured import OTHER_ROWS, Measured, of_other_rows
 from benchmarks.figures.step import PART, Section, Step, Unit, units_of
 from offboard.common.errors import DataError
 from offboard.loadgen.table.table_columns import WIDTH
@@ -70,10 +71,11 @@ def _block(what: str, page: Path, steps: Mapping[str, Step], files: Mapping[str,
     name, *filters = (one.strip() for one in what.split("|"))
     where = {key.strip(): cells for key, cells in map(_filter, filters)}
     shown = where.pop(SHOW, ())
-    if name not in steps:
-        raise DataError(f"{page}: <!-- figure: {name} -->: there is no such step")
+    name, _, part = name.partition("/")
+    if name not in steps or (part and part not in steps[name].parts):
+        raise DataError(f"{page}: <!-- figure: {what} -->: there is no such step")
     step = steps[name]
-    there = _there(step, files)
+    there = {unit: one for unit, one in _there(step, files).items() if part in ("", unit.part)}
     if not there:
         return [NOT_YET]
     link = f"{RESULTS.name if page.parent == RESULTS.parent else RESULTS}#{_anchor(step.title)}"
@@ -81,7 +83,7 @@ def _block(what: str, page: Path, steps: Mapping[str, Step], files: Mapping[str,
     try:
         return [*_table(step, there).chosen(where, shown).lines(), "", *conditions]
     except DataError as error:
-        raise DataError(f"{page}: <!-- figure: {name} -->: {error}") from None
+        raise DataError(f"{page}: <!-- figure: {what} -->: {error}") from None
 
 
 def _filter(text: str) -> tuple[str, list[str]]:
@@ -117,7 +119,9 @@ def _commits(sections: Sequence[Section], files: Mapping[str, Measured]) -> Iter
     yield f"**{len(same)} of {len(units)} measurements are of commit {commit}** ({_span(same)})."
     others: dict[str, list[Unit]] = {}
     for unit, one in there:
-        if one.commit != commit:
+        if of_other_rows(unit, one):
+            others.setdefault(OTHER_ROWS, []).append(unit)
+        elif one.commit != commit:
             others.setdefault(f"of commit {one.commit}", []).append(unit)
     missing = [unit for unit in units if unit.name not in files]
     for why, some in (*others.items(), ("not measured yet", missing)):
