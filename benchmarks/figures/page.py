@@ -80,8 +80,9 @@ def _block(what: str, page: Path, steps: Mapping[str, Step], files: Mapping[str,
         return [NOT_YET]
     link = f"{RESULTS.name if page.parent == RESULTS.parent else RESULTS}#{_anchor(step.title)}"
     conditions = [f"{line} [All figures]({link})." for line in _conditions(there)]
+    pictures = [line for unit in there for line in _pictures(unit, page.parent)]
     try:
-        return [*_table(step, there).chosen(where, shown).lines(), "", *conditions]
+        return [*pictures, *_table(step, there).chosen(where, shown).lines(), "", *conditions]
     except DataError as error:
         raise DataError(f"{page}: <!-- figure: {what} -->: {error}") from None
 
@@ -155,9 +156,12 @@ def _section(step: Step, files: Mapping[str, Measured]) -> Iterator[str]:
     for unit, one in there.items():
         if unit.part:
             yield from ("", f"#### {unit.step.title}: {unit.part}")
-        for path in unit.copies().values():
-            yield from ("", f"![{step.title} {unit.part}]({path.relative_to(RESULTS.parent)})")
-        yield from ("", *_output(step, one))
+        yield from ("", *_pictures(unit, RESULTS.parent), *_output(step, one))
+
+
+def _pictures(unit: Unit, folder: Path) -> Iterator[str]:
+    for path in unit.copies().values():
+        yield from (f"![{unit.step.title}: {unit.part or unit.name}]({path.relative_to(folder)})", "")
 
 
 def _commands(step: Step) -> Iterator[str]:
