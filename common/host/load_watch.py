@@ -16,7 +16,8 @@ class LoadWatch:
     A process that asks for its CPU time may have to wait for its quota at that moment. The thread that
     decides where a task runs must therefore not be the one that asks.
 
-    `every_s`: the usual time between two readings. `pause_s`: turns it into the time before the next one.
+    `every_s`: the time between two readings, or EVERY_S if that is longer and nobody called `latest` since
+    the reading before. `pause_s`: turns it into the time before the next reading.
     """
 
     def __init__(
@@ -24,8 +25,10 @@ class LoadWatch:
     ) -> None:
         self._load = load
         self._every_s = every_s
+        self._resting_s = max(every_s, EVERY_S)
         self._pause_s = pause_s
         self._latest = (0.0, 1.0)
+        self._asked = False  # since the last reading
         self._closed = threading.Event()
         self._thread: threading.Thread | None = None
         self._starting = threading.Lock()
@@ -33,6 +36,7 @@ class LoadWatch:
 
     def latest(self) -> tuple[float, float]:
         """The load and the capacity of the last reading."""
+        self._asked = True
         if self._thread is None:
             self._start()
         return self._latest
@@ -58,9 +62,13 @@ class LoadWatch:
                     self._thread = thread
 
     def _run(self) -> None:
-        while not self._closed.wait(self._pause_s(self._every_s)):
+        while not self._closed.wait(self._next_pause_s()):
             with self._reading:
                 self._read()
+
+    def _next_pause_s(self) -> float:
+        asked, self._asked = self._asked, False
+        return self._pause_s(self._every_s if asked else self._resting_s)
 
     def _read(self) -> None:
         self._latest = (self._load.share(HURRIED_S), self._load.capacity)

@@ -50,3 +50,24 @@ def test_a_hurried_watch_reads_in_the_callers_thread() -> None:
     readers = [counted.read_by.get(timeout=WAIT_S) for _ in range(2)]
     assert readers == [threading.current_thread()] * 2
     watch.close()
+
+
+def test_a_watch_that_nobody_asks_reads_less_often() -> None:
+    """A server that is idle reads as often as a robot; once it is asked, it reads at its own pace again."""
+    pauses, goes_on = SimpleQueue[float](), threading.Semaphore(0)
+
+    def pause_s(usual_s: float) -> float:
+        pauses.put(usual_s)
+        goes_on.acquire(timeout=WAIT_S)
+        return 0.0
+
+    watch = LoadWatch(Counted(), 0.01, pause_s)
+    watch.latest()
+    assert pauses.get(timeout=WAIT_S) == 0.01
+    goes_on.release()
+    assert pauses.get(timeout=WAIT_S) == EVERY_S
+    watch.latest()
+    goes_on.release()
+    assert pauses.get(timeout=WAIT_S) == 0.01
+    watch.close()
+    goes_on.release()
