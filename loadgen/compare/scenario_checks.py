@@ -89,16 +89,17 @@ def run_checks(names: Sequence[str], config: ChecksConfig) -> int:
 def checks_table(scenario: Scenario, config: ChecksConfig, runs: Mapping[str, Sequence[Outcome]]) -> Table:
     """One line for each policy and check: its value in each run, and in how many runs it fails."""
     values = [f"run_{number}" for number in range(1, config.seeds + 1)]
-    names = ("policy", "check", *values, "verdict", "note")
-    line = make_dataclass("CheckLine", [(name, str) for name in names], frozen=True)
-    headings = {name: Heading(name.replace("_", " "), name.replace("_", " "), None) for name in names[:-1]}
+    names = ("policy", "check", *values, "verdict")
+    line = make_dataclass("CheckLine", [*((name, str) for name in names), ("note", str, "")], frozen=True)
+    headings = {name: Heading(name.replace("_", " "), name.replace("_", " "), None) for name in names}
     lines = []
     for policy, outcomes in runs.items():
         for one in scenario.checks:
             if config.simulate and FIGURES[one.figure].real:
                 continue
             verdicts = [one.judge(outcome) for outcome in outcomes]
-            lines.append(line(policy, str(one), *map(_value, verdicts), _verdict(verdicts), ""))
+            cells = (policy, str(one), *map(_value, verdicts), _verdict(verdicts))
+            lines.append(line(**dict(zip(names, cells, strict=True))))
     where = f"in {SIMULATION}" if config.simulate else f"on the {config.testbed} testbed"
     seeds = "seed" if config.seeds == 1 else f"seeds {scenario.seed} to"
     caption = f"Checks of {scenario.name} {where}, {seeds} {scenario.seed + config.seeds - 1}."

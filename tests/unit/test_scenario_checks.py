@@ -43,9 +43,7 @@ def test_every_check_has_a_value_for_each_run(capsys: pytest.CaptureFixture[str]
         (["checks", "calm", "--policies", "paper,paper"], "a policy is named twice"),
     ],
 )
-def test_a_wrong_flag_is_one_line(
-    flags: list[str], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_flag_is_one_line(flags: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     """It gives exit code 2."""
     assert main(flags) == 2
     (line,) = capsys.readouterr().err.splitlines()
