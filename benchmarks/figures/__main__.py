@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from benchmarks.figures.measured import measure, read_all, why_old
 from benchmarks.figures.page import pages
-from benchmarks.figures.step import ROOT, STEPS, Unit, read_sections, units_of
+from benchmarks.figures.step import ROOT, STEPS, Section, Unit, read_sections, units_of
 from offboard.common.command_line import CommandParser, add_flags, run_command
 from offboard.common.config import check, resolve, setting
 from offboard.common.errors import ConfigError, OffloadError
@@ -46,10 +46,11 @@ def _run(argv: Sequence[str]) -> int:
     add_flags(parser, FiguresConfig, "FIGURES")
     config = resolve(FiguresConfig, parser.parse_args(argv), environ=os.environ, prefix="FIGURES")
     os.chdir(ROOT)
-    units = units_of(read_sections(ROOT / STEPS))
+    sections = read_sections(ROOT / STEPS)
+    units = units_of(sections)
     chosen, again = _chosen(units, config.only, "only") or units, _chosen(units, config.again, "again")
     if config.write:
-        write_pages()
+        write_pages(sections)
         return 0
     commit, files = commit_here(), read_all(units)
     if commit is None:
@@ -61,12 +62,12 @@ def _run(argv: Sequence[str]) -> int:
         return 0
     if changed := changed_code():
         raise ConfigError(f"the code was changed: commit {', '.join(changed[:MORE_FILES])} first")
-    return _measure([unit for unit, why in states.items() if why or unit in again], commit)
+    write_pages(sections)  # an error in a page is better known before than after hours
+    return _measure([unit for unit, why in states.items() if why or unit in again], sections, commit)
 
 
-def _measure(units: Sequence[Unit], commit: str) -> int:
+def _measure(units: Sequence[Unit], sections: Sequence[Section], commit: str) -> int:
     """Measure one after the other. A step that fails leaves its older file; the others go on."""
-    write_pages()  # an error in a page is better known before than after hours
     failed = []
     for number, unit in enumerate(units, 1):
         _say(f"{number} of {len(units)}: {unit.name}, about {unit.step.minutes:g} minutes")
@@ -79,15 +80,14 @@ def _measure(units: Sequence[Unit], commit: str) -> int:
         if (now := commit_here()) != commit:
             raise OffloadError(f"the code is no longer that of commit {commit}, but {now}")
         measured.write(ROOT / unit.file)
-        write_pages()
+        write_pages(sections)
     if failed:
         _say("\n".join(["", *failed]))
     return 1 if failed else 0
 
 
-def write_pages() -> None:
+def write_pages(sections: Sequence[Section]) -> None:
     """Write every page whose text is not as the files say."""
-    sections = read_sections(ROOT / STEPS)
     for path, text in pages(ROOT, sections, read_all(units_of(sections))).items():
         if not (ROOT / path).is_file() or (ROOT / path).read_text() != text:
             write_whole(ROOT / path, text)

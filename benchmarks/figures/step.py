@@ -20,6 +20,7 @@ ROOT = Path(__file__).parents[2]
 FOLDER = Path("docs/figures")
 STEPS = FOLDER / "steps.toml"
 PART = "{part}"  # in a command: the name of the part
+DATASETS = ("paper", "congested")  # in the order of the page
 SOAK = "soak"  # half an hour: it has a step of its own
 
 
@@ -170,4 +171,8 @@ def simulated_scenarios() -> tuple[str, ...]:
 
 
 # Lists that the file names by a word, so that a new scenario cannot be forgotten.
-PARTS = {"checked scenarios": checked_scenarios, "simulated scenarios": simulated_scenarios}
+PARTS = {
+    "checked scenarios": checked_scenarios,
+    "simulated scenarios": simulated_scenarios,
+    "datasets": lambda: DATASETS,
+}
