@@ -1,7 +1,9 @@
 """The figures of the docs: every page shows what the files of `make figures` hold, and no other figure."""
 
 import json
+import platform
 import shlex
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,10 +11,10 @@ import pytest
 
 from benchmarks.figures.__main__ import main
 from benchmarks.figures.markdown_tables import joined, notes_of, tables_of
-from benchmarks.figures.measured import Measured, read_all, why_old
+from benchmarks.figures.measured import Measured, measure, read_all, why_old
 from benchmarks.figures.page import doubled_titles, filled, pages, results
 from benchmarks.figures.step import FOLDER, ROOT, STEPS, Section, Step, Unit, read_sections, units_of
-from offboard.common.errors import DataError
+from offboard.common.errors import DataError, OffloadError
 from offboard.loadgen.__main__ import COMMANDS
 from tests.loose_figures import ALLOWED, loose_figures
 from tests.loose_figures import pages as pages_of_docs
@@ -180,6 +182,31 @@ def test_a_file_survives_writing_and_reading(tmp_path: Path) -> None:
     (tmp_path / "broken.json").write_text(json.dumps({"commit": "abc1234"}))
     with pytest.raises(DataError, match=r"broken.json: not a file of `make figures`"):
         Measured.read(tmp_path / "broken.json")
+
+
+def test_what_a_command_prints_is_kept_with_its_machine() -> None:
+    """The output of all commands is, with the commands, the commit and the Python that ran them."""
+    commands = ("python -c 'print(\"| a |\")'", "python -c 'print(2 + 2)'")
+    measured = measure(Unit(step(run=commands, environment=sys.prefix)), "abc1234")
+    assert list(measured.output) == ["| a |", "", "4"]
+    assert tuple(measured.commands) == commands
+    assert measured.commit == "abc1234"
+    assert measured.machine["python"] == platform.python_version()
+    assert measured.seconds >= 0
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("python -c 'raise SystemExit(\"no map\")'", "ended with exit code 1: no map"),
+        ("python -c 'pass'", "nothing was printed"),
+        ("no-such-program", "there is no program no-such-program"),
+    ],
+)
+def test_a_command_that_fails_leaves_no_figures(command: str, said: str) -> None:
+    """The step is not measured, and the error says why."""
+    with pytest.raises(OffloadError, match=said):
+        measure(Unit(step(run=(command,), environment=sys.prefix)), "abc1234")
 
 
 @pytest.mark.parametrize(
