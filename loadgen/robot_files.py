@@ -27,6 +27,8 @@ TRACE_FIELDS = (
     "waited_s",
 )
 
+SUMMARY = "summary.json"  # of a run, next to the traces of its robots
+
 log = logging.getLogger(__name__)
 
 

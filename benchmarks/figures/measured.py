@@ -3,9 +3,9 @@
 `measure` runs the commands of a step; nothing else makes such a file.
 """
 
+import contextlib
 import json
 import os
-import platform
 import shlex
 import shutil
 import signal
@@ -18,8 +18,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from benchmarks.figures.step import ROOT, Step, Unit
-from benchmarks.measure import processor
 from offboard.common.errors import DataError, OffloadError
+from offboard.loadgen.play.machine import machine as this_machine
 from offboard.loadgen.play.stolen_cpu_time import StolenCpuTime
 from offboard.loadgen.table.measured_rows import write_whole
 
@@ -61,7 +61,7 @@ def measure(unit: Unit, commit: str) -> Measured:
     """Run the commands of a step, copy its pictures and return what it printed; OffloadError if one fails."""
     for target in unit.step.ready:
         _build(target)
-    here = machine(_environment(unit.step))
+    here = machine_of(_environment(unit.step))
     reads, stolen, began = unit.reads(ROOT), StolenCpuTime(), time.monotonic()
     date, output = f"{datetime.now(UTC):%Y-%m-%d}", ""
     for command in unit.commands():
@@ -111,7 +111,7 @@ def read_all(units: Sequence[Unit], root: Path = ROOT) -> dict[str, Measured]:
     return {unit.name: Measured.read(root / unit.file) for unit in there}
 
 
-def machine(environment: Mapping[str, str]) -> dict[str, str | int | float]:
+def machine_of(environment: Mapping[str, str]) -> dict[str, str | int | float]:
     """The machine and the Python of an environment; OffloadError if it runs the code of another checkout."""
     code = "import platform, offboard; print(platform.python_version(), offboard.__file__)"
     python = shutil.which("python", path=environment["PATH"]) or "python"
@@ -126,14 +126,7 @@ def machine(environment: Mapping[str, str]) -> dict[str, str | int | float]:
     version, module = asked.stdout.strip().split(maxsplit=1)
     if not Path(module).is_relative_to(ROOT):
         raise OffloadError(f"{python} runs the code of {Path(module).parents[1]}")
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return {
-        "cpu": processor(),
-        "cores": os.cpu_count() or 1,
-        "memory_gib": round(memory / 2**30, 1),
-        "kernel": platform.release(),
-        "python": version,
-    }
+    return {**this_machine(), "python": version}
 
 
 def _environment(step: Step) -> dict[str, str]:
@@ -165,16 +158,18 @@ def _run(unit: Unit, command: str) -> str:
             [program, *words[1:]],
             cwd=ROOT,
             env=environment,
+            stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=errors,
             text=True,
+            process_group=0,
         )
         try:
             output, _ = process.communicate(timeout=limit_s)
         except subprocess.TimeoutExpired:
             _end(process)
             raise OffloadError(f"`{command}` has not ended after {limit_s / 60:.0f} minutes") from None
-        except KeyboardInterrupt:  # the terminal has sent it to the command too
+        except KeyboardInterrupt:
             _end(process)
             raise
     if process.returncode:
@@ -184,10 +179,10 @@ def _run(unit: Unit, command: str) -> str:
 
 
 def _end(process: "subprocess.Popen[str]") -> None:
-    """Let a command end as after Ctrl-C, so that it ends its own processes too."""
-    process.send_signal(signal.SIGINT)
-    try:
+    """End a command and its processes as Ctrl-C in a terminal does; kill what is left after END_S."""
+    os.killpg(process.pid, signal.SIGINT)
+    with contextlib.suppress(subprocess.TimeoutExpired):
         process.communicate(timeout=END_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.communicate()
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait(timeout=END_S)

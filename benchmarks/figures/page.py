@@ -207,7 +207,7 @@ def _where(one: Measured) -> str:
     rows = [f"rows of {Path(name).name} of commit {about['commit']}" for name, about in one.reads.items()]
     return (
         f"{one.commit}, {{}}; {of['cpu']}, {of['cores']} cores, {of['memory_gib']} GiB, "
-        f"Linux {of['kernel']}, Python {of['python']}{''.join(f'; {each}' for each in rows)}."
+        f"{of['kernel']}, Python {of['python']}{''.join(f'; {each}' for each in rows)}."
     )
 
 

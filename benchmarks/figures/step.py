@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 FOLDER = Path("docs/figures")
 STEPS = FOLDER / "steps.toml"
 PART = "{part}"  # in a command: the name of the part
-DATASETS = ("paper", "congested")  # in the order of the page
+DATASETS = ("paper", "congested", "registration")  # in the order of the page
 SOAK = "soak"  # half an hour: it has a step of its own
 
 

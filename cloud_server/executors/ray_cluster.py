@@ -30,7 +30,7 @@ for _name, _value in RAY_SETTINGS.items():
 
 try:
     import ray
-    from ray._raylet import GcsClient
+    from ray._raylet import GcsClient  # type: ignore[attr-defined, unused-ignore] # ray is not always there
     from ray.exceptions import RayError
 except ImportError as error:
     raise MissingExtra("--executor ray", "ray") from error

@@ -6,7 +6,8 @@ from pathlib import Path
 from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError
 from offboard.loadgen.play.run_files import find_source
-from offboard.loadgen.table.measured_rows import read, write_csv
+from offboard.loadgen.replay.dataset_file import measured_tasks, read_recorded, write_dataset
+from offboard.loadgen.table.measured_rows import read
 
 
 @dataclass(frozen=True)
@@ -15,8 +16,8 @@ class ExportConfig:
 
     csv: Path | None = setting(
         None,
-        "CSV file to write: size and both times of the tasks that ran on both sites; an existing file is "
-        "replaced",
+        "CSV file to write: the tasks that ran on both sites, with size, times, their parts, bytes, work and "
+        "features; an existing file is replaced",
     )
     kind: str | None = setting(None, "with --csv: kind of task to export, if the trace holds several kinds")
     mcap: Path | None = setting(
@@ -44,7 +45,7 @@ def run_export(path: Path, config: ExportConfig) -> int:
 
 def _export_csv(source: Path, csv: Path, kind: str | None) -> int:
     rows = read(source, kind)
-    write_csv(csv, rows)
+    write_dataset(csv, measured_tasks(read_recorded(source, kind)))
     _say(csv, f"{len(rows)} rows", rows.left_out, "without both times")
     return 0
 

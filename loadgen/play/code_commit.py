@@ -3,10 +3,8 @@
 So measured figures, and pages about them, can be committed without making the figures old.
 """
 
-import subprocess
-from collections.abc import Sequence
+from offboard.loadgen.play.machine import output_of
 
-ASK_S = 10
 NOT_CODE = (  # as patterns of git, from the root of the checkout
     "docs",
     "tests",
@@ -34,12 +32,3 @@ def changed_code() -> list[str]:
     """The code files that differ from the last commit, new ones included, from the root of the checkout."""
     changed = output_of(("git", "status", "--porcelain", "--untracked-files=all", "--", *_CODE))
     return [line.split(maxsplit=1)[1] for line in (changed or "").splitlines()]
-
-
-def output_of(command: Sequence[str]) -> str | None:
-    """What a command printed; None if it failed or printed nothing."""
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=ASK_S, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return (done.stdout.strip() or None) if done.returncode == 0 else None

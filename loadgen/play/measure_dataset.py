@@ -1,11 +1,9 @@
-"""`loadgen dataset`: measures the plans of a scenario on both sites and records how they were measured.
+"""`loadgen dataset`: measures the tasks of a scenario on both sites and records how they were measured.
 
-NAME.csv holds the rows; NAME.json holds machine, settings, commit, disturbance and CPU use.
+NAME.csv holds the rows; NAME.json holds machine, Table I, settings, commit, disturbance and CPU use.
 """
 
 import json
-import os
-import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -14,13 +12,20 @@ from typing import Any
 
 from offboard.common import VERSION
 from offboard.common.config import check, setting
-from offboard.loadgen.play.code_commit import commit_here, output_of
+from offboard.loadgen.play.code_commit import commit_here
+from offboard.loadgen.play.machine import docker_version, machine
 from offboard.loadgen.play.play_scenario import TESTBEDS, play
 from offboard.loadgen.play.run_files import TRACE
+from offboard.loadgen.play.table_one import specifications, table_one
+from offboard.loadgen.replay.dataset_file import measured_tasks, read_recorded, write_dataset
 from offboard.loadgen.scenario.scenario import Scenario, Workload
 from offboard.loadgen.scenario.scenario_file import check_calls, find_scenario, read_scenario
-from offboard.loadgen.table.measured_rows import write_csv, write_whole
+from offboard.loadgen.table.measured_rows import write_whole
 from offboard.loadgen.table.measurement_notes import disturbance, read_noted
+from offboard.loadgen.table.table_formats import render
+from offboard.robot_client import policies
+
+POLICY = policies.ALIAS  # its traces hold features and work; where a row runs is not up to the policy
 
 
 @dataclass(frozen=True)
@@ -34,9 +39,9 @@ class DatasetConfig:
     testbed: str = setting(
         "docker", "where to measure: in local processes or in Docker containers", choices=tuple(TESTBEDS)
     )
-    rows: int = setting(1000, "number of plans; each runs on both sites", minimum=1)
+    rows: int = setting(1000, "number of tasks; each runs on both sites", minimum=1)
     alone: int = setting(
-        100, "number of extra plans that measure how much the two sites disturb each other", minimum=0
+        100, "number of extra tasks that measure how much the two sites disturb each other", minimum=0
     )
     seed: int | None = setting(None, "random seed (default: the scenario's seed)", minimum=0)
 
@@ -48,13 +53,15 @@ def run_dataset(name: str, config: DatasetConfig, command: Sequence[str]) -> int
     """Play the scenario, then write both files. `command` is the command line, recorded in NAME.json."""
     path = find_scenario(name)
     scenario = read_scenario(path).changed(
-        seed=config.seed, tasks=config.rows, measure_all=True, alone=config.alone
+        seed=config.seed, tasks=config.rows, measure_all=True, alone=config.alone, policy=POLICY
     )
     check_calls(scenario, path)
     run = config.run / scenario.name
     started_at, commit = datetime.now(UTC), commit_here()
     play(scenario, run, config.testbed).check_robots()
     rows, disturbed = read_noted(run / TRACE), disturbance(run / TRACE)
+    this = machine() | ({"docker": docker_version()} if config.testbed == "docker" else {})
+    specified = specifications(this, scenario, run)
     about = {
         "name": scenario.name,
         "measured_at": started_at.isoformat(timespec="seconds"),
@@ -62,7 +69,8 @@ def run_dataset(name: str, config: DatasetConfig, command: Sequence[str]) -> int
         "commit": commit,
         "software": VERSION,
         "testbed": config.testbed,
-        "machine": _machine(config.testbed),
+        "machine": this,
+        "table_one": [asdict(line) for line in specified],
         "scenario": _settings(scenario),
         "rows": len(rows),
         "left_out": rows.left_out,
@@ -70,8 +78,9 @@ def run_dataset(name: str, config: DatasetConfig, command: Sequence[str]) -> int
         "disturbance": disturbed.as_dict() if disturbed else None,
     }
     path = config.out / f"{scenario.name}.csv"
-    write_csv(path, rows)
+    write_dataset(path, measured_tasks(read_recorded(run / TRACE, None)))
     write_whole(path.with_suffix(".json"), json.dumps(about, indent=2, ensure_ascii=False) + "\n")
+    print(f"\n{render([table_one(scenario.name, specified)], 'md')}")
     print(f"written: {path} ({len(rows)} rows, {rows.left_out} left out) and {path.with_suffix('.json')}")
     return 0
 
@@ -98,25 +107,3 @@ def _settings(scenario: Scenario) -> dict[str, Any]:
     if scenario.workload.map:
         settings["workload"]["map"] = scenario.workload.map.name
     return settings
-
-
-def _machine(testbed: str) -> dict[str, Any]:
-    machine = {
-        "cpu": _cpu_model(),
-        "cores": os.cpu_count(),
-        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
-        "python": platform.python_version(),
-    }
-    if testbed == "docker":
-        machine["docker"] = output_of(("docker", "version", "--format", "{{.Server.Version}}"))
-    return machine
-
-
-def _cpu_model() -> str:
-    """The kernel's name of the CPU, or else the architecture."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(models, platform.machine())

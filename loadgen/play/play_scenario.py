@@ -192,6 +192,7 @@ def write_summary(out: Path, played: Played, about: Mapping[str, Any]) -> None:
         "seed": scenario.seed,
         "policy": scenario.robot.policy,
         "predictor": scenario.robot.predictor,
+        "window": scenario.robot.window,
         "tasks": scenario.workload.tasks * scenario.workload.robots,
         "software": VERSION,
         **about,

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Self
 
 from offboard.common.errors import ConfigError, DataError
+from offboard.loadgen import robot_files
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.testbed.testbed import ROBOT, WAN
 
@@ -17,7 +18,7 @@ ANSWERS = "answers.jsonl"
 LINK = "link.jsonl"  # of the relay of `cloud`; that of `edge` writes link-edge.jsonl
 EVENTS = "events.jsonl"
 READINGS = "usage.jsonl"
-SUMMARY = "summary.json"
+SUMMARY = robot_files.SUMMARY
 TABLE = "table.md"
 PICTURE = "plan.png"
 ROBOT_SEED_STEP = 1_000_003  # large: robots of one run differ, and so do runs with neighbouring seeds

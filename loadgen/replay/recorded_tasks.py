@@ -1,6 +1,6 @@
-"""The tasks of a trace or a dataset, with all that a replay needs to know of them.
+"""The tasks of a trace, with all that a replay needs to know of them.
 
-The fields of a trace are those of docs/formats.md; `recorded_site` plays the runs again.
+docs/formats.md explains the fields. `dataset_file` reads the tasks of a dataset, `recorded_site` runs them.
 """
 
 from collections.abc import Collection, Mapping
@@ -12,7 +12,7 @@ from offboard.common import errors
 from offboard.common.errors import CloudBroken, CloudError, ConfigError, DataError, OffloadError, TaskError
 from offboard.common.tasks import Size
 from offboard.loadgen.robot_files import read_trace
-from offboard.loadgen.table.measured_rows import ALLOWED, VALUE_MAX, Rows
+from offboard.loadgen.table.measured_rows import ALLOWED, VALUE_MAX
 from offboard.robot_client.policies import Decision, Hedge, Probe
 from offboard.robot_client.sites.runner import (
     CLOUD,
@@ -61,17 +61,9 @@ class RecordedTask:
         return (self.started_s or 0.0) + self.waited_s
 
     @property
-    def tells_work(self) -> bool:
-        return any(run.value is not None for run in self.runs.values())
-
-
-def of_rows(rows: Rows) -> list[RecordedTask]:
-    """The tasks of a dataset, of which only sizes and times are known."""
-    times = zip(rows.size.tolist(), rows.onboard_s.tolist(), rows.cloud_s.tolist(), strict=True)
-    return [
-        RecordedTask(size, {ONBOARD: Execution(ONBOARD, onboard_s), CLOUD: Execution(CLOUD, cloud_s)})
-        for size, onboard_s, cloud_s in times
-    ]
+    def work(self) -> float | None:
+        """What the results told; None: nothing."""
+        return next((run.value for run in self.runs.values() if run.value is not None), None)
 
 
 def read_tasks(path: Path, kind: str | None) -> list[RecordedTask]:
@@ -115,8 +107,7 @@ def _task(fields: Mapping[str, Any]) -> RecordedTask:
 def _end_late(tasks: list[RecordedTask], place: int, fields: Mapping[str, Any]) -> None:
     """Put the end of a run that another site overtook in the place of what its own line said of it."""
     task = tasks[place]
-    works = [run.value for run in task.runs.values() if run.value is not None]
-    late = _execution(fields, works[0] if works else None)
+    late = _execution(fields, task.work)
     tasks[place] = replace(task, runs={**task.runs, late.site: late})
 
 

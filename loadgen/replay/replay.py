@@ -16,11 +16,13 @@ from offboard.common.errors import DataError
 from offboard.loadgen import rivals
 from offboard.loadgen.progress import progress
 from offboard.loadgen.replay import same_decisions
-from offboard.loadgen.replay.recorded_tasks import RecordedTask, of_rows, read_tasks
+from offboard.loadgen.replay.dataset_file import measured_tasks, read_recorded
+from offboard.loadgen.replay.recorded_tasks import RecordedTask
+from offboard.loadgen.replay.settings_of_run import settings_of_run
 from offboard.loadgen.replay.virtual_robot import VirtualRobot
 from offboard.loadgen.table import confidence_intervals, table_two_figures
 from offboard.loadgen.table.confidence_intervals import Picks
-from offboard.loadgen.table.measured_rows import Column, Rows, is_csv, read_lived
+from offboard.loadgen.table.measured_rows import Column, Rows, read_lived
 from offboard.loadgen.table.measurement_notes import read_noted
 from offboard.loadgen.table.table_formats import Heading, Table
 from offboard.loadgen.table.table_settings import FULL, MeasuredTimesConfig
@@ -33,6 +35,7 @@ from offboard.robot_client.settings import Settings
 
 ORACLE = "oracle"
 RECORDED = "as recorded"
+OWN = "each policy's own"
 
 
 @dataclass(frozen=True)
@@ -44,12 +47,14 @@ class ReplayConfig(MeasuredTimesConfig):
     )
     predictor: str | None = setting(
         None,
-        f"predictor for all policies, instead of the one that each policy brings: {rivals.PREDICTOR_HELP}",
+        "predictor for all policies (default: that of the run, if its summary.json names one, or else the "
+        f"one that each policy brings): {rivals.PREDICTOR_HELP}",
         metavar="NAME",
     )
-    window: int = setting(
-        WINDOW,
-        "window length N; the first N rows are warm-up and are not scored",
+    window: int | None = setting(
+        None,
+        "window length N; the first N rows are warm-up and are not scored (default: that of the run, if its "
+        f"summary.json is next to the trace, or else {WINDOW})",
         minimum=2,
         maximum=WINDOW_MAX,
     )
@@ -60,6 +65,16 @@ class ReplayConfig(MeasuredTimesConfig):
             rivals.policy(policy, "--policies")
         if self.predictor is not None:
             rivals.predictor(self.predictor, "--predictor")
+
+    @property
+    def length(self) -> int:
+        """The window length N."""
+        return WINDOW if self.window is None else self.window
+
+    def as_in_the_run(self, path: Path) -> "ReplayConfig":
+        """With the window and the predictor of the run of this trace, unless the user gave them."""
+        run = settings_of_run(path)
+        return replace(self, window=self.window or run.window, predictor=self.predictor or run.predictor)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,28 +141,24 @@ def run_replay(path: Path, config: ReplayConfig) -> int:
 
 def tables(path: Path, config: ReplayConfig) -> list[Table]:
     """One table for each feedback mode. The first line of a trace's table is the recorded run itself."""
+    asked, config = config, config.as_in_the_run(path)
     rows, lived = read_noted(path, config.kind, least=0), read_lived(path, config.kind)
     if not len(rows) + rows.left_out:
         raise DataError(f"{path}: there is no {config.kind or 'task'} in this trace")
     recorded = [_recorded(lived.waited_s, lived.to_cloud)] if len(lived.waited_s) else []
-    run = [] if is_csv(path) else read_tasks(path, config.kind)
-    tasks = measured_tasks(rows, run)
+    run = read_recorded(path, config.kind)
+    tasks = measured_tasks(run)
     with progress("policies", len(config.modes()) * (len(config.policies) + 1)) as shown:
         same = {policy: _same_percent(run, policy, config) for policy in config.policies if recorded}
         lines = {
             mode: [*recorded, *_mode_lines(tasks, rows, config, feedback=mode, same=same, step=shown.step)]
             for mode in config.modes()
         }
-    return [_table(path, rows, config, lines[mode], feedback=mode) for mode in config.modes()]
-
-
-def measured_tasks(rows: Rows, run: Sequence[RecordedTask]) -> list[RecordedTask]:
-    """The tasks of these rows: those of the `run`, with all that its trace knows, or else of a dataset.
-
-    The decisions of the run are left out: here the policies decide.
-    """
-    found = [replace(one, decision=None, deadline_s=None) for one in run if one.measured]
-    return found or of_rows(rows)
+    about = _about(config, asked)
+    return [
+        _table(path, rows, config, lines[mode], about=f"{about}, feedback {mode}", feedback=mode)
+        for mode in config.modes()
+    ]
 
 
 def replay(
@@ -190,7 +201,7 @@ def _same_percent(run: Sequence[RecordedTask], policy: str, config: ReplayConfig
     """The share of the run's decisions that this policy makes too."""
 
     def robot(sites: Sequence[str]) -> VirtualRobot:
-        made = _made(policy, predictor=config.predictor, window=config.window, seed=config.seed)
+        made = _made(policy, predictor=config.predictor, window=config.length, seed=config.seed)
         return VirtualRobot(*made, tells_work=_tell_work(run), sites=sites)
 
     return same_decisions.same_percent(same_decisions.compare(run, robot))
@@ -205,13 +216,24 @@ def _made(policy: str, *, predictor: str | None, window: int, seed: int) -> tupl
 
 
 def _tell_work(tasks: Sequence[RecordedTask]) -> bool:
-    return any(one.tells_work for one in tasks)
+    return any(one.work is not None for one in tasks)
 
 
-def _table(path: Path, rows: Rows, config: ReplayConfig, lines: list[PolicyScore], *, feedback: str) -> Table:
+def _about(config: ReplayConfig, asked: ReplayConfig) -> str:
+    """With which predictor and window, and whether they are those of the run, because none were asked for."""
+    of_run = {
+        name: " of the run"
+        for name in ("predictor", "window")
+        if getattr(config, name) != getattr(asked, name)
+    }
+    predictor, window = of_run.get("predictor", ""), of_run.get("window", "")
+    return f"predictor {config.predictor or OWN}{predictor}, window {config.length}{window}"
+
+
+def _table(
+    path: Path, rows: Rows, config: ReplayConfig, lines: list[PolicyScore], *, about: str, feedback: str
+) -> Table:
     left_out = f" ({rows.left_out} tasks without both times left out)" if rows.left_out else ""
-    predictor = config.predictor or "each policy's own"
-    about = f"predictor {predictor}, window {config.window}, feedback {feedback}"
     absent = set() if config.bootstrap else {"bound"}
     if all(line.same_percent is None for line in lines):  # no policy of a run decided them
         absent.add("same_percent")
@@ -222,8 +244,8 @@ def _table(path: Path, rows: Rows, config: ReplayConfig, lines: list[PolicyScore
             "rows": len(rows),
             "left_out": rows.left_out,
             "feedback": feedback,
-            "predictor": predictor,
-            "window": config.window,
+            "predictor": config.predictor or OWN,
+            "window": config.length,
         },
         headings={name: of for name, of in HEADINGS.items() if name not in absent},
         lines=lines,
@@ -253,11 +275,11 @@ def _lines(
 ) -> Iterator[PolicyScore]:
     """The figures of one policy, and with --bootstrap the ends of their intervals."""
     line = PolicyScore(policy)
-    if len(rows) <= config.window:
-        both = f"{len(rows) or 'no'} tasks ran on both sites, but the warm-up needs {config.window}"
+    if len(rows) <= config.length:
+        both = f"{len(rows) or 'no'} tasks ran on both sites, but the warm-up needs {config.length}"
         yield replace(line, note=f"cannot be replayed: {both}")
         return
-    scored = rows.since(config.window)
+    scored = rows.since(config.length)
     if policy == ORACLE:
         played = best(scored)
     else:
@@ -265,7 +287,7 @@ def _lines(
             tasks,
             policy,
             predictor=config.predictor,
-            window=config.window,
+            window=config.length,
             feedback=feedback,
             seed=config.seed,
         )

@@ -126,7 +126,7 @@ def _replay_of(findings: Findings) -> str:
     settings = findings.settings
     return (
         f"Replay of {len(findings.scored):,} of {len(findings.rows):,} rows, after a warm-up of "
-        f"N = {settings.window}; predictor {settings.predictor}, feedback {settings.feedback}"
+        f"N = {settings.length}; predictor {settings.predictor}, feedback {settings.feedback}"
     )
 
 
@@ -138,7 +138,7 @@ def _every_n(findings: Findings) -> str:
 
 def _too_few(findings: Findings) -> str:
     return (
-        f"Not drawn: the warm-up of N = {findings.settings.window} needs all of the "
+        f"Not drawn: the warm-up of N = {findings.settings.length} needs all of the "
         f"{len(findings.rows):,} rows, and no task was decided live."
     )
 

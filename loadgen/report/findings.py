@@ -7,12 +7,12 @@ from functools import cached_property
 from pathlib import Path
 
 from offboard.loadgen.replay import replay
-from offboard.loadgen.replay.recorded_tasks import read_tasks
+from offboard.loadgen.replay.dataset_file import measured_tasks, read_recorded
 from offboard.loadgen.replay.replay import ORACLE, RECORDED, ReplayConfig, Replayed
 from offboard.loadgen.report import chart_data
 from offboard.loadgen.report.chart_data import Accuracies, Decisions, Times
 from offboard.loadgen.table import table_two
-from offboard.loadgen.table.measured_rows import Column, is_csv, read_lived
+from offboard.loadgen.table.measured_rows import Column, read_lived
 from offboard.loadgen.table.measurement_notes import read_noted
 from offboard.loadgen.table.predictor_evaluation import Evaluation
 from offboard.loadgen.table.table_formats import Table
@@ -33,7 +33,7 @@ class Findings:
         self.settings = replay
         self.lived = read_lived(source, replay.kind)
         self.rows = read_noted(source, replay.kind, least=0 if len(self.lived.waited_s) else 1)
-        self.scored = self.rows.since(replay.window)
+        self.scored = self.rows.since(replay.length)
 
     @cached_property
     def times(self) -> Times | None:
@@ -85,7 +85,7 @@ class Findings:
             policy,
             self._played[policy].spent_s,
             self._played[policy].to_cloud,
-            first=settings.window + 1,
+            first=settings.length + 1,
             seed=settings.seed,
             best=self._best.to_cloud,
         )
@@ -104,14 +104,13 @@ class Findings:
         if not len(self.scored):
             return {}
         settings = self.settings
-        run = [] if is_csv(self._source) else read_tasks(self._source, settings.kind)
-        tasks = replay.measured_tasks(self.rows, run)
+        tasks = measured_tasks(read_recorded(self._source, settings.kind))
         return {
             policy: replay.replay(
                 tasks,
                 policy,
                 predictor=settings.predictor,
-                window=settings.window,
+                window=settings.length,
                 feedback=settings.feedback,
                 seed=settings.seed,
             )

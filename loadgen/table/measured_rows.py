@@ -1,12 +1,12 @@
 """Measured rows: reads tasks with both times known (size, onboard_s, cloud_s) from a trace or a CSV dataset.
 
-`predictor_evaluation` and `replay` compute figures from them.
+`predictor_evaluation` and `replay` compute figures from them. What else a dataset holds is read by
+`replay/dataset_file`.
 """
 
 import csv
-import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -84,20 +84,25 @@ def read_lived(path: Path, kind: str | None = None) -> Lived:
         try:
             if not decision["both"] and decision["policy"] != PINNED:
                 first_lines.setdefault(str(fields["kind"]), line)
-                lived.append((_number(where, "waited_s", fields["waited_s"]), decision["site"] == CLOUD))
+                lived.append((number(where, "waited_s", fields["waited_s"]), decision["site"] == CLOUD))
         except (TypeError, KeyError) as error:
             raise DataError(f"{where}: decision: {error!r}; site, both and policy are needed") from None
     _check_one_kind(path, first_lines)
     return Lived(np.array([s for s, _ in lived]), np.array([cloud for _, cloud in lived], dtype=bool))
 
 
-def write_csv(path: Path, rows: Rows) -> None:
-    """Write a dataset that `read` reads back to the last digit. If writing fails, an existing file stays."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(HEADER)
-    writer.writerows(zip(rows.size.tolist(), rows.onboard_s.tolist(), rows.cloud_s.tolist(), strict=True))
-    write_whole(path, text.getvalue())
+def read_cells(path: Path, further: Collection[str] = ()) -> Iterator[tuple[str, dict[str, str]]]:
+    """The cells of each row of a CSV dataset by column, after its place: FILE:LINE.
+
+    Those of the columns of HEADER, which must be there, and of those of `further` that are.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            yield from _rows_of_cells(path, file, further)
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from error
 
 
 def write_whole(path: Path, text: str) -> None:
@@ -114,48 +119,62 @@ def is_csv(path: Path) -> bool:
     return path.suffix.lower() == ".csv"
 
 
-def _read_csv(path: Path) -> Rows:
+def number(where: str, name: str, value: Any) -> float:
+    """The value of a cell or field as a number; `where` is its file and line."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            found = _csv_rows(path, file)
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from error
-    if not found:
-        raise DataError(f"{path}: there are no rows below the header")
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not 0 <= number <= VALUE_MAX:
+        raise DataError(f"{where}: {name}: {short(value)} is not {ALLOWED}")
+    return number
+
+
+def short(value: Any) -> str:
+    """How an error message shows a wrong value."""
+    text = repr(value)
+    return text if len(text) <= SHOWN_MAX else f"{text[:SHOWN_MAX]}.."
+
+
+def _read_csv(path: Path) -> Rows:
+    found: list[Row] = []
+    for where, cells in read_cells(path):
+        size, onboard_s, cloud_s = (number(where, name, cells[name]) for name in HEADER)
+        found.append((size, onboard_s, cloud_s))
     return _rows(found)
 
 
-def _csv_rows(path: Path, file: Iterator[str]) -> list[Row]:
-    reader = csv.reader(file)
-    found: list[Row] = []
+def _rows_of_cells(
+    path: Path, file: Iterator[str], further: Collection[str]
+) -> Iterator[tuple[str, dict[str, str]]]:
+    reader, count = csv.reader(file), 0
     try:
         header = [name.strip() for name in next(reader, [])]
-        if not header:
-            raise DataError(f"{path}:1: the header is missing; the first line must be {','.join(HEADER)}")
-        places = [_place(path, header, name) for name in HEADER]
-        for cells in reader:
-            if cells:
-                _add(path, found, _csv_row(f"{path}:{reader.line_num}", header, places, cells))
+        places = _places(path, header, further)
+        for cells in filter(None, reader):
+            _check_room(path, count)
+            count += 1
+            # A decimal comma ends here too: 0,5 is two cells.
+            if len(cells) != len(header):
+                of = f"the header has {len(header)}: {','.join(header)}"
+                raise DataError(f"{path}:{reader.line_num}: {len(cells)} cells, but {of}")
+            yield f"{path}:{reader.line_num}", {name: cells[place] for name, place in places.items()}
     except csv.Error as error:
         raise DataError(f"{path}:{reader.line_num}: {error}") from error
-    return found
+    if not count:
+        raise DataError(f"{path}: there are no rows below the header")
 
 
-def _place(path: Path, header: Sequence[str], name: str) -> int:
-    if header.count(name) != 1:
-        found = f"has no column {name!r}" if name not in header else f"has the column {name!r} twice"
-        raise DataError(f"{path}:1: header {','.join(header)!r} {found}; it must be {','.join(HEADER)}")
-    return header.index(name)
-
-
-def _csv_row(where: str, header: Sequence[str], places: Sequence[int], cells: Sequence[str]) -> Row:
-    # A decimal comma ends here too: 0,5 is two cells.
-    if len(cells) != len(header):
-        raise DataError(f"{where}: {len(cells)} cells, but the header has {len(header)}: {','.join(header)}")
-    size, onboard_s, cloud_s = (_number(where, header[place], cells[place]) for place in places)
-    return size, onboard_s, cloud_s
+def _places(path: Path, header: Sequence[str], further: Collection[str]) -> Mapping[str, int]:
+    """Where each column is that is read."""
+    if not header:
+        raise DataError(f"{path}:1: the header is missing; the first line must be {','.join(HEADER)}")
+    for name in (*HEADER, *further):
+        if header.count(name) > 1 or (name in HEADER and name not in header):
+            found = f"has no column {name!r}" if name not in header else f"has the column {name!r} twice"
+            allowed = f"it must be {','.join(HEADER)}, then other columns, each once"
+            raise DataError(f"{path}:1: header {short(','.join(header))} {found}; {allowed}")
+    return {name: header.index(name) for name in (*HEADER, *further) if name in header}
 
 
 def _read_trace(path: Path, kind: str | None, least: int) -> Rows:
@@ -170,7 +189,8 @@ def _read_trace(path: Path, kind: str | None, least: int) -> Rows:
             left_out += 1
             continue
         first_lines.setdefault(str(fields["kind"]), line)
-        _add(path, found, row)
+        _check_room(path, len(found))
+        found.append(row)
     if len(found) < least:
         raise DataError(
             f"{path}: no {kind or 'task'} was answered by both sites; measure some with "
@@ -192,7 +212,7 @@ def _trace_row(where: str, fields: dict[str, Any]) -> Row | None:
     try:
         for one in fields["executions"]:
             if one["ok"] and not one["censored"]:
-                seconds.setdefault(one["site"], _number(where, f"seconds of {one['site']}", one["seconds"]))
+                seconds.setdefault(one["site"], number(where, f"seconds of {one['site']}", one["seconds"]))
     except (TypeError, KeyError) as error:
         raise DataError(
             f"{where}: executions: {error!r}; each needs site, seconds, ok and censored"
@@ -201,29 +221,13 @@ def _trace_row(where: str, fields: dict[str, Any]) -> Row | None:
         return None
     size = fields["size"]
     if isinstance(size, list):
-        raise DataError(f"{where}: size: {_short(size)} has several numbers; one is needed here")
-    return _number(where, "size", size), seconds[ONBOARD], seconds[CLOUD]
+        raise DataError(f"{where}: size: {short(size)} has several numbers; one is needed here")
+    return number(where, "size", size), seconds[ONBOARD], seconds[CLOUD]
 
 
-def _number(where: str, name: str, value: Any) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = math.nan
-    if not 0 <= number <= VALUE_MAX:
-        raise DataError(f"{where}: {name}: {_short(value)} is not {ALLOWED}")
-    return number
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= SHOWN_MAX else f"{text[:SHOWN_MAX]}.."
-
-
-def _add(path: Path, found: list[Row], row: Row) -> None:
-    if len(found) == ROWS_MAX:
+def _check_room(path: Path, count: int) -> None:
+    if count == ROWS_MAX:
         raise DataError(f"{path}: more than {ROWS_MAX} rows, which is the most allowed")
-    found.append(row)
 
 
 def _rows(found: list[Row], left_out: int = 0) -> Rows:

@@ -51,6 +51,9 @@ def test_a_dataset_is_measured_in_containers(tmp_path: Path) -> None:
     about = json.loads((tmp_path / "paper.json").read_text())
     assert len(read(tmp_path / "paper.csv")) == about["rows"] == 15
     assert about["machine"]["docker"]
+    said = {line["what"]: line for line in about["table_one"]}
+    assert said["runs in"]["robot"] == f"a container of Docker {about['machine']['docker']}"
+    assert "unknown" not in (said["system"]["robot"], said["Python"]["cloud"])
     assert about["disturbance"]["plans"] == 3
     assert set(made_by_docker()) <= before
 

@@ -7,7 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from offboard.loadgen.replay.dataset_file import read_dataset
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.table.measured_rows import read
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED
+from tests.chaos.plays import skip_if_unplayable
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
 
@@ -41,6 +45,41 @@ def test_a_dataset_says_how_it_was_measured(tmp_path: Path) -> None:
     onboard = about["disturbance"]["sites"]["onboard"]
     assert onboard["seconds"]["pairs"] == 3
     assert 0.1 < onboard["cpu_share"] < 1.1, onboard  # a plan computes; a short one ends within its quota
+    assert "Table I of paper: robot and cloud." in out
+    assert {"what": "CPU quota", "robot": "0.2 CPU", "cloud": "1 CPU"} in about["table_one"]
+    assert about["machine"]["memory_gib"] > 0
     table = loadgen("table", "paper.csv", "--windows", "5", cwd=tmp_path)
     assert "robot 0.2 CPU" in table
     assert "onboard, total time: " in table
+    check_replay(tmp_path)
+
+
+def check_replay(folder: Path) -> None:
+    """Whatever the policy of the scenario, the rows hold what policies see, and are replayed as the trace."""
+    tasks = read_dataset(folder / "paper.csv")
+    assert all(task.work and task.sendings[CLOUD].bytes for task in tasks)
+    assert all(task.conditions[site] is not UNMEASURED for task in tasks for site in (ONBOARD, CLOUD))
+    assert all(task.runs[site].run_s and task.runs[site].cpu_s for task in tasks for site in (ONBOARD, CLOUD))
+    assert all(task.runs[CLOUD].bytes_out for task in tasks)
+    flags = ("--window", "5", "--format", "json", "--policies", "paper,greedy,hedge:probe:greedy")
+    files = ("paper.csv", "run/paper/trace.jsonl")
+    of_csv, of_trace = (
+        json.loads(loadgen("replay", file, *flags, cwd=folder))["tables"][0]["scores"] for file in files
+    )
+    assert [line | {"same_percent": None} for line in of_trace] == of_csv
+
+
+def test_a_dataset_of_an_application_tells_its_work_and_bytes(tmp_path: Path) -> None:
+    """Scans of different sizes send different bytes; work and parts of both times are there."""
+    skip_if_unplayable(read_scenario(find_scenario("registration")))
+    loadgen(
+        *("dataset", "registration", "--testbed", "local", "--rows", "8", "--alone", "1"),
+        *("--out", str(tmp_path), "--run", str(tmp_path / "run")),
+    )
+    tasks = read_dataset(tmp_path / "registration.csv")
+    assert len(tasks) == len({task.size for task in tasks}) == 8
+    assert all(task.work and task.runs[CLOUD].network_s for task in tasks)
+    by_size = sorted(tasks, key=lambda task: task.size)
+    sent = [task.sendings[CLOUD].bytes for task in by_size]
+    assert sent == sorted(sent)
+    assert sent[0] < sent[-1]

@@ -60,7 +60,7 @@ FOLDERS: dict[str, set[str]] = {
     "loadgen/rivals": set(),
     "loadgen/table": {"loadgen", "loadgen/rivals"},
     "loadgen/replay": {"loadgen", "loadgen/rivals", "loadgen/simulation/model", "loadgen/table"},
-    "loadgen/export": {"loadgen", "loadgen/play", "loadgen/robot", "loadgen/table"},
+    "loadgen/export": {"loadgen", "loadgen/play", "loadgen/replay", "loadgen/robot", "loadgen/table"},
     "loadgen/scenario": {
         "loadgen",
         "loadgen/relay/link",
@@ -69,7 +69,14 @@ FOLDERS: dict[str, set[str]] = {
         "loadgen/table",
         "loadgen/testbed",
     },
-    "loadgen/play": {"loadgen", "loadgen/robot", "loadgen/scenario", "loadgen/table", "loadgen/testbed"},
+    "loadgen/play": {
+        "loadgen",
+        "loadgen/replay",
+        "loadgen/robot",
+        "loadgen/scenario",
+        "loadgen/table",
+        "loadgen/testbed",
+    },
     "loadgen/simulation/model": {
         "loadgen/relay/link",
         "loadgen/robot",

@@ -36,7 +36,9 @@ def test_exported_rows_are_read_back_exactly(tmp_path: Path) -> None:
     assert run_export(trace.path, ExportConfig(csv=out)) == 0
     written, known = read(out), read(trace.path)
     assert len(written) == 4
-    assert out.read_text().splitlines()[0] == "size,onboard_s,cloud_s"
+    assert (
+        out.read_text().splitlines()[0] == "size,onboard_s,cloud_s,cloud_bytes_out,cloud_bytes_in,timeout_s"
+    )
     for name in ("size", "onboard_s", "cloud_s"):
         np.testing.assert_array_equal(getattr(written, name), getattr(known, name))
 

@@ -10,7 +10,6 @@ import pytest
 from offboard.common.errors import ConfigError, DataError
 from offboard.common.tasks import task
 from offboard.loadgen import rivals
-from offboard.loadgen.replay.recorded_tasks import of_rows
 from offboard.loadgen.replay.replay import ReplayConfig, replay_policy, run_replay
 from offboard.loadgen.table import table_two
 from offboard.loadgen.table.measured_rows import Rows, read
@@ -24,6 +23,7 @@ from offboard.robot_client.records.trace import Record, Trace
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.fakes import ScriptedRunner
+from tests.recorded_rows import of_rows
 from tests.table_loops import THOUSAND, TWELVE, csv_of
 
 DATASETS = Path(__file__).parents[2] / "loadgen" / "datasets"
@@ -227,3 +227,44 @@ def test_an_unknown_name_or_file_is_refused(tmp_path: Path) -> None:
         ReplayConfig(predictor="x")
     with pytest.raises(DataError, match="No such file"):
         run_replay(tmp_path / "none.jsonl", ReplayConfig())
+
+
+def test_window_and_predictor_are_those_of_the_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The summary next to a trace gives what the user did not, and the caption says so."""
+    times = {"onboard": 0.1, "cloud": 0.2}
+    path = trace_of(tmp_path, *(("paper", "onboard", times, 0.1) for _ in range(40)))
+    summary = path.with_name("summary.json")
+
+    def caption(**settings: Any) -> str:
+        assert run_replay(path, ReplayConfig(policies=("paper",), **settings)) == 0
+        return " ".join(capsys.readouterr().out.partition("\n\n")[0].split())
+
+    own = "predictor each policy's own"
+    assert f"{own}, window 50, feedback" in caption()
+    summary.write_text(json.dumps({"window": 20, "predictor": None}))
+    assert f"{own}, window 20 of the run, feedback" in caption()
+    summary.write_text(json.dumps({"window": 20, "predictor": "huber"}))
+    assert "predictor huber of the run, window 20 of the run, feedback" in caption()
+    assert "predictor least-squares, window 10, feedback" in caption(window=10, predictor="least-squares")
+    summary.write_text(json.dumps({"name": "calm"}))  # of an earlier version
+    assert f"{own}, window 50, feedback" in caption()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("{", r"summary\.json: no summary of a run: Expecting property name"),
+        ("[]", r"summary\.json: no summary of a run: 'list'"),
+        ('{"window": 1}', r"summary\.json: window: 1 is not a whole number from 2 to"),
+        ('{"window": "many"}', r"summary\.json: window: 'many' is not a whole number"),
+        ('{"predictor": "crystal"}', r"summary\.json: predictor: .*crystal"),
+    ],
+)
+def test_a_wrong_summary_is_an_error(tmp_path: Path, text: str, expected: str) -> None:
+    """The error names the file and the field."""
+    path = trace_of(tmp_path, ("paper", "onboard", {"onboard": 0.1, "cloud": 0.2}, 0.1))
+    path.with_name("summary.json").write_text(text)
+    with pytest.raises((DataError, ConfigError), match=expected):
+        run_replay(path, ReplayConfig())

@@ -6,14 +6,13 @@ from pathlib import Path
 import pytest
 
 from offboard.common.errors import DataError
-from offboard.loadgen.replay.recorded_tasks import RecordedTask, of_rows, read_tasks
-from offboard.loadgen.replay.replay import ReplayConfig, measured_tasks, replay, tables
+from offboard.loadgen.replay.recorded_tasks import RecordedTask, read_tasks
+from offboard.loadgen.replay.replay import ReplayConfig, tables
 from offboard.loadgen.replay.same_decisions import compare, same
 from offboard.loadgen.replay.virtual_robot import VirtualRobot
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks, find_tasks
 from offboard.loadgen.simulation.simulated_run import simulate
-from offboard.loadgen.table.measured_rows import read
 from offboard.robot_client import policies
 from offboard.robot_client.policies import Decision, Hedge, Probe
 from offboard.robot_client.records.trace import Trace
@@ -77,18 +76,6 @@ def test_a_robot_that_starts_again_knows_nothing(simulated: Simulated, tmp_path:
     path = tmp_path / "trace.jsonl"
     path.write_text("".join(simulated("heavy-tail", "default", seed).read_text() for seed in (1, 2)))
     assert same_percent(path, "default") >= 99
-
-
-def test_the_policy_sees_the_features_of_the_trace(simulated: Simulated) -> None:
-    """Where the round trip changes, `greedy` does better with the features than with the times alone."""
-    path = simulated("rtt-step", "greedy", measure_all=True)
-    rows, window = read(path), 20
-    tasks = {"features": measured_tasks(rows, read_tasks(path, None)), "times": of_rows(rows)}
-    mean_s = {
-        name: replay(given, "greedy", predictor=None, window=window, feedback="chosen").spent_s.mean()
-        for name, given in tasks.items()
-    }
-    assert mean_s["features"] < mean_s["times"]
 
 
 @pytest.mark.parametrize(

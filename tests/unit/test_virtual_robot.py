@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 
 from offboard.common.errors import Overtaken
-from offboard.loadgen.replay.recorded_tasks import RecordedTask, of_rows
+from offboard.loadgen.replay.dataset_file import write_dataset
+from offboard.loadgen.replay.recorded_tasks import RecordedTask
 from offboard.loadgen.replay.replay import ReplayConfig, replay, tables
 from offboard.loadgen.replay.virtual_robot import Played, VirtualRobot
-from offboard.loadgen.table.measured_rows import Rows, write_csv
+from offboard.loadgen.table.measured_rows import Rows
 from offboard.robot_client.policies import Decision, Forecast, Hedge, Probe
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
+from tests.recorded_rows import of_rows
 
 Times = tuple[float, float]  # onboard, cloud
 
@@ -115,7 +117,7 @@ def stalls() -> Rows:
 def test_probes_and_hedges_change_the_figures(tmp_path: Path) -> None:
     """Hedges shorten the stalls, and probes find the site that has become faster."""
     path = tmp_path / "stalls.csv"
-    write_csv(path, stalls())
+    write_dataset(path, of_rows(stalls()))
     names = ("greedy", "probe:greedy", "hedge:greedy", "hedge:probe:greedy")
     (table,) = tables(path, ReplayConfig(policies=names, window=20))
     mean_s = {line.policy: line.mean_s for line in table.lines}
