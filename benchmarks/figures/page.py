@@ -148,7 +148,7 @@ def _section(step: Step, files: Mapping[str, Measured]) -> Iterator[str]:
         return
     yield from _conditions(there)
     if missing := [unit.part for unit in step.units() if unit not in there]:
-        yield f"Not measured yet: {', '.join(missing)}."
+        yield from ("", f"Not measured yet: {', '.join(missing)}.")
     if step.merge:
         notes = notes_of({unit.part: one.output for unit, one in there.items()})
         yield from ("", *_merged(step, there).lines(), *(["", *notes] if notes else []))
@@ -196,7 +196,7 @@ def _conditions(there: Mapping[Unit, Measured]) -> Iterator[str]:
         lines.setdefault(_where(one), []).append(one)
     names = {id(one): unit.part for unit, one in there.items()}
     for where, some in lines.items():
-        parts = "" if len(lines) == 1 else f"{', '.join(names[id(one)] for one in some)}: "
+        parts = "" if len(lines) == 1 else f"- {', '.join(names[id(one)] for one in some)}: "
         stolen = [one.stolen_percent for one in some if one.stolen_percent is not None]
         worst = f" Its host took at most {max(stolen):g} % of the CPU time." if stolen else ""
         yield f"{parts}Commit {where.format(_span(some))}{worst}"
