@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.figures.__main__ import main
 from benchmarks.figures.markdown_tables import joined, notes_of, tables_of
-from benchmarks.figures.measured import Measured, measure, read_all, why_old
+from benchmarks.figures.measured import OTHER_ROWS, Measured, measure, read_all, why_old
 from benchmarks.figures.page import doubled_titles, filled, pages, results
 from benchmarks.figures.step import FOLDER, ROOT, STEPS, Section, Step, Unit, read_sections, units_of
 from offboard.common.errors import DataError, OffloadError
@@ -132,6 +132,18 @@ def test_the_page_says_what_is_of_another_commit_and_what_is_missing() -> None:
     assert "Not measured yet: [In parts](#in-parts) (b); [Third](#third)." in page
     assert "Commit abc1234, 2026-11-26; AMD EPYC, 2 cores, 8 GiB, Linux 6.1, Python 3.11.7." in page
     assert "### Third\n\nHow fast.\n\n```sh\npython -m speed\n```\n\nNot measured yet.\n" in page
+
+
+def test_the_page_names_tables_of_other_rows_than_those_of_the_checkout() -> None:
+    """If a dataset is measured again, its tables are not up to date until they are."""
+    (unit,) = (one for one in UNITS if one.name == "table-two/paper")
+    now = replace(MEASURED, reads=unit.reads(ROOT), commands=unit.commands())
+    before = replace(now, reads={"loadgen/datasets/paper.csv": {"sha256": "0", "commit": "def5678"}})
+    assert why_old(unit, now, "abc1234") == ""
+    assert why_old(unit, before, "abc1234") == OTHER_ROWS
+    page = results([Section("S", "", (unit.step,))], {unit.name: before})
+    assert "Of rows that were measured again since: [Table II on our own datasets]" in page
+    assert "rows of paper.csv of commit def5678" in page
 
 
 def test_a_block_holds_chosen_rows_and_columns() -> None:
