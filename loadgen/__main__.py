@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 C = TypeVar("C")
 
 PREFIX = "LOADGEN"
+MEASURED = "trace.jsonl of a run, or a CSV file with the columns size,onboard_s,cloud_s"
 SCENARIO, CHANGES = "scenario", "changes to the scenario"
 
 
@@ -148,6 +149,18 @@ def _table(argv: Sequence[str]) -> int:
     return run_table(*_file_and_config("table", TableConfig, argv))
 
 
+def _claims(argv: Sequence[str]) -> int:
+    from offboard.loadgen.claims.claims import run_claims
+    from offboard.loadgen.claims.claims_settings import ClaimsConfig
+
+    parser = _parser("claims", "DATASET ...")
+    parser.add_argument("datasets", type=Path, metavar="DATASET", nargs="+", help=MEASURED)
+    add_flags(parser, ClaimsConfig, PREFIX)
+    flags = parser.parse_args(argv)
+    _find_modules_here()
+    return run_claims(flags.datasets, resolve(ClaimsConfig, flags, environ=os.environ, prefix=PREFIX))
+
+
 def _replay(argv: Sequence[str]) -> int:
     from offboard.loadgen.replay.replay import ReplayConfig, run_replay
 
@@ -255,8 +268,7 @@ def _config(name: str, cls: type[C], argv: Sequence[str], prefix: str = PREFIX) 
 def _file_and_config(name: str, cls: type[C], argv: Sequence[str]) -> tuple[Path, C]:
     """The file and the settings of a command that reads one file of measured times."""
     parser = _parser(name, "TRACE")
-    help = "trace.jsonl of a run, or a CSV file with the columns size,onboard_s,cloud_s"
-    parser.add_argument("trace", type=Path, metavar="TRACE", help=help)
+    parser.add_argument("trace", type=Path, metavar="TRACE", help=MEASURED)
     add_flags(parser, cls, PREFIX)
     flags = parser.parse_args(argv)
     _find_modules_here()
@@ -275,6 +287,7 @@ COMMANDS = {
     "compare": Command("play scenarios with several policies and seeds, and compare the policies", _compare),
     "checks": Command("play scenarios with several policies and seeds, and print every check", _checks),
     "table": Command("make Table II of the paper from a trace or CSV file", _table),
+    "claims": Command("check each claim of the paper on traces or CSV files", _claims),
     "replay": Command("show what each policy would have done with the tasks of a trace or CSV file", _replay),
     "report": Command(
         "make an HTML page and PNG charts of a run, or a page that compares several runs", _report

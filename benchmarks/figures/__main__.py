@@ -80,7 +80,11 @@ def _measure(units: Sequence[Unit], sections: Sequence[Section], commit: str) ->
         if (now := commit_here()) != commit:
             raise OffloadError(f"the code is no longer that of commit {commit}, but {now}")
         measured.write(ROOT / unit.file)
-        write_pages(sections)
+        try:
+            write_pages(sections)
+        except OffloadError as error:
+            failed.append(f"the pages are not written: {error}")
+            _say(failed[-1])
     if failed:
         _say("\n".join(["", *failed]))
     return 1 if failed else 0

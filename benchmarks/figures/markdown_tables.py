@@ -77,13 +77,24 @@ def tables_of(lines: Sequence[str]) -> list[MarkdownTable]:
     return [one for one in blocks_of(lines) if isinstance(one, MarkdownTable)]
 
 
+def first_table(lines: Sequence[str]) -> MarkdownTable:
+    tables = tables_of(lines)
+    if not tables:
+        raise DataError("no table was printed")
+    return tables[0]
+
+
 def joined(heading: str, outputs: Mapping[str, Sequence[str]]) -> MarkdownTable:
-    """The first tables of several outputs as one, with a first column that names the output."""
-    first = {name: tables_of(lines)[0] for name, lines in outputs.items()}
-    one = next(iter(first.values()))
-    if any(table.headings != one.headings for table in first.values()):
-        raise DataError(f"the tables have different columns: {', '.join(first)}")
-    rows = tuple((name, *row) for name, table in first.items() for row in table.rows)
+    """The first tables of several outputs as one, with a first column that names the output.
+
+    It has the columns that all of them have, because a command leaves out columns that do not fit.
+    """
+    first = {name: first_table(lines) for name, lines in outputs.items()}
+    of_all = [set(table.headings) for table in first.values()]
+    common = [one for one in next(iter(first.values())).headings if all(one in each for each in of_all)]
+    chosen = {name: table.chosen({}, common) for name, table in first.items()}
+    one = next(iter(chosen.values()))
+    rows = tuple((name, *row) for name, table in chosen.items() for row in table.rows)
     return MarkdownTable((heading, *one.headings), ("---", *one.rule), rows)
 
 

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from benchmarks.figures.markdown_tables import MarkdownTable, blocks_of, joined, notes_of, tables_of
+from benchmarks.figures.markdown_tables import MarkdownTable, blocks_of, first_table, joined, notes_of
 from benchmarks.figures.measured import OTHER_ROWS, Measured, of_other_rows
 from benchmarks.figures.step import PART, Section, Step, Unit, units_of
 from offboard.common.errors import DataError
@@ -94,7 +94,7 @@ def _filter(text: str) -> tuple[str, list[str]]:
 
 def _table(step: Step, there: Mapping[Unit, Measured]) -> MarkdownTable:
     """The table that other pages may show."""
-    return _merged(step, there) if step.merge else tables_of(next(iter(there.values())).output)[0]
+    return _merged(step, there) if step.merge else first_table(next(iter(there.values())).output)
 
 
 def _merged(step: Step, there: Mapping[Unit, Measured]) -> MarkdownTable:

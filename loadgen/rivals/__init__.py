@@ -15,12 +15,14 @@ _PREDICTORS = {
     "bayesian-least-squares": "adaptive.BayesianLeastSquares",
     "theil-sen": "robust.TheilSen",
     "huber": "robust.Huber",
+    "k-means": "k_means.KMeansOfSizes",
     "random-forest": "random_forest.RandomForest",
     "arima": "arima.Arima",
     "sarima": "arima.Sarima",
     "lstm": "lstm.Lstm",
+    "lstm-sequence": "lstm.LstmSequence",
 }
-_SLOW = ("random-forest", "arima", "sarima", "lstm")
+_SLOW = ("random-forest", "arima", "sarima", "lstm", "lstm-sequence")
 _RULES = {"linucb": "bandits.LinUcb", "thompson": "bandits.Thompson"}
 
 PREDICTORS = (*predictors.names(), *_PREDICTORS)

@@ -129,11 +129,13 @@ def _cell(table: Table, line: Any, name: str) -> str:
 def _latex_cell(cell: str) -> str:
     if cell == UNDEFINED:
         return "--"
-    return f"${cell}$" if cell.startswith("-") else _latex_text(cell)
+    words = cell.split(" ")  # such as those of an interval
+    return " ".join(f"${word}$" if word[:1] == "-" and word[1:] else _latex_text(word) for word in words)
 
 
 def _latex_text(text: str) -> str:
     special = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    special |= {"<": "$<$", ">": "$>$"}
     return "".join(special.get(sign, f"\\{sign}" if sign in "&%$#_{}" else sign) for sign in text)
 
 

@@ -62,7 +62,7 @@ class TableConfig(MeasuredTimesConfig):
     )
     every_window: bool = setting(
         False,
-        "run slow predictors (forest, ARIMA, SARIMA, LSTM) with every N, not only full; may take an hour",
+        "run slow predictors (forest, ARIMA, SARIMA, LSTMs) with every N, not only full; may take an hour",
     )
 
     def __post_init__(self) -> None:

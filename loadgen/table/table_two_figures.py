@@ -162,10 +162,15 @@ def quantile(values: Column, percent: int) -> Column:
 
 def mean_r(sizes: Column, seconds: Column, length: int) -> float | None:
     """Mean Pearson r over all sliding windows of `length` rows; leaves out windows with a constant column."""
+    found = window_r(sizes, seconds, length)
+    return float(found.mean()) if len(found) else None
+
+
+def window_r(sizes: Column, seconds: Column, length: int) -> Column:
+    """Pearson r of each sliding window of `length` rows; leaves out windows with a constant column."""
     d, t = sliding_window_view(sizes, length), sliding_window_view(seconds, length)
     step = max(1, BLOCK_CELLS_MAX // length)
-    found = np.concatenate([_pearson(d[at : at + step], t[at : at + step]) for at in range(0, len(d), step)])
-    return float(found.mean()) if len(found) else None
+    return np.concatenate([_pearson(d[at : at + step], t[at : at + step]) for at in range(0, len(d), step)])
 
 
 def _pearson(d: Column, t: Column) -> Column:

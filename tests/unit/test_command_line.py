@@ -13,6 +13,7 @@ from offboard.common.config import REQUIRED, flag_of, setting, settings_of
 from offboard.common.errors import ConfigError, DataError, OffloadError
 from offboard.common.security.keys import KeysConfig
 from offboard.loadgen.__main__ import DemoConfig, RunConfig
+from offboard.loadgen.claims.claims_settings import ClaimsConfig
 from offboard.loadgen.compare.compare_settings import CompareConfig
 from offboard.loadgen.export.export import ExportConfig
 from offboard.loadgen.play.measure_dataset import DatasetConfig
@@ -33,6 +34,7 @@ CONFIGS = (
     DemoConfig,
     CompareConfig,
     TableConfig,
+    ClaimsConfig,
     ReplayConfig,
     ReportConfig,
     DatasetConfig,

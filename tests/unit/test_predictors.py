@@ -9,9 +9,10 @@ import pytest
 
 from offboard.common.errors import ConfigError, MissingExtra
 from offboard.loadgen import rivals
-from offboard.robot_client import predictors
+from offboard.robot_client import policies, predictors
 from offboard.robot_client.predictors import Predictor
 from tests import checks
+from tests.table_loops import section
 
 ROOT = Path(__file__).parents[2]
 BAYES = "river:linear_model.BayesianLinearRegression"
@@ -19,12 +20,18 @@ NAMES = (*rivals.PREDICTORS, BAYES)
 WINDOWED = tuple(name for name in NAMES if name != predictors.PARTS)
 
 # Limits of the error on a straight line, as a share of the error of the mean time.
-GAINS = dict.fromkeys(NAMES, 0.05) | {predictors.PARTS: 0.1, "random-forest": 0.2, "lstm": 0.3}
+GAINS = (
+    dict.fromkeys(NAMES, 0.05)
+    | {predictors.PARTS: 0.1, "random-forest": 0.2}
+    | {"k-means": 0.2, "lstm": 0.3, "lstm-sequence": 0.3}
+)
 EXTRAS = {  # for each predictor, the library that it needs, and the extra that installs it
+    "k-means": ("sklearn", "learned"),
     "random-forest": ("sklearn", "learned"),
     "arima": ("statsmodels", "learned"),
     "sarima": ("statsmodels", "learned"),
     "lstm": ("torch", "lstm"),
+    "lstm-sequence": ("torch", "lstm"),
     BAYES: ("river", "river"),
 }
 BASE = tuple(name for name in rivals.PREDICTORS if name not in EXTRAS)
@@ -47,6 +54,7 @@ def make(name: str) -> Callable[[], Predictor]:
     return lambda: rivals.make(name, checks.WINDOW, seed=3)
 
 
+@pytest.mark.timeout(60)  # the LSTMs are fitted up to ten times
 @pytest.mark.parametrize("check", checks.CONTRACT, ids=lambda check: check.__name__)
 def test_contract(check: Callable[[checks.Make], None], make: checks.Make) -> None:
     """Every check of the contract holds for every predictor."""
@@ -78,6 +86,15 @@ def test_an_unknown_name_is_refused_with_all_names() -> None:
             refuse("theil-send")
         for part in ("'theil-send'", *names, "or MODULE.CLASS of your own"):
             assert part in str(refused.value)
+
+
+def test_the_evaluation_page_lists_every_name() -> None:
+    """Its table has a line for every predictor, and each rule of a rival is named."""
+    table = section("Predictors")
+    for listed in rivals.PREDICTORS:
+        assert f"`{listed}`" in table, listed
+    for rule in set(rivals.RULES) - set(policies.names()):
+        assert f"`{rule}`" in section("Replay"), rule
 
 
 def test_a_robot_knows_a_rival_by_its_path(name: str) -> None:

@@ -1,0 +1,158 @@
+"""One claim of the paper next to our figure, and the rule that says whether they agree.
+
+The figures are computed in the other files of this folder.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from offboard.loadgen.table.confidence_intervals import Blocks, Picks
+from offboard.loadgen.table.measured_rows import Column
+from offboard.loadgen.table.table_formats import UNDEFINED, Heading
+
+YES, NO, UNCLEAR = "yes", "no", "unclear"
+DIGITS, INTERVAL_DIGITS = 4, 3  # of the figures in Markdown and LaTeX
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One of our figures with its 95 % interval. None: undefined; `exact`: it needs no interval."""
+
+    value: float | None
+    low: float | None = None
+    high: float | None = None
+    exact: bool = False
+
+    def times(self, factor: float) -> "Figure":
+        """The same in another unit."""
+        value, low, high = (
+            None if one is None else factor * one for one in (self.value, self.low, self.high)
+        )
+        return replace(self, value=value, low=low, high=high)
+
+
+@dataclass(frozen=True, slots=True)
+class Claimed:
+    """Between which limits the paper says that the figure is."""
+
+    low: float = -math.inf
+    high: float = math.inf
+
+    def agrees(self, figure: Figure) -> str:
+        """Yes or no if the whole interval is inside or outside of the limits; otherwise unclear."""
+        value = figure.value
+        low, high = (value, value) if figure.exact else (figure.low, figure.high)
+        if low is None or high is None:
+            return UNCLEAR
+        if self.low < low and high < self.high:
+            return YES
+        return NO if high <= self.low or self.high <= low else UNCLEAR
+
+
+POSITIVE = Claimed(low=0.0)
+BELOW_ONE = Claimed(high=1.0)
+ABOVE_ONE = Claimed(low=1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """One line of the table. `above` and `below` are the limits of the rule; None: there is none.
+
+    `number` is that of the section in docs/claims.md. `more` is the command that shows more.
+    """
+
+    number: int
+    claim: str
+    theirs: str
+    ours: float | None
+    low: float | None
+    high: float | None
+    above: float | None
+    below: float | None
+    agrees: str
+    more: str = ""
+    note: str = ""
+
+    @property
+    def ours_shown(self) -> str:
+        return _shown(self.ours)
+
+    @property
+    def interval(self) -> str:
+        if self.low is None or self.high is None:
+            return UNDEFINED
+        return f"{self.low:.{INTERVAL_DIGITS}g} to {self.high:.{INTERVAL_DIGITS}g}"
+
+
+HEADINGS = {
+    "number": Heading("no.", "no.", None),
+    "claim": Heading("claim", "claim", None),
+    "theirs": Heading("theirs", "theirs", None),
+    "ours_shown": Heading("ours", "ours", None),
+    "interval": Heading("95 % interval", r"95 \% interval", None),
+    "agrees": Heading("agrees", "agrees", None),
+}
+
+
+def claim(
+    number: int,
+    words: str,
+    figure: Figure,
+    *,
+    theirs: str | float | None = None,
+    claimed: Claimed | None = None,
+    note: str = "",
+) -> Claim:
+    """The line of a figure. Without `claimed`, the paper says nothing that it could agree with."""
+    above, below = (None, None) if claimed is None else (claimed.low, claimed.high)
+    return Claim(
+        number=number,
+        claim=words,
+        theirs=theirs if isinstance(theirs, str) else _shown(theirs),
+        ours=figure.value,
+        low=figure.low,
+        high=figure.high,
+        above=None if above == -math.inf else above,
+        below=None if below == math.inf else below,
+        agrees=UNDEFINED if claimed is None else claimed.agrees(figure),
+        note=note,
+    )
+
+
+def unknown(number: int, words: str, why: str) -> Claim:
+    """A line without a figure."""
+    return replace(claim(number, words, Figure(None), note=why), agrees=UNDEFINED)
+
+
+def bootstrapped(blocks: Blocks, figure: Callable[[Picks], Column]) -> Figure:
+    """A figure of all rows, with its interval. `figure` returns one value for each resample."""
+    if not blocks.rows:
+        return Figure(None)
+    value = float(figure(np.arange(blocks.rows)[np.newaxis])[0])
+    if not math.isfinite(value):
+        return Figure(None)
+    low, high = blocks.intervals(lambda picks: {"it": figure(picks)})
+    return Figure(value, low.get("it"), high.get("it"))
+
+
+def mean_of(blocks: Blocks, values: Column) -> Figure:
+    """The mean of one value for each row."""
+    return bootstrapped(blocks, lambda picks: values[picks].mean(-1))
+
+
+def ratio(blocks: Blocks, values: Column, others: Column) -> Figure:
+    """The sum of one value for each row, as a share of the sum of another one."""
+
+    def share(picks: Picks) -> Column:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found: Column = values[picks].sum(-1) / others[picks].sum(-1)
+        return found
+
+    return bootstrapped(blocks, share)
+
+
+def _shown(value: float | None) -> str:
+    return UNDEFINED if value is None else f"{value:.{DIGITS}g}"

@@ -1,0 +1,85 @@
+"""`loadgen claims`: one line for each claim of the paper, next to our own figure, for each dataset.
+
+The other files of this folder compute the lines. docs/claims.md explains them.
+"""
+
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from offboard.loadgen.claims.claim import HEADINGS, Claim
+from offboard.loadgen.claims.claims_settings import ClaimsConfig
+from offboard.loadgen.claims.computing_time import ROUNDS, computing_time
+from offboard.loadgen.claims.prediction_claims import K_MEANS, RIVALS, PredictionClaims
+from offboard.loadgen.claims.sample_order import sample_order
+from offboard.loadgen.claims.several_inputs import several_inputs
+from offboard.loadgen.claims.significance import significance
+from offboard.loadgen.progress import Progress, progress
+from offboard.loadgen.table.measured_rows import Rows
+from offboard.loadgen.table.measurement_notes import read_noted
+from offboard.loadgen.table.table_columns import ColumnSettings
+from offboard.loadgen.table.table_formats import Table
+
+MORE = {  # for each claim, the command that shows more of it
+    1: "loadgen table {file} --columns r_cloud,r_onboard --bootstrap",
+    3: "loadgen table {file} --feedback both --bootstrap --all",
+    4: "loadgen table {file} --bootstrap",
+    5: "loadgen table {file} --windows full --predictors all --bootstrap",
+    6: "python -m benchmarks decision",
+    8: "loadgen table {file} --predictors k-means,least-squares --bootstrap",
+    9: "loadgen replay {file} --policies paper,onboard,cloud --bootstrap",
+}
+
+
+def run_claims(paths: Sequence[Path], config: ClaimsConfig) -> int:
+    """Print one table for each dataset to stdout."""
+    read = [(path, read_noted(path, config.kind)) for path in paths]  # first, so that mistakes show at once
+    with progress("claims", len(paths) * _steps(config)) as shown:
+        tables = [_table(path, rows, config, shown) for path, rows in read]
+    sys.stdout.write(ColumnSettings().text(tables, config.format))
+    return 0
+
+
+def _table(path: Path, rows: Rows, config: ClaimsConfig, shown: Progress) -> Table:
+    lines = [
+        replace(one, more=MORE.get(one.number, "docs/claims.md").format(file=path))
+        for one in claims(path, rows, config, shown)
+    ]
+    left_out = f" ({rows.left_out} tasks without both times left out)" if rows.left_out else ""
+    return Table(
+        caption=f"{path}: {len(rows)} rows{left_out}. The numbers are those of the claims in docs/claims.md.",
+        about={"source": str(path), "rows": len(rows), "left_out": rows.left_out},
+        headings=HEADINGS,
+        lines=lines,
+        notes=(
+            *rows.notes,
+            *(f"More of {number}: {more.format(file=path)}" for number, more in MORE.items()),
+        ),
+    )
+
+
+def claims(path: Path, rows: Rows, config: ClaimsConfig, shown: Progress) -> Iterator[Claim]:
+    """The lines of one dataset, by claim."""
+    of_predictions = PredictionClaims(rows, config)
+    yield from significance(rows, config)
+    shown.step()
+    yield from sample_order(rows, config)
+    shown.step()
+    yield from of_predictions.errors()
+    yield from of_predictions.accuracy()
+    shown.step()
+    compared = []
+    for name in config.rivals():
+        compared.append(of_predictions.rival(name))
+        shown.step()
+    yield from (one for one in compared if one.number == RIVALS)
+    yield from computing_time(rows, config, shown.step)
+    yield from several_inputs(path, rows, config)
+    yield from (one for one in compared if one.number == K_MEANS)
+    yield from of_predictions.saving()
+
+
+def _steps(config: ClaimsConfig) -> int:
+    """How often `claims` steps."""
+    return 3 + len(config.rivals()) + ROUNDS + 1

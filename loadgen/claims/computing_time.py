@@ -1,0 +1,99 @@
+"""Claim 6: least squares needs less time than the other predictors to be trained and to predict."""
+
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+from offboard.common.errors import MissingExtra
+from offboard.loadgen import rivals
+from offboard.loadgen.claims.claim import ABOVE_ONE, Claim, Figure, claim, unknown
+from offboard.loadgen.claims.claims_settings import ClaimsConfig
+from offboard.loadgen.table.measured_rows import Rows
+from offboard.robot_client.predictors import LEAST_SQUARES, Predictor
+
+CLAIM = 6
+# The median of six rounds lies between the least and the greatest with a probability of 1 - 2 / 2^6 = 97 %.
+ROUNDS = 6
+CLAIMED = ("lstm", "lstm-sequence")  # the paper compares itself only with an LSTM
+
+
+@dataclass
+class Times:
+    """The seconds of one predictor in each round: all training, and one prediction."""
+
+    training_s: list[float] = field(default_factory=list)
+    prediction_s: list[float] = field(default_factory=list)
+
+
+def computing_time(
+    rows: Rows, config: ClaimsConfig, step: Callable[[], object] = lambda: None
+) -> Iterator[Claim]:
+    """The times of each predictor as multiples of those of least squares.
+
+    Training is to learn the first 80 % of the onboard times and to make the first prediction, because most
+    predictors fit when they are asked. In each round every predictor has its turn, so that a slow minute of
+    the machine counts for all. It is CPU time, so that other programs do not count. `step` is called after
+    each of the ROUNDS + 1 rounds.
+    """
+    split = len(rows) * 4 // 5
+    if not 2 <= split < len(rows):
+        yield unknown(CLAIM, "computing time", "not enough rows")
+        return
+    times, missing = measured(rows, split, config, step)
+    line = times.pop(LEAST_SQUARES)
+    yield claim(CLAIM, f"{LEAST_SQUARES}: training, ms", _median([1e3 * s for s in line.training_s]))
+    yield claim(CLAIM, f"{LEAST_SQUARES}: prediction, ms", _median([1e3 * s for s in line.prediction_s]))
+    for name in config.rivals():
+        if name in missing:
+            yield unknown(CLAIM, f"{name}: times", missing[name])
+            continue
+        theirs, claimed = ("> 1", ABOVE_ONE) if name in CLAIMED else (None, None)
+        for words, own, base in (
+            ("training", times[name].training_s, line.training_s),
+            ("prediction", times[name].prediction_s, line.prediction_s),
+        ):
+            ratios = [one / other for one, other in zip(own, base, strict=True)]
+            yield claim(CLAIM, f"{words}, {name}", _median(ratios), theirs=theirs, claimed=claimed)
+
+
+def measured(
+    rows: Rows, split: int, config: ClaimsConfig, step: Callable[[], object]
+) -> tuple[dict[str, Times], dict[str, str]]:
+    """The times of each predictor, and why the others could not be made. The first round does not count."""
+    times: dict[str, Times] = {}
+    missing: dict[str, str] = {}
+    for turn in range(ROUNDS + 1):
+        for name in (LEAST_SQUARES, *config.rivals()):
+            if name in missing:
+                continue
+            try:
+                predictor = rivals.make(name, split, config.seed)
+            except MissingExtra as error:
+                missing[name] = str(error)
+                continue
+            training_s, prediction_s = _timed(predictor, rows, split)
+            if turn:
+                times[name].training_s.append(training_s)
+                times[name].prediction_s.append(prediction_s)
+            else:
+                times[name] = Times()
+        step()
+    return times, missing
+
+
+def _timed(predictor: Predictor, rows: Rows, split: int) -> tuple[float, float]:
+    """The seconds of training, and of one prediction: the mean over the rows after the split."""
+    sizes, seconds = rows.size.tolist(), rows.onboard_s.tolist()
+    began = time.process_time()
+    for size, second in zip(sizes[:split], seconds[:split], strict=True):
+        predictor.learn(size, second)
+    predictor.predict(sizes[split])
+    trained = time.process_time()
+    for size in sizes[split:]:
+        predictor.predict(size)
+    return trained - began, (time.process_time() - trained) / (len(sizes) - split)
+
+
+def _median(values: list[float]) -> Figure:
+    return Figure(statistics.median(values), min(values), max(values))

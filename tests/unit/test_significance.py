@@ -1,0 +1,51 @@
+"""Claim 1: the p-value of Pearson's r, and which windows are significant."""
+
+import numpy as np
+import pytest
+
+from offboard.loadgen.claims.claims_settings import ClaimsConfig
+from offboard.loadgen.claims.significance import P_MAX, p_value, significance, smallest_significant_r
+from offboard.loadgen.table.measured_rows import Rows
+
+
+@pytest.mark.parametrize("rows", [3, 4, 5, 10, 50, 200, 1000, 1_000_000])
+@pytest.mark.parametrize("r", [0.0, 0.001, 0.05, 0.3, -0.3, 0.8, 0.999999, 1.0])
+def test_the_p_value_equals_scipy(rows: int, r: float) -> None:
+    """For few and for many rows, weak and strong correlations, it is that of scipy to nine digits."""
+    special = pytest.importorskip("scipy.special", reason="scipy is not installed: `make install`")
+    theirs = float(special.betainc((rows - 2) / 2, 0.5, 1 - r * r))
+    assert p_value(r, rows) == pytest.approx(theirs, rel=1e-9, abs=1e-300)
+
+
+def test_known_p_values() -> None:
+    """Three rows: t has one degree of freedom, so p is an arctangent. Two rows say nothing."""
+    assert p_value(np.sqrt(0.5), 3) == pytest.approx(0.5, rel=1e-12)  # t = 1
+    assert p_value(1.0, 2) == 1.0
+
+
+@pytest.mark.parametrize("rows", [5, 50, 500])
+def test_the_smallest_significant_r_has_that_p_value(rows: int) -> None:
+    """r is significant from there on."""
+    r = smallest_significant_r(rows)
+    assert p_value(r, rows) == pytest.approx(P_MAX, rel=1e-6)
+    assert p_value(r - 1e-6, rows) > P_MAX
+
+
+def test_a_line_is_significant_and_noise_is_not() -> None:
+    """Times on a line agree with the paper at every N, and times that are only noise do not."""
+    random = np.random.default_rng(4)
+    size = random.uniform(0, 5, 300)
+    rows = Rows(size, onboard_s=0.1 + size + random.normal(0, 0.1, 300), cloud_s=random.uniform(1, 2, 300))
+    config = ClaimsConfig(windows=("10", "50"), predictors=("least-squares",))
+    agreed = {one.claim: one.agrees for one in significance(rows, config)}
+    assert {agreed[words] for words in agreed if words.startswith("onboard")} == {"yes"}
+    assert agreed["cloud: p of r, all rows"] == "no"
+    assert agreed["cloud: N = 50, % with p < 0.005"] == "no"
+
+
+def test_equal_sizes_have_no_correlation() -> None:
+    """A dataset with one size only, and one that is shorter than the window, get lines without figures."""
+    rows = Rows(np.ones(40), onboard_s=np.arange(40.0), cloud_s=np.arange(40.0))
+    found = list(significance(rows, ClaimsConfig(windows=("10", "50"), predictors=("least-squares",))))
+    assert {one.ours for one in found} == {None}
+    assert {one.note for one in found} == {"too few different rows", "not enough rows"}
