@@ -19,7 +19,7 @@ RAY_READY := .cache/ray/.ready
 
 ROS2_READY := .cache/ros2-kilted/.ready .cache/ros2-jazzy/.ready
 
-.PHONY: help demo install format lint type test unit pythons integration compose chaos state bench examples ray ros2 browser prometheus torch up down table lock wheel clean
+.PHONY: help demo install format lint type test unit pythons integration compose chaos state bench figures examples ray ros2 browser prometheus torch up down table lock wheel clean
 
 help: ## list the targets
 	@grep -E '^[a-z0-9]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -71,6 +71,9 @@ state: $(DEV_READY) ## abuse a robot for ten minutes and count lost, wrong and h
 
 bench: $(PEERS_READY) ## measure speed next to other libraries; needs an otherwise idle machine
 	$(BIN)/python -m benchmarks
+
+figures: $(DEV_READY) ## measure all figures of the docs that are not up to date, ONLY=NAME,..: these only; takes hours
+	$(BIN)/python -m benchmarks.figures $(if $(ONLY),--only $(ONLY))
 
 examples: $(EXAMPLES_READY) ## measure the five applications with one seed, FULL=1: with three; needs an otherwise idle machine
 	$(EXAMPLES_BIN)/python -m benchmarks.applications $(if $(FULL),--seeds 3)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from benchmarks.application_docs import publish
 from benchmarks.application_runs import Planned, Progress, find_kind, planned, play
 from benchmarks.application_tables import WORST, Run, faults, table, tasks_csv, worst_tasks
 from benchmarks.measure import processor
@@ -21,7 +20,7 @@ from offboard.common.config import check, flag_of, resolve, setting, settings_of
 from offboard.common.errors import ConfigError
 from offboard.common.toml_file import unknown
 from offboard.loadgen.compare.compare_settings import SEEDS_MAX
-from offboard.loadgen.play.machine import commit_here
+from offboard.loadgen.play.code_commit import commit_here
 from offboard.loadgen.play.run_files import SUMMARY
 from offboard.loadgen.table.measured_rows import write_whole
 
@@ -48,9 +47,6 @@ class ApplicationsConfig:
     out: Path = setting(
         Path("out/examples"), "folder for tables, pictures and the folders of the runs", metavar="DIR"
     )
-    publish: bool = setting(
-        False, "measure nothing: copy the tables and pictures of --out into docs/, with no change"
-    )
 
     def __post_init__(self) -> None:
         check(self)
@@ -70,9 +66,6 @@ def _run(argv: Sequence[str]) -> int:
     for name in names:
         if name not in NAMES:
             raise ConfigError(unknown("application", name, NAMES))
-    if config.publish:
-        publish(names, config.out)
-        return 0
     return measure(names, config)
 
 

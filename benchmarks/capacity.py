@@ -23,6 +23,7 @@ from typing import Any
 
 from benchmarks.measure import processor
 from benchmarks.servers import Server, cloud_server
+from offboard.loadgen.play.code_commit import commit_here
 from offboard.loadgen.robot_files import read_trace
 
 MAP = Path(__file__).parents[1] / "maps" / "willow-full-0.05.yaml"
@@ -72,10 +73,10 @@ def main() -> None:
         before = memory_mib(server, "VmRSS")
         for rate in map(float, chosen.rates.split(",")):
             step = measure(server, rate, seconds=chosen.seconds, resolution=chosen.resolution)
-            print(step, flush=True)
+            print(step, file=sys.stderr, flush=True)
             steps.append(asdict(step))
         figures = {
-            "measured": f"{datetime.now(UTC):%Y-%m-%d}, commit {commit()}",
+            "measured": f"{datetime.now(UTC):%Y-%m-%d}, commit {commit_here() or 'unknown'}",
             "machine": f"{processor()}, {os.cpu_count()} cores, shared by server and {ROBOTS} robots",
             "task": f"plan_path on {MAP.stem} at {chosen.resolution} m",
             "workers": chosen.workers,
@@ -187,11 +188,6 @@ def memory_mib(server: Server, field: str) -> int:
     found = re.search(rf"^{field}:\s*(\d+) kB", Path(f"/proc/{server.pid}/status").read_text(), re.MULTILINE)
     assert found is not None
     return round(int(found[1]) / 1024)
-
-
-def commit() -> str:
-    command = ["git", "rev-parse", "--short", "HEAD"]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
 if __name__ == "__main__":

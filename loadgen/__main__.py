@@ -129,6 +129,19 @@ def _compare(argv: Sequence[str]) -> int:
     return run_compare(flags.scenarios, resolve(CompareConfig, flags, environ=os.environ, prefix=PREFIX))
 
 
+def _checks(argv: Sequence[str]) -> int:
+    from offboard.loadgen.compare.scenario_checks import ChecksConfig, run_checks
+    from offboard.loadgen.scenario.scenario_file import shipped
+
+    parser = _parser("checks", "SCENARIO ...")
+    help = f"TOML files, or some of {', '.join(shipped())}"
+    parser.add_argument("scenarios", metavar="SCENARIO", nargs="+", help=help)
+    add_flags(parser, ChecksConfig, PREFIX)
+    flags = parser.parse_args(argv)
+    _find_modules_here()
+    return run_checks(flags.scenarios, resolve(ChecksConfig, flags, environ=os.environ, prefix=PREFIX))
+
+
 def _table(argv: Sequence[str]) -> int:
     from offboard.loadgen.table.table_settings import TableConfig
     from offboard.loadgen.table.table_two import run_table
@@ -272,6 +285,7 @@ COMMANDS = {
     "run": Command("play a scenario, and judge its checks", _run),
     "watch": Command("show a run on a page, while it goes on or later, with a time slider", _watch),
     "compare": Command("play scenarios with several policies and seeds, and compare the policies", _compare),
+    "checks": Command("play scenarios with several policies and seeds, and print every check", _checks),
     "table": Command("make Table II of the paper from a trace or CSV file", _table),
     "claims": Command("check each claim of the paper on traces or CSV files", _claims),
     "replay": Command("show what each policy would have done with the tasks of a trace or CSV file", _replay),

@@ -1,4 +1,4 @@
-"""What this machine is: processor, memory, graphics processor, system, and the commit of the checkout."""
+"""What this machine is: processor, memory, graphics processor and system."""
 
 import os
 import platform
@@ -11,7 +11,6 @@ from offboard.loadgen.testbed.container_part import IMAGES
 
 ASK_S = 30.0
 NONE = "none"
-WRITTEN = tuple(f":(top,exclude){folder}" for folder in ("loadgen/datasets", "docs"))
 ROOT = Path("/")
 # Devices of graphics processors: NVIDIA, any with a kernel driver, AMD compute, Jetson, Windows with WSL.
 GPU_DEVICES = ("nvidia[0-9]*", "dri/renderD*", "kfd", "nvhost-gpu", "dxg")
@@ -51,16 +50,6 @@ def gpu(root: Path) -> str:
         lines = path.read_text(errors="replace").splitlines()
         models += [line.partition(":")[2].strip() for line in lines if line.startswith("Model")]
     return ", ".join(models or found) or NONE
-
-
-def commit_here() -> str | None:
-    """The commit of the checkout in the current folder, marked `-dirty` if files were changed.
-
-    Files that a measurement writes do not count: datasets and figures.
-    """
-    commit = output_of(("git", "describe", "--always", "--abbrev=12"))
-    changed = ("git", "status", "--porcelain", "--untracked-files=no", "--", ":/")
-    return f"{commit}-dirty" if commit and output_of((*changed, *WRITTEN)) else commit
 
 
 def output_of(command: Sequence[str]) -> str | None:

@@ -12,7 +12,8 @@ from typing import Any
 
 from offboard.common import VERSION
 from offboard.common.config import check, setting
-from offboard.loadgen.play.machine import commit_here, docker_version, machine
+from offboard.loadgen.play.code_commit import commit_here
+from offboard.loadgen.play.machine import docker_version, machine
 from offboard.loadgen.play.play_scenario import TESTBEDS, play
 from offboard.loadgen.play.run_files import TRACE
 from offboard.loadgen.play.table_one import specifications, table_one

@@ -23,13 +23,15 @@ READINGS_MIN = 6  # readings of a part that are needed to tell whether it grows
 class Figure:
     """One figure of an outcome: its unit, its meaning, and the function that computes it (None: undefined).
 
-    `needs` names the setting of the workload that the figure cannot do without.
+    `needs` names the setting of the workload that the figure cannot do without. `real`: only real processes
+    have it, because a simulation computes no answers, and has no memory and no overhead.
     """
 
     unit: str
     about: str
     compute: Callable[[Outcome], float | None] = field(repr=False)
     needs: str | None = None
+    real: bool = False
 
 
 def _lost(run: Outcome) -> float:
@@ -156,9 +158,13 @@ def _growth(of: Callable[[Reading], float]) -> Callable[[Outcome], float | None]
 
 FIGURES: dict[str, Figure] = {
     "lost": Figure("tasks", "tasks that were never answered", _lost),
-    "wrong": Figure("tasks", "tasks with a wrong answer", _wrong, "jump"),
+    "wrong": Figure("tasks", "tasks with a wrong answer", _wrong, "jump", real=True),
     "unverified": Figure(
-        "tasks", "answers with unexpected bytes that are too large to be compared", _unverified, "jump"
+        "tasks",
+        "answers with unexpected bytes that are too large to be compared",
+        _unverified,
+        "jump",
+        real=True,
     ),
     "failed": Figure("tasks", "tasks that ended with an error", _failed),
     "mean_ms": Figure("ms", "mean time from when a task is due to its answer", _mean_ms),
@@ -198,17 +204,18 @@ FIGURES: dict[str, Figure] = {
     ),
     "regret_ms": Figure("ms", "mean time that the faster site would have saved", _regret_ms, "reference"),
     "overhead_ms": Figure(
-        "ms", "median time that Offboard itself added to a task that ran on one site", _overhead_ms
+        "ms", "median time that Offboard itself added to a task that ran on one site", _overhead_ms, real=True
     ),
     "overhead_percent": Figure(
-        "%", "overhead_ms as a share of the mean time of these tasks", _overhead_percent
+        "%", "overhead_ms as a share of the mean time of these tasks", _overhead_percent, real=True
     ),
     "memory_growth_percent": Figure(
-        "%", "memory growth of the part that grew most", _growth(lambda one: one.memory_bytes)
+        "%", "memory growth of the part that grew most", _growth(lambda one: one.memory_bytes), real=True
     ),
     "handles_growth_percent": Figure(
         "%",
         "growth in open files and sockets of the part that grew most",
         _growth(lambda one: one.handles),
+        real=True,
     ),
 }

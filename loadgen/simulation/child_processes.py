@@ -1,9 +1,13 @@
-"""Processes that compute for a command: at Ctrl-C, which reaches them too, they end without a word."""
+"""Processes that compute for a command: they end without a word at Ctrl-C, and when the command is killed."""
 
 import contextlib
+import ctypes
 import signal
+import sys
 from collections.abc import Iterator
 from multiprocessing import resource_tracker
+
+PR_SET_PDEATHSIG = 1  # prctl(2)
 
 
 @contextlib.contextmanager
@@ -21,6 +25,11 @@ def starting() -> Iterator[None]:
 
 
 def end_quietly() -> None:
-    """Called first in a child: from now on Ctrl-C ends it. The command says that it was interrupted."""
+    """Called first in a child: from now on Ctrl-C ends it. The command says that it was interrupted.
+
+    A child would wait for work for ever if the command were killed: it holds both ends of its pipe.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

@@ -1,9 +1,11 @@
-"""Commands that compute in several processes, in which Ctrl-C arrives."""
+"""Commands that compute in several processes, and how these end."""
 
+import contextlib
 import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -35,12 +37,11 @@ def cpu_s(process: Path) -> float:
     return sum(map(int, used)) / os.sysconf("SC_CLK_TCK")
 
 
-@pytest.mark.parametrize("after_s", [IMPORTING_S, COMPUTING_S])
-@pytest.mark.parametrize("name", COMMANDS)
-def test_ctrl_c_ends_all_processes_with_one_line(name: str, after_s: float, tmp_path: Path) -> None:
-    """The signal reaches all processes, as in a terminal; only the command itself says so."""
+@contextlib.contextmanager
+def busy(name: str, after_s: float, out: Path) -> "Iterator[subprocess.Popen[str]]":
+    """A command whose processes have used this CPU time."""
     with subprocess.Popen(
-        [sys.executable, "-m", "offboard.loadgen", *COMMANDS[name], str(tmp_path), "--jobs", str(JOBS)],
+        [sys.executable, "-m", "offboard.loadgen", *COMMANDS[name], str(out), "--jobs", str(JOBS)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -49,9 +50,33 @@ def test_ctrl_c_ends_all_processes_with_one_line(name: str, after_s: float, tmp_
     ) as command:
         try:
             until(lambda: sum(cpu_s(one) >= after_s for one in children(command.pid)) == JOBS)
-            os.killpg(command.pid, signal.SIGINT)
-            said = command.communicate(timeout=30)[1]
+            yield command
         finally:
             command.kill()
+
+
+@pytest.mark.parametrize("after_s", [IMPORTING_S, COMPUTING_S])
+@pytest.mark.parametrize("name", COMMANDS)
+def test_ctrl_c_ends_all_processes_with_one_line(name: str, after_s: float, tmp_path: Path) -> None:
+    """The signal reaches all processes, as in a terminal; only the command itself says so."""
+    with busy(name, after_s, tmp_path) as command:
+        os.killpg(command.pid, signal.SIGINT)
+        said = command.communicate(timeout=30)[1]
     assert command.returncode == INTERRUPTED_EXIT, said
     assert said == f"loadgen {name}: interrupted\n"
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_no_process_outlives_a_killed_command(name: str, tmp_path: Path) -> None:
+    """A command that is killed cannot end its processes, so they end by themselves."""
+    with busy(name, COMPUTING_S, tmp_path) as command:
+        computing = children(command.pid)
+        command.kill()
+        command.wait()
+        until(lambda: not any(map(_runs, computing)))
+
+
+def _runs(process: Path) -> bool:
+    with contextlib.suppress(OSError):
+        return (process / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    return False

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from benchmarks import applications
-from benchmarks.application_docs import PAGE, publish
 from benchmarks.application_runs import Planned
 from benchmarks.application_tables import (
     POLICIES,
@@ -22,7 +21,6 @@ from benchmarks.application_tables import (
     tasks_csv,
     worst_tasks,
 )
-from offboard.common.errors import ConfigError
 from offboard.loadgen.scenario.outcome import Answered, Outcome
 
 TIMES_MS = {
@@ -194,37 +192,9 @@ def test_a_lost_answer_is_named_and_gives_exit_code_1(
         (["apriltag"], "unknown application 'apriltag'; did you mean 'apriltags'?"),
         (["--scenarios", "calm,storm"], "--scenarios: 'storm' is not one of calm, outage, bandwidth, busy"),
         (["--seeds", "0"], "--seeds: 0 is below 1, the minimum"),
-        (["arm", "--publish", "--out", "no"], "--publish: no/arm.md is missing: measure arm first"),
     ],
 )
 def test_a_wrong_value_is_one_line(flags: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     """It gives exit code 2."""
     assert applications.main(flags) == 2
     assert capsys.readouterr().err == f"python -m benchmarks.applications: {said}\n"
-
-
-def test_publishing_replaces_what_is_between_the_marks(tmp_path: Path) -> None:
-    """The rest of the page stays, and publishing again replaces the table again."""
-    page = tmp_path / PAGE
-    page.parent.mkdir()
-    page.write_text("# Arm\n\n<!-- table: arm -->\n<!-- end of table -->\n\nMore.\n")
-    for text in ("| old |", "| new |"):
-        (tmp_path / "arm.md").write_text(f"{text}\n")
-        (tmp_path / "arm.svg").write_text(f"<svg>{text}</svg>")
-        publish(["arm"], tmp_path, root=tmp_path)
-    shown = "![Response time of each task, onboard and in the cloud](pictures/arm.svg)"
-    wanted = f"# Arm\n\n<!-- table: arm -->\n\n{shown}\n\n| new |\n\n<!-- end of table -->\n\nMore.\n"
-    assert page.read_text() == wanted
-    assert (page.parent / "pictures" / "arm.svg").read_text() == "<svg>| new |</svg>"
-    for name in ("signs.md", "signs.svg"):
-        (tmp_path / name).write_text("")
-    with pytest.raises(ConfigError, match=r"docs/applications.md has no lines <!-- table: signs -->"):
-        publish(["signs"], tmp_path, root=tmp_path)
-
-
-def test_the_page_has_marks_for_every_application() -> None:
-    """So each of them can be published."""
-    page = (Path(__file__).parents[2] / PAGE).read_text()
-    for name in applications.NAMES:
-        assert page.count(f"<!-- table: {name} -->\n") == 1
-    assert page.count("<!-- end of table -->") == len(applications.NAMES)

@@ -1,7 +1,6 @@
 """Servers and money for a fleet, computed from measured figures and the reader's prices."""
 
 import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,6 @@ import pytest
 
 from benchmarks.cost_per_task import main
 
-ROOT = Path(__file__).parents[2]
 PRICES = ("--server-hour", "0.5", "--gigabyte-out", "0.25", "--gigabyte-radio", "2")
 STEP = {
     "by_server": 1,
@@ -50,19 +48,6 @@ def test_servers_and_money_follow_from_figures_and_prices(
     money = [4 * 0.5, 3.24 * 0.25, 3.6 * 2]
     expected = [100, 50, 4, 3.6, *money, sum(money), sum(money) / 0.18]
     assert [float(cell) for cell in found] == pytest.approx(expected, rel=1e-3)
-
-
-def test_the_page_shows_what_the_program_prints(capsys: pytest.CaptureFixture[str]) -> None:
-    """The tables of docs/scale.md are those of its command and of the measured figures in the repository."""
-    page = (ROOT / "docs" / "scale.md").read_text()
-    (command,) = re.findall(
-        r"^\.venv/bin/python -m benchmarks.cost_per_task benchmarks/(.*)$", page, re.MULTILINE
-    )
-    name, *flags = command.split()
-    assert main([str(ROOT / "benchmarks" / name), *flags]) == 0
-    printed = rows(capsys.readouterr().out)
-    assert {len(row) for row in printed} == {9}
-    assert [row for row in printed if row not in rows(page)] == []
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,8 @@
-"""What a dataset says of the machine and the checkout that it was measured on."""
+"""What a dataset says of the machine that it was measured on."""
 
-import subprocess
 from pathlib import Path
 
-import pytest
-
-from offboard.loadgen.play.machine import commit_here, gpu, machine
+from offboard.loadgen.play.machine import gpu, machine
 from offboard.loadgen.play.table_one import specifications, table_one
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.table.table_formats import render
@@ -37,23 +34,3 @@ def test_table_one_names_what_robot_and_cloud_ran_on(tmp_path: Path) -> None:
     assert whats == ["processor", "cores", "CPU quota", "RAM", "GPU", "runs in", "system", "kernel", "Python"]
     assert all(all(cell) for cell in cells[2:])
     assert max(map(len, text)) <= 100
-
-
-def test_a_commit_is_dirty_if_code_was_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a measurement writes, datasets and pages, changes nothing of what was measured."""
-    monkeypatch.chdir(tmp_path)
-    assert commit_here() is None
-    for name in ("loadgen/datasets", "docs", "common"):
-        (tmp_path / name).mkdir(parents=True)
-        (tmp_path / name / "file").touch()
-    author = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false")
-    for command in (("init", "-q"), ("add", "."), (*author, "commit", "-q", "-m", "x")):
-        subprocess.run(("git", *command), check=True)
-    clean = commit_here()
-    assert clean is not None
-    assert len(clean) == 12
-    (tmp_path / "docs/file").write_text("x")
-    (tmp_path / "loadgen/datasets/file").write_text("x")
-    assert commit_here() == clean
-    (tmp_path / "common/file").write_text("x")
-    assert commit_here() == f"{clean}-dirty"

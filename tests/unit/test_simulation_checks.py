@@ -15,14 +15,6 @@ POLICIES = ("default", "paper")
 SEEDS = 2  # of each scenario; tasks of another seed are planned once more
 TASKS_MAX = 400  # of a scenario that is played here
 OPEN_TASKS_MAX = 4000  # of one whose tasks come at a rate, so that it has no references
-REAL = {  # figures of real processes: a simulation computes no answers, and has no memory and no overhead
-    "wrong",
-    "unverified",
-    "overhead_ms",
-    "overhead_percent",
-    "memory_growth_percent",
-    "handles_growth_percent",
-}
 LONG = {"demo", "paper", "congested"}  # they make data sets, and have no checks
 
 
@@ -67,7 +59,9 @@ def test_the_checks_of_a_scenario_hold_in_simulation(name: str) -> None:
         runs = pool.play(seeds, {policy: {"policy": policy} for policy in POLICIES})
     failed = dict[str, list[str]]()
     for policy, of_seeds in runs.items():
-        verdicts = [one.judge(run) for run in of_seeds for one in played.checks if one.figure not in REAL]
+        verdicts = [
+            one.judge(run) for run in of_seeds for one in played.checks if not FIGURES[one.figure].real
+        ]
         print(f"{name} with {policy}:", *verdicts, sep="\n  ")
         failed[policy] = [str(one) for one in verdicts if not one.holds]
         for run in of_seeds:

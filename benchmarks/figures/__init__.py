@@ -1,0 +1,1 @@
+"""Measures every figure of the docs, and writes the pages that show them."""

@@ -1,0 +1,188 @@
+"""What a step printed, and everything that says how: commit, date, machine and commands, as one JSON file.
+
+`measure` runs the commands of a step; nothing else makes such a file.
+"""
+
+import contextlib
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from benchmarks.figures.step import ROOT, Step, Unit
+from offboard.common.errors import DataError, OffloadError
+from offboard.loadgen.play.machine import machine as this_machine
+from offboard.loadgen.play.stolen_cpu_time import StolenCpuTime
+from offboard.loadgen.table.measured_rows import write_whole
+
+LIMIT_FACTOR, LIMIT_MORE_S = 5.0, 600.0  # a command may take so much longer than the step is expected to
+END_S = 30.0  # for a command to end after Ctrl-C
+BUILD_S = 3600.0
+OUTPUT_MAX = 1_000_000  # characters
+SAID_LINES = 3  # of a command that failed
+LOGS = Path("out/figures")
+OTHER_ROWS = "of rows that were measured again since"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The result of a step or of one part of it, as its file holds it."""
+
+    commit: str
+    date: str
+    machine: Mapping[str, str | int | float]
+    stolen_percent: float | None
+    commands: Sequence[str]
+    reads: Mapping[str, Mapping[str, str]]
+    seconds: float
+    output: Sequence[str]
+
+    @classmethod
+    def read(cls, path: Path) -> "Measured":
+        try:
+            return cls(**json.loads(path.read_text()))
+        except (ValueError, TypeError) as error:
+            raise DataError(f"{path}: not a file of `make figures`: {error}") from None
+
+    def write(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, json.dumps(asdict(self), indent=1, ensure_ascii=False) + "\n")
+
+
+def measure(unit: Unit, commit: str) -> Measured:
+    """Run the commands of a step, copy its pictures and return what it printed; OffloadError if one fails."""
+    for target in unit.step.ready:
+        _build(target)
+    here = machine_of(_environment(unit.step))
+    reads, stolen, began = unit.reads(ROOT), StolenCpuTime(), time.monotonic()
+    date, output = f"{datetime.now(UTC):%Y-%m-%d}", ""
+    for command in unit.commands():
+        output += _run(unit, command)
+    if not output.strip():
+        raise OffloadError("nothing was printed")
+    if len(output) > OUTPUT_MAX:
+        raise OffloadError(f"{len(output)} characters were printed, at most {OUTPUT_MAX} are kept")
+    for source, target in unit.copies().items():
+        shutil.copyfile(ROOT / source, ROOT / target)
+    percent = stolen.percent()
+    return Measured(
+        commit=commit,
+        date=date,
+        machine=here,
+        stolen_percent=None if percent is None else round(percent, 1),
+        commands=unit.commands(),
+        reads=reads,
+        seconds=round(time.monotonic() - began, 1),
+        output=[line.rstrip() for line in output.strip().splitlines()],
+    )
+
+
+def why_old(unit: Unit, measured: Measured | None, commit: str) -> str:
+    """Why a step must be measured, or "" if its file is up to date."""
+    if measured is None:
+        return "not measured"
+    if measured.commit != commit:
+        return f"of commit {measured.commit}"
+    if list(measured.commands) != unit.commands():
+        return "of other commands"
+    return OTHER_ROWS if of_other_rows(unit, measured) else ""
+
+
+def of_other_rows(unit: Unit, measured: Measured) -> bool:
+    """Whether the rows that a step read have changed since."""
+    try:
+        now = {name: about["sha256"] for name, about in unit.reads(ROOT).items()}
+    except OffloadError:
+        return True
+    return now != {name: about["sha256"] for name, about in measured.reads.items()}
+
+
+def read_all(units: Sequence[Unit], root: Path = ROOT) -> dict[str, Measured]:
+    """The results that there are, by the name of the step or part."""
+    there = [unit for unit in units if (root / unit.file).is_file()]
+    return {unit.name: Measured.read(root / unit.file) for unit in there}
+
+
+def machine_of(environment: Mapping[str, str]) -> dict[str, str | int | float]:
+    """The machine and the Python of an environment; OffloadError if it runs the code of another checkout."""
+    code = "import platform, offboard; print(platform.python_version(), offboard.__file__)"
+    python = shutil.which("python", path=environment["PATH"]) or "python"
+    asked = subprocess.run(  # -P: what a program of the environment imports, whatever the folder
+        [python, "-P", "-c", code],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=END_S,
+    )
+    version, module = asked.stdout.strip().split(maxsplit=1)
+    if not Path(module).is_relative_to(ROOT):
+        raise OffloadError(f"{python} runs the code of {Path(module).parents[1]}")
+    return {**this_machine(), "python": version}
+
+
+def _environment(step: Step) -> dict[str, str]:
+    """That of a user who has activated the environment of the step; tables are as wide as everywhere."""
+    folder = ROOT / step.environment / "bin"
+    if not (folder / "python").exists():
+        raise OffloadError(f"{step.environment} is missing: `make figures` builds it")
+    return {**os.environ, "PATH": f"{folder}:{os.environ['PATH']}", "COLUMNS": "100"}
+
+
+def _build(target: str) -> None:
+    done = subprocess.run(["make", target], cwd=ROOT, stdout=sys.stderr, check=False, timeout=BUILD_S)
+    if done.returncode:
+        raise OffloadError(f"`make {target}` failed")
+
+
+def _run(unit: Unit, command: str) -> str:
+    """What a command printed to stdout; stderr goes to a log."""
+    log = ROOT / LOGS / f"{unit.name.replace('/', '-')}.log"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    limit_s = LIMIT_FACTOR * 60 * unit.step.minutes + LIMIT_MORE_S
+    environment = _environment(unit.step)
+    words = shlex.split(command)
+    program = shutil.which(words[0], path=environment["PATH"])
+    if program is None:
+        raise OffloadError(f"`{command}`: there is no program {words[0]}")
+    with log.open("w") as errors:
+        process = subprocess.Popen(
+            [program, *words[1:]],
+            cwd=ROOT,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+            process_group=0,
+        )
+        try:
+            output, _ = process.communicate(timeout=limit_s)
+        except subprocess.TimeoutExpired:
+            _end(process)
+            raise OffloadError(f"`{command}` has not ended after {limit_s / 60:.0f} minutes") from None
+        except KeyboardInterrupt:
+            _end(process)
+            raise
+    if process.returncode:
+        said = " / ".join(log.read_text().strip().splitlines()[-SAID_LINES:])
+        raise OffloadError(f"`{command}` ended with exit code {process.returncode}: {said}")
+    return f"{output.rstrip()}\n\n"
+
+
+def _end(process: "subprocess.Popen[str]") -> None:
+    """End a command and its processes as Ctrl-C in a terminal does; kill what is left after END_S."""
+    os.killpg(process.pid, signal.SIGINT)
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.communicate(timeout=END_S)
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait(timeout=END_S)

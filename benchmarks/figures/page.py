@@ -1,0 +1,235 @@
+"""The pages: docs/results.md as a whole, and the marked blocks of other pages, from the files of the steps.
+
+A block is a line `<!-- figure: NAME | COLUMN: CELL, .. | show: COLUMN, .. -->` and a line `<!-- end -->`.
+What is between them comes from the first table of the step, or of its part with NAME/PART, and only rows with
+these cells are shown.
+"""
+
+import re
+import textwrap
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from benchmarks.figures.markdown_tables import MarkdownTable, blocks_of, first_table, joined, notes_of
+from benchmarks.figures.measured import OTHER_ROWS, Measured, of_other_rows
+from benchmarks.figures.step import PART, Section, Step, Unit, units_of
+from offboard.common.errors import DataError
+from offboard.loadgen.table.table_columns import WIDTH
+
+RESULTS = Path("docs/results.md")
+BLOCK = re.compile(r"<!-- figure: (?P<what>[^\n]*?) -->\n(?P<shown>.*?)<!-- end -->", re.DOTALL)
+SHOW = "show"
+ABOUT = """\
+<!-- `make figures` writes this page from docs/figures/. Change docs/figures/steps.toml instead. -->
+
+# Results
+
+This page holds all measured figures.
+`make figures` measures them, and writes this page from what the commands printed.
+Each section names its commit, date, machine and commands. Later commits may give other figures.
+[performance.md](performance.md), [scenarios.md](scenarios.md) and [evaluation.md](evaluation.md) explain
+what is measured.
+"""
+NOT_YET = "Not measured yet."
+
+
+def pages(root: Path, sections: Sequence[Section], files: Mapping[str, Measured]) -> dict[Path, str]:
+    """Every page that holds figures, as it should be, by its path from the root."""
+    found = {RESULTS: results(sections, files)}
+    steps = {step.name: step for section in sections for step in section.steps}
+    for path in [*sorted((root / "docs").glob("*.md")), root / "README.md"]:
+        name, text = path.relative_to(root), path.read_text()
+        if name != RESULTS and BLOCK.search(text):
+            found[name] = filled(text, name, steps, files)
+    return found
+
+
+def results(sections: Sequence[Section], files: Mapping[str, Measured]) -> str:
+    """The results page."""
+    lines = [*ABOUT.splitlines(), "", *_commits(sections, files), ""]
+    for section in sections:
+        lines.append(f"- {_link(section.title)}: {', '.join(_link(step.title) for step in section.steps)}")
+    for section in sections:
+        lines += ["", f"## {section.title}", *(["", section.about] if section.about else [])]
+        for step in section.steps:
+            lines += ["", f"### {step.title}", "", *_section(step, files)]
+    return "\n".join(lines) + "\n"
+
+
+def filled(text: str, page: Path, steps: Mapping[str, Step], files: Mapping[str, Measured]) -> str:
+    """The page with its blocks as they should be."""
+
+    def block(found: "re.Match[str]") -> str:
+        shown = "\n".join(_block(found["what"], page, steps, files))
+        return f"<!-- figure: {found['what']} -->\n\n{shown}\n\n<!-- end -->"
+
+    return BLOCK.sub(block, text)
+
+
+def _block(what: str, page: Path, steps: Mapping[str, Step], files: Mapping[str, Measured]) -> list[str]:
+    name, *filters = (one.strip() for one in what.split("|"))
+    where = {key.strip(): cells for key, cells in map(_filter, filters)}
+    shown = where.pop(SHOW, ())
+    name, _, part = name.partition("/")
+    if name not in steps or (part and part not in steps[name].parts):
+        raise DataError(f"{page}: <!-- figure: {what} -->: there is no such step")
+    step = steps[name]
+    there = {unit: one for unit, one in _there(step, files).items() if part in ("", unit.part)}
+    if not there:
+        return [NOT_YET]
+    link = f"{RESULTS.name if page.parent == RESULTS.parent else RESULTS}#{_anchor(step.title)}"
+    conditions = [f"{line} [All figures]({link})." for line in _conditions(there)]
+    pictures = [line for unit in there for line in _pictures(unit, page.parent)]
+    try:
+        return [*pictures, *_table(step, there).chosen(where, shown).lines(), "", *conditions]
+    except DataError as error:
+        raise DataError(f"{page}: <!-- figure: {what} -->: {error}") from None
+
+
+def _filter(text: str) -> tuple[str, list[str]]:
+    key, _, cells = text.partition(":")
+    return key, [cell.strip() for cell in cells.split(",")]
+
+
+def _table(step: Step, there: Mapping[Unit, Measured]) -> MarkdownTable:
+    """The table that other pages may show."""
+    return _merged(step, there) if step.merge else first_table(next(iter(there.values())).output)
+
+
+def _merged(step: Step, there: Mapping[Unit, Measured]) -> MarkdownTable:
+    """The tables of all parts as one."""
+    table = joined(step.merge, {unit.part: one.output for unit, one in there.items()})
+    table = table.bracketed() if step.brackets else table
+    return table.pivoted(*step.pivot) if step.pivot else table
+
+
+def _there(step: Step, files: Mapping[str, Measured]) -> dict[Unit, Measured]:
+    return {unit: files[unit.name] for unit in step.units() if unit.name in files}
+
+
+def _commits(sections: Sequence[Section], files: Mapping[str, Measured]) -> Iterator[str]:
+    """Which commit the figures are of, which ones are of another commit, and which ones are missing."""
+    units = units_of(sections)
+    there = [(unit, files[unit.name]) for unit in units if unit.name in files]
+    if not there:
+        yield "Nothing is measured yet."
+        return
+    commit = max(there, key=lambda item: (item[1].date, item[1].commit))[1].commit
+    same = [one for _, one in there if one.commit == commit]
+    yield f"**{len(same)} of {len(units)} measurements are of commit {commit}** ({_span(same)})."
+    others: dict[str, list[Unit]] = {}
+    for unit, one in there:
+        if of_other_rows(unit, one):
+            others.setdefault(OTHER_ROWS, []).append(unit)
+        elif one.commit != commit:
+            others.setdefault(f"of commit {one.commit}", []).append(unit)
+    missing = [unit for unit in units if unit.name not in files]
+    for why, some in (*others.items(), ("not measured yet", missing)):
+        if some:
+            yield f"{why[0].upper()}{why[1:]}: {'; '.join(_named(some))}."
+
+
+def _named(units: Sequence[Unit]) -> Iterator[str]:
+    """The sections of these measurements, with their parts if not all of them are meant."""
+    for step in dict.fromkeys(unit.step.name for unit in units):
+        some = [unit for unit in units if unit.step.name == step]
+        one = some[0].step
+        parts = "" if len(some) == len(list(one.units())) else f" ({', '.join(unit.part for unit in some)})"
+        yield f"{_link(one.title)}{parts}"
+
+
+def _section(step: Step, files: Mapping[str, Measured]) -> Iterator[str]:
+    there = _there(step, files)
+    yield step.about
+    yield from ("", "```sh", *_commands(step), "```", "")
+    if not there:
+        yield NOT_YET
+        return
+    yield from _conditions(there)
+    if missing := [unit.part for unit in step.units() if unit not in there]:
+        yield from ("", f"Not measured yet: {', '.join(missing)}.")
+    if step.merge:
+        notes = notes_of({unit.part: one.output for unit, one in there.items()})
+        yield from ("", *_merged(step, there).lines(), *(["", *notes] if notes else []))
+        return
+    for unit, one in there.items():
+        if unit.part:
+            yield from ("", f"#### {unit.step.title}: {unit.part}")
+        yield from ("", *_pictures(unit, RESULTS.parent), *_output(step, one))
+
+
+def _pictures(unit: Unit, folder: Path) -> Iterator[str]:
+    for path in unit.copies().values():
+        yield from (f"![{unit.step.title}: {unit.part or unit.name}]({path.relative_to(folder)})", "")
+
+
+def _commands(step: Step) -> Iterator[str]:
+    for command in step.run:
+        yield " \\\n  ".join(_wrapped(command.replace(PART, "NAME"), WIDTH - 4))
+    if step.parts:
+        yield from (f"# {line}" for line in _wrapped(f"NAME: {', '.join(step.parts)}", WIDTH - 2))
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    return textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False)
+
+
+def _output(step: Step, one: Measured) -> Iterator[str]:
+    """What was printed, with headings below that of the step."""
+    if step.plain:
+        yield from ("```", *one.output, "```")
+        return
+    for block in blocks_of(one.output):
+        if isinstance(block, MarkdownTable):
+            yield from block.lines()
+            if step.first_table:
+                return
+        else:
+            yield from (re.sub(r"^#+ (.*)", r"**\1**", line) for line in block)
+
+
+def _conditions(there: Mapping[Unit, Measured]) -> Iterator[str]:
+    """Commit, date, machine, rows and stolen time: one line for each different one."""
+    lines: dict[str, list[Measured]] = {}
+    for one in there.values():
+        lines.setdefault(_where(one), []).append(one)
+    names = {id(one): unit.part for unit, one in there.items()}
+    for where, some in lines.items():
+        parts = "" if len(lines) == 1 else f"- {', '.join(names[id(one)] for one in some)}: "
+        stolen = [one.stolen_percent for one in some if one.stolen_percent is not None]
+        worst = f" Its host took at most {max(stolen):g} % of the CPU time." if stolen else ""
+        yield f"{parts}Commit {where.format(_span(some))}{worst}"
+
+
+def _where(one: Measured) -> str:
+    of = one.machine
+    rows = [f"rows of {Path(name).name} of commit {about['commit']}" for name, about in one.reads.items()]
+    return (
+        f"{one.commit}, {{}}; {of['cpu']}, {of['cores']} cores, {of['memory_gib']} GiB, "
+        f"{of['kernel']}, Python {of['python']}{''.join(f'; {each}' for each in rows)}."
+    )
+
+
+def _span(some: Sequence[Measured]) -> str:
+    dates = sorted(one.date for one in some)
+    return dates[0] if dates[0] == dates[-1] else f"{dates[0]} to {dates[-1]}"
+
+
+def _link(title: str) -> str:
+    return f"[{title}](#{_anchor(title)})"
+
+
+def _anchor(title: str) -> str:
+    """The anchor of a heading, as GitHub makes it."""
+    return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
+
+
+def doubled_titles(sections: Sequence[Section]) -> list[str]:
+    """Titles that would have the same anchor."""
+    titles = Counter(
+        _anchor(title)
+        for section in sections
+        for title in (section.title, *(step.title for step in section.steps))
+    )
+    return [title for title, count in titles.items() if count > 1]

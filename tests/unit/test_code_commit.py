@@ -1,0 +1,63 @@
+"""The commit of measured figures: that of the code, whatever happens to files that no measurement needs."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from offboard.loadgen.play.code_commit import changed_code, commit_here
+
+
+@pytest.fixture
+def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A checkout with one commit, which is the current folder."""
+    monkeypatch.chdir(tmp_path)
+    for name, value in {"NAME": "a", "EMAIL": "a@example.org"}.items():
+        monkeypatch.setenv(f"GIT_AUTHOR_{name}", value)
+        monkeypatch.setenv(f"GIT_COMMITTER_{name}", value)
+    git("init", "--quiet")
+    commit("code.py", "1")
+    return tmp_path
+
+
+def git(*words: str) -> str:
+    return subprocess.run(["git", *words], check=True, capture_output=True, text=True).stdout
+
+
+def commit(name: str, text: str) -> None:
+    Path(name).parent.mkdir(parents=True, exist_ok=True)
+    Path(name).write_text(text)
+    git("add", ".")
+    git("commit", "--quiet", "-m", name)
+
+
+@pytest.mark.parametrize("name", ["docs/figures/a.json", "docs/page.md", "README.md", "tests/test_a.py"])
+def test_files_that_no_measurement_needs_do_not_change_it(checkout: Path, name: str) -> None:
+    """Neither a commit of such a file, nor a change of it."""
+    first = commit_here()
+    assert first is not None
+    assert git("rev-parse", "HEAD").startswith(first)
+    commit(name, "1")
+    (checkout / name).write_text("2")
+    assert commit_here() == first
+    assert changed_code() == []
+
+
+def test_a_change_of_code_is_seen(checkout: Path) -> None:
+    """A changed file, a new file and a new commit are, and the files are named."""
+    first = commit_here()
+    (checkout / "code.py").write_text("2")
+    (checkout / "folder").mkdir()
+    (checkout / "folder" / "new.py").write_text("1")
+    assert changed_code() == ["code.py", "folder/new.py"]
+    assert commit_here() == f"{first}-dirty"
+    commit("code.py", "3")
+    assert commit_here() not in (first, f"{first}-dirty")
+    assert git("rev-parse", "HEAD").startswith(str(commit_here()))
+
+
+def test_outside_a_checkout_there_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Then the figures have no commit."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
+    assert commit_here() is None
