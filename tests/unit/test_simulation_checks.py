@@ -65,9 +65,7 @@ def test_the_checks_of_a_scenario_hold_in_simulation(name: str) -> None:
         print(f"{name} with {policy}:", *verdicts, sep="\n  ")
         failed[policy] = [str(one) for one in verdicts if not one.holds]
         for run in of_seeds:
-            answered = sorted(
-                one.i for one in run.answered if one.robot == "robot"
-            )  # a burst is not in order
+            answered = sorted(one.i for one in run.answered if one.robot == "robot")  # bursts have no order
             assert answered == list(range(played.workload.tasks))
             over = FIGURES["time_over_oracle"].compute(run)
             assert played.workload.arrivals != "closed" or 0.95 < (over or 0.0) < 3, (policy, over)
