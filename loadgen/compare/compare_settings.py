@@ -8,6 +8,7 @@ from offboard.common.errors import ConfigError
 from offboard.loadgen import rivals
 from offboard.loadgen.compare.resume import PLAYS_MAX
 from offboard.loadgen.play.play_scenario import TESTBEDS
+from offboard.loadgen.scenario.scenario import split_objective
 from offboard.loadgen.table.table_columns import ColumnSettings
 from offboard.loadgen.table.table_formats import FORMATS
 from offboard.robot_client import policies
@@ -24,7 +25,8 @@ class CompareConfig(ColumnSettings):
 
     policies: tuple[str, ...] = setting(
         ("paper", policies.DEFAULT, ONBOARD, CLOUD),
-        f"policies to compare: {rivals.POLICY_HELP}; POLICY@PREDICTOR uses another predictor than its own",
+        f"policies to compare: {rivals.POLICY_HELP}; POLICY@PREDICTOR uses another predictor than its own,"
+        " and POLICY+OBJECTIVE, such as default+mean, decides by another objective than the scenario's",
         metavar="NAME,NAME,..",
     )
     seeds: int = setting(
@@ -93,12 +95,12 @@ class CompareConfig(ColumnSettings):
 
 
 def split_strategy(name: str) -> tuple[str, str | None]:
-    """The policy and the predictor of POLICY or POLICY@PREDICTOR.
+    """The policy, with its objective if one is named, and the predictor of POLICY+OBJECTIVE@PREDICTOR.
 
     None: the predictor that the policy brings.
     """
     policy, at, predictor = name.partition("@")
-    rivals.policy(policy, "--policies")
+    rivals.policy(split_objective(policy, "--policies")[0], "--policies")
     if at:
         rivals.predictor(predictor, "--policies")
     return policy, predictor if at else None

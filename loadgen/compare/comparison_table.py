@@ -16,10 +16,12 @@ from offboard.loadgen.scenario.interval_coverage import interval_columns, interv
 from offboard.loadgen.scenario.outage_recovery import median_recovery
 from offboard.loadgen.scenario.outcome import Answered, Outcome
 from offboard.loadgen.scenario.scenario import Scenario
+from offboard.loadgen.scenario.task_cost import Costing
 from offboard.loadgen.table.confidence_intervals import BOUNDS, Blocks, Picks, percentiles
 from offboard.loadgen.table.measured_rows import Column
 from offboard.loadgen.table.table_formats import Heading, Table
 from offboard.loadgen.table.table_two_figures import quantile
+from offboard.robot_client.policies.objectives import OBJECTIVES
 from offboard.robot_client.sites.runner import CLOUD
 
 
@@ -30,6 +32,8 @@ class Line:
     - `over_first`: mean time / mean time of the first policy, on the same tasks
     - `server_over_first`: the same ratio for the server's own run time, on tasks that both sent to the cloud
     - `at_one_speed`: `over_first` without the difference in machine speed (`machine_speed`)
+    - `cost`: what the scenario's objective makes small, per task; `cost_over_first`: over that of the first
+      policy, on the same tasks
     - `recovery`: number of tasks until recovery from an outage
     - `coverage_percent`, `relative_width`, `width_over_constant`: of the prediction intervals
     - `time_over_oracle`, `regret_ms`: over the `referenced` tasks, which also ran on each site alone
@@ -43,6 +47,8 @@ class Line:
     over_first: float | None = None
     at_one_speed: float | None = None
     server_over_first: float | None = None
+    cost: float | None = None
+    cost_over_first: float | None = None
     p95_ms: float | None = None
     p99_ms: float | None = None
     late_percent: float | None = None
@@ -67,6 +73,8 @@ HEADINGS: dict[str, Heading] = {
     "over_first": Heading("mean / first policy", "mean / first policy", 3),
     "at_one_speed": Heading("mean / first policy at equal machine speed", "at equal speed", 3),
     "server_over_first": Heading("server time / first policy", "server time / first policy", 3),
+    "cost": Heading("cost per task", "cost", 4),
+    "cost_over_first": Heading("cost / first policy", "cost / first policy", 3),
     "p95_ms": Heading("P95 ms", "P95 ms", 1),
     "p99_ms": Heading("P99 ms", "P99 ms", 1),
     "late_percent": Heading("late %", r"late \%", 2),
@@ -86,6 +94,13 @@ FIRST = (  # the most important columns
 )
 
 
+# If the objective is not the mean time, its cost takes the place of the columns that judge by time.
+BY_COST = (
+    *("tasks", "lost", "cost", "cost_over_first", "mean_ms", "p95_ms"),
+    *("late_percent", "cloud_percent", "twice_percent"),
+)
+
+
 def comparison_table(
     scenario: Scenario,
     config: CompareConfig,
@@ -99,7 +114,8 @@ def comparison_table(
     names, first = config.policies, runs[config.policies[0]]
     lines: list[Line] = []
     with progress("bootstrap", len(names)) as shown:
-        for found in each(_lines, names, [runs[name] for name in names], [first for _ in names]):
+        judged = [runs[name] for name in names], [first for _ in names], [scenario.costing() for _ in names]
+        for found in each(_lines, names, *judged):
             lines.extend(found)
             shown.step()
     span = f", counted from task {config.from_task} on" if config.from_task else ""
@@ -110,7 +126,8 @@ def comparison_table(
         " Below each policy are the bounds of its 95 % intervals, from blocks of neighbouring tasks."
     )
     about = {"scenario": scenario.name, "testbed": config.where, "seeds": config.seeds}
-    return Table(caption=caption, about=about, headings=HEADINGS, lines=lines, first=FIRST)
+    columns = FIRST if scenario.robot.objective == OBJECTIVES[0] else BY_COST
+    return Table(caption=caption, about=about, headings=HEADINGS, lines=lines, first=columns)
 
 
 def _runs_and_seeds(first: int, count: int) -> str:
@@ -119,20 +136,20 @@ def _runs_and_seeds(first: int, count: int) -> str:
     return f"{count} runs of each policy with seeds {first} to {first + count - 1}"
 
 
-def _lines(policy: str, runs: Sequence[Outcome], first: Sequence[Outcome]) -> list[Line]:
+def _lines(policy: str, runs: Sequence[Outcome], first: Sequence[Outcome], costing: Costing) -> list[Line]:
     """The figures of a policy, then the low and the high ends of their intervals."""
     asked = sum(sum(run.asked.values()) for run in runs)
-    columns, referenced = _columns(runs, first), _referenced(runs)
+    columns, referenced = _columns(runs, first, costing), _referenced(runs)
     count = len(columns["response_s"])
     lost = asked - count
     counts: dict[str, Any] = {"tasks": count, "referenced": len(referenced["sent_s"])}
     if not count:
         return [Line(policy, lost=lost, **counts)]
     one = np.arange(count)[None]
-    measured: dict[str, Any] = _task_figures(columns, one)
+    measured: dict[str, Any] = _task_figures(columns, one, costing)
     own = np.arange(counts["referenced"])[None]
     measured |= _reference_figures(referenced, own) if counts["referenced"] else {}
-    resampled = Blocks(count).resampled(lambda picks: _task_figures(columns, picks))
+    resampled = Blocks(count).resampled(lambda picks: _task_figures(columns, picks, costing))
     if resampled:
         slope = speed_slope(resampled)
         for figures in (measured, resampled):
@@ -165,11 +182,14 @@ def _pairs(runs: Sequence[Outcome], first: Sequence[Outcome]) -> list[_Pair]:
     return found
 
 
-def _columns(runs: Sequence[Outcome], first: Sequence[Outcome]) -> dict[str, Column]:
+def _columns(runs: Sequence[Outcome], first: Sequence[Outcome], costing: Costing) -> dict[str, Column]:
     """Columns with one value for each task; NaN where a task has no value."""
 
     def column(value: Callable[[_Pair], float | None]) -> Column:
         return np.array([value(pair) for pair in pairs], dtype=float)
+
+    def cost(one: Answered | None) -> float | None:
+        return None if one is None else costing.of_task(one.response_s, one.quality, one.spent)
 
     pairs = _pairs(runs, first)
     return {
@@ -177,6 +197,8 @@ def _columns(runs: Sequence[Outcome], first: Sequence[Outcome]) -> dict[str, Col
         "first_s": column(lambda pair: pair.first.response_s if pair.first else None),
         "server_s": column(lambda pair: pair.mine.server_s),
         "first_server_s": column(lambda pair: pair.first.server_s if pair.first else None),
+        "cost": column(lambda pair: cost(pair.mine)),
+        "first_cost": column(lambda pair: cost(pair.first)),
         "late": column(_late),
         "cloud": column(_sent_to_cloud),
         "twice": column(lambda pair: len(pair.mine.sites) > 1),
@@ -202,14 +224,17 @@ def _referenced(runs: Sequence[Outcome]) -> dict[str, Column]:
     }
 
 
-def _task_figures(columns: Mapping[str, Column], picks: Picks) -> dict[str, Column]:
+def _task_figures(columns: Mapping[str, Column], picks: Picks, costing: Costing) -> dict[str, Column]:
     """The figures over all tasks, for each resample (one row of `picks`)."""
+    cost, first_cost = columns["cost"][picks], columns["first_cost"][picks]
     response, first = columns["response_s"][picks], columns["first_s"][picks]
     server, first_server = columns["server_s"][picks], columns["first_server_s"][picks]
     return {
         "mean_ms": 1e3 * response.mean(axis=-1),
         "over_first": _ratio(response, first),
         "server_over_first": _ratio(server, first_server),
+        "cost": costing.over(cost),
+        "cost_over_first": _over(costing.over(cost), costing.over(first_cost)),
         "p95_ms": 1e3 * quantile(response, 95),
         "p99_ms": 1e3 * quantile(response, 99),
         "late_percent": 100 * _mean(columns["late"][picks]),
@@ -241,6 +266,12 @@ def _ratio(over: Column, under: Column) -> Column:
     both = ~(np.isnan(over) | np.isnan(under))
     upper, lower = np.where(both, over, 0.0).sum(axis=-1), np.where(both, under, 0.0).sum(axis=-1)
     ratio: Column = np.divide(upper, lower, where=lower > 0, out=np.full(len(over), np.nan))
+    return ratio
+
+
+def _over(cost: Column, first: Column) -> Column:
+    """NaN where the first policy costs nothing, or did not answer all of these tasks."""
+    ratio: Column = np.divide(cost, first, where=first > 0, out=np.full(len(cost), np.nan))
     return ratio
 
 

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from offboard.loadgen.play.run_files import PICTURE, ROBOT_SEED_STEP, RobotFiles, link_file
+from offboard.loadgen.robot.decision_settings import MEAN
 from offboard.loadgen.scenario.event_timeline import absent_at_first
-from offboard.loadgen.scenario.scenario import Scenario, Workload
+from offboard.loadgen.scenario.scenario import SPENDING, Scenario, Workload
 from offboard.loadgen.testbed.testbed import ROBOT, Setup, relay_of
 
 PLANNER = "offboard.common.planning.planner"
@@ -64,6 +65,7 @@ def _robot_flags(scenario: Scenario, files: RobotFiles, *, first: bool) -> Mappi
         "heartbeats": robot.heartbeats,
         "window": robot.window,
         "timeout": robot.timeout_s,
+        **_objective_flags(scenario),
         # Nobody waits for a server that an event starts later.
         "connect": ABSENT_CONNECT_S if absent_at_first(scenario.timeline()) & servers else None,
         "seed": files.seed,
@@ -71,6 +73,21 @@ def _robot_flags(scenario: Scenario, files: RobotFiles, *, first: bool) -> Mappi
         "answers": files.answers,
     }
     return {name: value for name, value in flags.items() if value is not None}
+
+
+def _objective_flags(scenario: Scenario) -> Mapping[str, Any]:
+    """What the policy makes small; for the mean time, and for a policy that weighs no costs, no flags."""
+    robot, costing, name = scenario.robot, scenario.costing(), scenario.robot.decides_by
+    if name == MEAN:
+        return {}
+    flags: dict[str, Any] = {"objective": name}
+    if name == "deadline":
+        return flags | {"deadline": costing.deadline_s}
+    if name in SPENDING:
+        weights = {"s_per_joule": robot.s_per_joule, "s_per_megabyte": robot.s_per_megabyte}
+        watts = {"compute_watts": robot.compute_watts, "idle_watts": robot.idle_watts}
+        flags |= {**weights, **watts, "radio_joules_byte": robot.radio_joules_byte}
+    return flags
 
 
 def _map_flags(workload: Workload) -> Mapping[str, Any]:

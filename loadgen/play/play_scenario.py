@@ -177,8 +177,9 @@ def judge(scenario: Scenario, out: Path, exit_codes: Mapping[str, int]) -> Playe
         answered=answered,
         references=read_references(reference_path(out / TRACE)),
         readings=read_readings(out / READINGS),
-        deadline_s=None if workload.deadline_ms is None else workload.deadline_ms / 1e3,
+        deadline_s=workload.deadline_s,
         outage=read_outage(out / EVENTS),
+        costing=scenario.costing(),
     )
     verdicts = [check.judge(outcome) for check in scenario.checks]
     return Played(scenario, outcome, verdicts, exit_codes)

@@ -15,11 +15,16 @@ from offboard.robot_client.settings import Settings
 
 DECISIONS, OBJECTIVE, LIMITS = "decisions", "objective", "limits"
 MEAN = OBJECTIVES[0]
+# The objectives that each setting belongs to; the first one cannot do without it.
+USED_BY = {
+    "deadline_s": ("deadline",),
+    "s_per_joule": ("energy", "metered"),
+    "s_per_megabyte": ("metered", "energy"),
+}
 POLICY_HELP = (
     f"{policies.HELP}. `default` stands for {policies.DEFAULT}: run a task where it should finish first, "
     "try the other site now and then, and start the task there as well if the first site is late"
 )
-NEEDS = {"deadline": "deadline_s", "energy": "s_per_joule"}  # the field that an objective cannot do without
 
 
 @dataclass(frozen=True)
@@ -50,8 +55,8 @@ class DecisionSettings:
     )
     objective: str = setting(
         MEAN,
-        "what the policy minimises: mean time, time of the slowest 5 % (p95), missed deadlines, "
-        "or time and energy",
+        "what the policy minimises: mean time, the time that 95 % of the tasks stay below (p95), missed "
+        "deadlines, or time plus what energy (energy) and data (metered) are worth",
         group=OBJECTIVE,
         rare=True,
         choices=OBJECTIVES,
@@ -67,7 +72,15 @@ class DecisionSettings:
     )
     s_per_joule: float | None = setting(
         None,
-        "with --objective energy: seconds that one joule is worth",
+        "with --objective energy or metered: seconds that one joule is worth",
+        group=OBJECTIVE,
+        rare=True,
+        minimum=0.0,
+        maximum=1e6,
+    )
+    s_per_megabyte: float | None = setting(
+        None,
+        "with --objective metered or energy: seconds that a million bytes, sent or received, are worth",
         group=OBJECTIVE,
         rare=True,
         minimum=0.0,
@@ -135,12 +148,12 @@ class DecisionSettings:
         policies.check_name(self.policy, "--policy")
         if self.predictor is not None:
             predictors.check_name(self.predictor, "--predictor")
-        for name, field in NEEDS.items():
+        for field, names in USED_BY.items():
             value, flag = getattr(self, field), field.removesuffix("_s").replace("_", "-")
-            if self.objective == name and value is None:
-                raise ConfigError(f"--objective: {name} needs --{flag}")
-            if self.objective != name and value is not None:
-                raise ConfigError(f"--{flag}: {value:g} needs --objective {name}")
+            if self.objective == names[0] and value is None:
+                raise ConfigError(f"--objective: {names[0]} needs --{flag}")
+            if self.objective not in names and value is not None:
+                raise ConfigError(f"--{flag}: {value:g} needs --objective {' or '.join(names)}")
         if self.objective != MEAN and not policies.weighs_cost(self.policy):
             raise ConfigError(f"--objective: {self.objective} changes nothing with --policy {self.policy}")
         by_deadline = self.objective == "deadline"
@@ -154,7 +167,12 @@ class DecisionSettings:
             predictor=self.predictor,
             window=self.window,
             heartbeats=self.heartbeats,
-            objective=objectives.make(self.objective, deadline_s=self.deadline_s, s_a_joule=self.s_per_joule),
+            objective=objectives.make(
+                self.objective,
+                deadline_s=self.deadline_s,
+                s_per_joule=self.s_per_joule,
+                s_per_megabyte=self.s_per_megabyte,
+            ),
             s_per_quality=self.s_per_quality,
             energy=Energy(self.compute_watts, self.idle_watts, self.radio_joules_byte),
             duplicates=self.duplicates,

@@ -15,6 +15,7 @@ from offboard.loadgen.testbed.testbed import PART
 ROUNDS_MAX = 10_000_000
 RARE = 25  # on each computer, one in this many sizes ...
 MUCH = 20  # ... takes this many times as long
+EVERYWHERE = "everywhere"  # stands for the computer where all have the same slow sizes
 
 
 @task("hash_rounds", size=float)
@@ -35,16 +36,27 @@ def hash_rarely_long(rounds: int) -> bytes:
 
     Each computer has its own slow sizes.
     """
-    for _ in range(rounds_on(os.environ.get(PART, ""), rounds) // max(rounds, 1) - 1):
-        check_wanted()
-        _hashed(rounds)
-    return _hashed(rounds)
+    return _hashed_in_steps(rounds, rounds_on(os.environ.get(PART, ""), rounds))
+
+
+@task("hash_rarely_long_everywhere", size=float)
+def hash_rarely_long_everywhere(rounds: int) -> bytes:
+    """Like `hash_rarely_long`, but every computer has the same slow sizes."""
+    return _hashed_in_steps(rounds, rounds_on(EVERYWHERE, rounds))
 
 
 def rounds_on(part: str, rounds: int) -> int:
     """The rounds that `hash_rarely_long` computes on this part of a testbed; the tail is unpredictable."""
     rare = zlib.crc32(f"{part}/{rounds}".encode()) % RARE == 0
     return rounds * MUCH if rare else rounds
+
+
+def _hashed_in_steps(rounds: int, total: int) -> bytes:
+    """The hash of `rounds`, after other hashes until `total` rounds are done."""
+    for _ in range(total // max(rounds, 1) - 1):
+        check_wanted()
+        _hashed(rounds)
+    return _hashed(rounds)
 
 
 def _hashed(rounds: int) -> bytes:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from offboard.loadgen.scenario.interval_coverage import Interval
+from offboard.loadgen.scenario.task_cost import Costing, Spent
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +23,7 @@ class Answered:
     `server_s` is the run time that the cloud server reported, without link and queue.
     `probed` says whether a second site ran it too, so that its time is learnt.
     `overhead_s` is what Offboard itself added to the time of the task; None: unknown.
+    `spent` is what all its runs took.
     """
 
     i: int
@@ -41,6 +43,7 @@ class Answered:
     used: str | None = None
     quality: float | None = None
     probed: bool = False
+    spent: Spent = Spent()
 
     @property
     def response_s(self) -> float:
@@ -95,7 +98,7 @@ class Outcome:
 
     `asked` is the number of tasks that each robot asked for.
     `outage` is the number of tasks that the first robot had answered when the link first fell silent, and
-    when it was back for good.
+    when it was back for good. `costing` is the price of its tasks.
     """
 
     asked: Mapping[str, int]
@@ -104,6 +107,12 @@ class Outcome:
     readings: Sequence[Reading] = ()
     deadline_s: float | None = None
     outage: tuple[int, int] | None = None
+    costing: Costing = Costing()
+
+    def costs(self) -> Sequence[float]:
+        """What each answered task cost."""
+        of_task = self.costing.of_task
+        return [of_task(one.response_s, one.quality, one.spent) for one in self.answered]
 
     def between(self, first: int, last: int | None = None) -> "Outcome":
         """The tasks of each robot from number `first` up to, but without, number `last`."""

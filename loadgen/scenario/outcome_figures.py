@@ -11,6 +11,7 @@ import numpy as np
 
 from offboard.loadgen.scenario.outcome import Outcome, Reading
 from offboard.loadgen.table.table_two_figures import quantile
+from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client.sites.runner import ONBOARD
 
 GROWTH_FROM = 1 / 3  # share of the run that is left out: a process needs it to reach its usual size
@@ -103,6 +104,13 @@ def _time_over_oracle(run: Outcome) -> float | None:
     return sum(one.sent_s for one in run.references) / oracle_s if oracle_s else None
 
 
+def _wait_over_oracle(run: Outcome) -> float | None:
+    waited_s = {one.i: one.response_s for one in run.answered if one.robot == ROBOT}
+    known = [one for one in run.references if one.i in waited_s]
+    oracle_s = sum(one.oracle_s for one in known)
+    return sum(waited_s[one.i] for one in known) / oracle_s if oracle_s else None
+
+
 def _regret_ms(run: Outcome) -> float | None:
     regrets = [one.sent_s - one.oracle_s for one in run.references]
     return 1e3 * sum(regrets) / len(regrets) if regrets else None
@@ -111,6 +119,10 @@ def _regret_ms(run: Outcome) -> float | None:
 def _quality(run: Outcome) -> float | None:
     known = [one.quality for one in run.answered if one.quality is not None]
     return sum(known) / len(known) if known else None
+
+
+def _cost(run: Outcome) -> float | None:
+    return float(run.costing.over(np.array(run.costs()))) if run.answered else None
 
 
 def _overhead_ms(run: Outcome) -> float | None:
@@ -160,6 +172,12 @@ FIGURES: dict[str, Figure] = {
     "p99_ms": Figure("ms", "99 % of the tasks are answered within this time", _quantile_ms(99)),
     "late_percent": Figure("%", "tasks answered after their deadline", _percent(_late), "deadline_ms"),
     "quality": Figure("of 1", "mean quality of the variants that answered", _quality),
+    "cost": Figure(
+        "per task",
+        "what the robot's objective makes small: mean seconds, P95 in seconds, share of late tasks, or mean"
+        " seconds with the worth of joules and megabytes",
+        _cost,
+    ),
     SHARE: Figure(
         "%", "share of the servers in the tasks that were sent to one site", _percent(_in_the_cloud)
     ),
@@ -175,6 +193,13 @@ FIGURES: dict[str, Figure] = {
         "times",
         "time of the reference tasks on the chosen site, divided by their time on the faster site",
         _time_over_oracle,
+        "reference",
+    ),
+    "wait_over_oracle": Figure(
+        "times",
+        "time that the robot waited for the reference tasks, with hedges, divided by their time on the"
+        " faster site",
+        _wait_over_oracle,
         "reference",
     ),
     "regret_ms": Figure("ms", "mean time that the faster site would have saved", _regret_ms, "reference"),

@@ -15,19 +15,24 @@ from offboard.common.variants import IN_GROUP
 from offboard.loadgen import rivals
 from offboard.loadgen.relay.link.link_settings import LinkFlags
 from offboard.loadgen.robot.config import CallConfig, DriveConfig, RobotConfig
+from offboard.loadgen.robot.decision_settings import MEAN, USED_BY
 from offboard.loadgen.robot.workload import ARRIVALS
 from offboard.loadgen.scenario.event_timeline import AT_TASK_MAX, Event
 from offboard.loadgen.scenario.outcome_figures import FIGURES
 from offboard.loadgen.scenario.pass_fail_check import Check, check_computable
 from offboard.loadgen.scenario.random_faults import Chaos
+from offboard.loadgen.scenario.task_cost import Costing
 from offboard.loadgen.testbed.cpu_quota import CPUS_MAX, CPUS_MIN
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, relay_of
 from offboard.robot_client import policies
-from offboard.robot_client.policies import BOTH
+from offboard.robot_client.policies import BOTH, objectives
+from offboard.robot_client.policies.energy import Energy
+from offboard.robot_client.policies.objectives import OBJECTIVES, Objective
 from offboard.robot_client.sites.runner import ONBOARD
 
 ROBOTS_MAX = 64
 SERVERS_MAX = 16
+SPENDING = ("energy", "metered")  # objectives that weigh joules and megabytes
 
 
 @dataclass(frozen=True)
@@ -80,6 +85,10 @@ class Workload:
         if self.alone > self.tasks:
             raise ConfigError(f"workload.alone: {self.alone} is above workload.tasks {self.tasks}")
 
+    @property
+    def deadline_s(self) -> float | None:
+        return None if self.deadline_ms is None else self.deadline_ms / 1e3
+
     def robot_names(self) -> tuple[str, ...]:
         return tuple(ROBOT if n == 1 else f"{ROBOT}-{n}" for n in range(1, self.robots + 1))
 
@@ -108,7 +117,11 @@ class RobotPart:
     """`[robot]`: how each robot decides, and its CPU quota."""
 
     cpus: float = setting(0.2, "CPU quota, in CPUs", minimum=CPUS_MIN, maximum=CPUS_MAX)
-    policy: str = setting(policies.ALIAS, f"policy that chooses the site: {rivals.POLICY_HELP}")
+    policy: str = setting(
+        policies.ALIAS,
+        f"policy that chooses the site: {rivals.POLICY_HELP}; POLICY+OBJECTIVE decides by another objective"
+        " than that of the scenario",
+    )
     predictor: str | None = setting(
         None, f"predictor, if not the one that the policy brings: {rivals.PREDICTOR_HELP}"
     )
@@ -119,14 +132,48 @@ class RobotPart:
     timeout_s: float = setting(
         2.0, "longest wait for an answer of a server, in seconds", name="timeout", minimum=0.001
     )
+    objective: str = setting(
+        MEAN,
+        "what the policy makes small, and what `cost` measures; deadline is that of workload.deadline_ms",
+        choices=OBJECTIVES,
+    )
+    s_per_joule: float | None = setting(None, "seconds that one joule is worth", minimum=0.0)
+    s_per_megabyte: float | None = setting(
+        None, "seconds that a million bytes, sent or received, are worth", minimum=0.0
+    )
+    compute_watts: float = setting(
+        Energy().compute_w, "power that one busy core draws above idle, in watts", minimum=0.0
+    )
+    idle_watts: float = setting(
+        Energy().idle_w, "power drawn while waiting for an answer, in watts", minimum=0.0
+    )
+    radio_joules_byte: float = setting(
+        Energy().radio_j_byte, "energy to send or receive one byte, in joules", minimum=0.0
+    )
 
     def __post_init__(self) -> None:
         check(self)
         self.names()
+        for weight in ("s_per_joule", "s_per_megabyte"):
+            given, names = getattr(self, weight) is not None, USED_BY[weight]
+            if given and self.objective not in names:
+                raise ConfigError(f"robot.{weight}: needs robot.objective = {' or '.join(names)}")
+            if self.objective == names[0] and not given:
+                raise ConfigError(f"robot.objective: {self.objective!r} needs robot.{weight}")
+
+    @property
+    def decides_by(self) -> str:
+        """The objective of the policy; mean for a policy that weighs no costs."""
+        policy, objective = split_objective(self.policy, "robot.policy")
+        own = self.objective if policies.weighs_cost(rivals.policy(policy)) else MEAN
+        return own if objective is None else objective
+
+    def energy(self) -> Energy:
+        return Energy(self.compute_watts, self.idle_watts, self.radio_joules_byte)
 
     def names(self) -> tuple[str, str | None]:
         """Policy and predictor, by the names that a robot knows."""
-        policy = rivals.policy(self.policy, "robot.policy")
+        policy = rivals.policy(split_objective(self.policy, "robot.policy")[0], "robot.policy")
         if self.predictor is None:
             return policy, None
         return policy, rivals.predictor(self.predictor, "robot.predictor")
@@ -186,8 +233,33 @@ class Scenario:
 
     def __post_init__(self) -> None:
         check_servers(self.servers)
+        self.objective()
         if self.chaos is not None and len(self.servers) > 1:
             raise ConfigError("chaos: random faults need a scenario with one server")
+
+    def objective(self) -> Objective:
+        """What the policy makes small; ConfigError if the scenario does not say what it needs."""
+        robot, deadline_s = self.robot, self.workload.deadline_s
+        name = robot.decides_by
+        if "deadline" in (name, robot.objective) and deadline_s is None:
+            raise ConfigError("robot.objective: 'deadline' needs workload.deadline_ms")
+        return objectives.make(
+            name,
+            deadline_s=deadline_s,
+            s_per_joule=robot.s_per_joule if name in SPENDING else None,
+            s_per_megabyte=robot.s_per_megabyte if name in SPENDING else None,
+        )
+
+    def costing(self) -> Costing:
+        """The price of a task by the objective of the scenario, whatever the policy makes small."""
+        robot = self.robot
+        return Costing(
+            robot.objective,
+            self.workload.deadline_s,
+            s_per_joule=robot.s_per_joule or 0.0,
+            s_per_megabyte=robot.s_per_megabyte or 0.0,
+            energy=robot.energy(),
+        )
 
     def parts(self) -> tuple[str, ...]:
         """The names of all parts of the run: servers, relays and robots."""
@@ -264,6 +336,21 @@ class Scenario:
             robot=robot,
             checks=checks,
         )
+
+
+def split_objective(name: str, where: str) -> tuple[str, str | None]:
+    """The policy and the objective of POLICY or POLICY+OBJECTIVE; None: that of the scenario.
+
+    ConfigError if the policy weighs no costs; `where` names the flag or the key.
+    """
+    policy, plus, objective = name.partition("+")
+    if not plus:
+        return policy, None
+    if objective not in OBJECTIVES:
+        raise ConfigError(f"{where}: {name!r}: {objective!r} is not one of {', '.join(OBJECTIVES)}")
+    if not policies.weighs_cost(rivals.policy(policy, where)):
+        raise ConfigError(f"{where}: {name!r}: an objective changes nothing with {policy}")
+    return policy, objective
 
 
 def check_servers(servers: Sequence[CloudPart]) -> None:

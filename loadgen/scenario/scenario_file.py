@@ -52,24 +52,28 @@ def read_scenario(path: Path) -> Scenario:
     link = _link(_table(table, "link", path), path)
     servers = _servers(table, path)
     links = {one.name: from_table(LinkFlags, {**link, **one.link}, path, "link").link for one in servers}
-    return Scenario(
-        name=name,
-        seed=seed,
-        workload=workload,
-        about=str(table.get("about", "")).strip(),
-        robot=from_table(RobotPart, _table(table, "robot", path), path, "robot"),
-        servers=servers,
-        link=link,
-        events=parse_events(table, path, parts=parts_of(list(links), workload), links=links),
-        checks=parse_checks(
+    found: dict[str, Any] = {
+        "name": name,
+        "seed": seed,
+        "workload": workload,
+        "about": str(table.get("about", "")).strip(),
+        "robot": from_table(RobotPart, _table(table, "robot", path), path, "robot"),
+        "servers": servers,
+        "link": link,
+        "events": parse_events(table, path, parts=parts_of(list(links), workload), links=links),
+        "checks": parse_checks(
             table,
             path,
             tasks=workload.tasks,
             known=workload.known(),
             sites=(ONBOARD, *(one.site for one in servers)),
         ),
-        chaos=_chaos(table, workload, path, servers=len(servers)),
-    )
+        "chaos": _chaos(table, workload, path, servers=len(servers)),
+    }
+    try:
+        return Scenario(**found)
+    except ConfigError as error:
+        raise DataError(f"{path}: {error}") from None
 
 
 def check_calls(scenario: Scenario, path: Path) -> None:

@@ -16,6 +16,7 @@ from offboard.loadgen.scenario.interval_coverage import intervals_of, late_secon
 from offboard.loadgen.scenario.outcome import Answered, Outcome, Reference
 from offboard.loadgen.scenario.outcome_files import is_probed
 from offboard.loadgen.scenario.scenario import Scenario
+from offboard.loadgen.scenario.task_cost import late_executions, spent_of
 from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks
 from offboard.loadgen.simulation.model.stepped_offloader import SteppedOffloader
 from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
@@ -27,6 +28,8 @@ from offboard.robot_client.records.trace import Record, Trace, as_dict
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites import heartbeat
 from offboard.robot_client.sites.runner import ONBOARD
+
+HEARD_S = 1.0  # from connecting to the first task: a real robot has heard from its servers by then
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,12 +55,12 @@ def simulate(
     run = _Run(scenario, tasks, noise, trace)
     with run.offload:
         run.play()
-    deadline_ms = scenario.workload.deadline_ms
     return Outcome(
         asked={ROBOT: scenario.workload.tasks},
         answered=run.answered(),
         references=run.references,
-        deadline_s=None if deadline_ms is None else deadline_ms / 1e3,
+        deadline_s=scenario.workload.deadline_s,
+        costing=scenario.costing(),
     )
 
 
@@ -86,12 +89,18 @@ class _Run:
         self._scenario = scenario
         self._clock = VirtualClock()
         self._timeline = Timeline(scenario.timeline())
+        self._zero_s = HEARD_S if scenario.workload.arrivals == CLOSED else 0.0  # when the first task is due
         self._in_flight = 0
         self._queue: deque[tuple[int, float]] = deque()  # tasks that are due, while too many are in flight
         robot = scenario.robot
         policy, predictor = robot.names()
         settings = Settings(
-            predictor=predictor, window=robot.window, heartbeats=robot.heartbeats, seed=scenario.seed
+            predictor=predictor,
+            window=robot.window,
+            heartbeats=robot.heartbeats,
+            objective=scenario.objective(),
+            energy=robot.energy(),
+            seed=scenario.seed,
         )
         heartbeat_s = heartbeat.EVERY_S if settings.beats(policy) else 0.0
         self._testbed = SimulatedTestbed(scenario, tasks, self._clock, heartbeat_s=heartbeat_s, noise=noise)
@@ -107,10 +116,11 @@ class _Run:
 
     def play(self) -> None:
         for at_s in {event.at_s for event in self._timeline.left() if event.at_s is not None}:
-            self._clock.at(at_s, self._play_events)
+            self._clock.at(self._zero_s + at_s, self._play_events)
         self._play_events()
         self._testbed.begin()
         if self._scenario.workload.arrivals == CLOSED:
+            self._clock.pass_by(self._zero_s)
             for number in range(self._scenario.workload.tasks):
                 self._offload(number, self._clock.now_s())
         else:
@@ -145,7 +155,7 @@ class _Run:
 
     def _play_events(self) -> None:
         """Make all events happen that are due."""
-        for event in self._timeline.due(self._clock.now_s(), len(self._ended)):
+        for event in self._timeline.due(self._clock.now_s() - self._zero_s, len(self._ended)):
             self._testbed.happen(event)
 
     def _offload(self, number: int, due_s: float) -> None:
@@ -165,12 +175,13 @@ class _Run:
     def answered(self) -> list[Answered]:
         """All tasks, each with the runs that ended after the task itself."""
         late = late_seconds(ended.line for ended in self._ended)
+        ended_late = late_executions(ended.line for ended in self._ended)
         return [
             Answered(
                 i=ended.number,
                 robot=ROBOT,
-                due_s=ended.due_s,
-                ended_s=ended.ended_s,
+                due_s=ended.due_s - self._zero_s,
+                ended_s=ended.ended_s - self._zero_s,
                 error=None,
                 answer=None,
                 chosen=ended.line["decision"]["site"],
@@ -178,6 +189,7 @@ class _Run:
                 sites=tuple(execution["site"] for execution in ended.line["executions"]),
                 intervals=intervals_of(ended.line, late),
                 probed=is_probed(ended.line),
+                spent=spent_of(ended.line, ended_late),
             )
             for ended in self._ended
         ]

@@ -41,12 +41,7 @@ def pinned(where: str, forecast: Forecast) -> Decision:
 
 
 def decided(
-    policy: Policy,
-    forecast: Forecast,
-    kind: Kind,
-    *,
-    absent: Mapping[str, str],
-    known: Callable[[str], int],
+    policy: Policy, forecast: Forecast, kind: Kind, *, absent: Mapping[str, str], known: Callable[[str], int]
 ) -> Decision:
     """The decision of the policy, without a second run if the kind must not run twice.
 

@@ -26,6 +26,7 @@ class Conformal:
 
     def __init__(self) -> None:
         self._order: deque[float] = deque()
+        self._stopped: deque[float | None] = deque(maxlen=ERRORS_MAX)  # of each run; None: it was not stopped
         self._sorted: list[float] = []
         self._usual_s = RunningMean()
         self._outside = 1 - COVERAGE  # the share of errors that the interval leaves out
@@ -36,7 +37,8 @@ class Conformal:
     def errors(self) -> PredictionErrors:
         """The errors until now, as a value; made again only after something was learnt."""
         if self._errors is None:
-            self._errors = PredictionErrors(tuple(self._sorted), self._usual_s.value)
+            stopped = sorted(score for score in self._stopped if score is not None)
+            self._errors = PredictionErrors(tuple(self._sorted), self._usual_s.value, tuple(stopped))
         return self._errors
 
     def learn(self, predicted_s: float, seconds: float) -> None:
@@ -47,13 +49,16 @@ class Conformal:
                 low, high = self._ends or self._interval()
                 self._adapt(missed=not low <= score <= high)
             self._add(score)
+            self._stopped.append(None)
         self._usual_s.add(max(seconds, predicted_s))
         self._errors = None
 
-    def miss(self) -> None:
+    def miss(self, predicted_s: float, seconds: float) -> None:
         """Learn that a task was stopped after the upper end; how late it would have been is unknown."""
         if len(self._sorted) >= ERRORS_MIN:
             self._adapt(missed=True)
+            self._stopped.append((seconds - predicted_s) / unit_s(predicted_s, self._usual_s.value))
+            self._errors = None
 
     def interval(self, predicted_s: float, spread_s: float | None) -> tuple[float, float] | None:
         """Lower and upper end in seconds; None while too few errors are known and there is no spread."""

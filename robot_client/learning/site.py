@@ -82,7 +82,6 @@ class SiteMemory:
         self._objective = objective
         self._energy = energy
         self._quality = quality
-        self._bytes = RunningMean()
         self._bytes_in = RunningMean()
         self._cpu_s = RunningMean()
 
@@ -120,12 +119,14 @@ class SiteMemory:
         if condition.silent:
             seconds = max(seconds, timeout_s)
         low_s, high_s = self._conformal.interval(seconds, found.spread_s) or (None, None)
-        joules, errors, quality = self._joules(seconds), self._conformal.errors, self._quality
-        cost = self._objective.cost(Expected(seconds, found.spread_s, joules, quality), errors)
+        energy, errors, quality = self._energy, self._conformal.errors, self._quality
+        onboard_s = self._cpu_s.value or seconds
+        joules = energy.onboard_j(onboard_s) if self._site == ONBOARD else energy.remote_j(seconds, moved)
+        cost = self._objective.cost(Expected(seconds, found.spread_s, joules, quality, bytes=moved), errors)
         # All fields in their order: with keywords, it takes three times as long.
         return Outlook._make((
             seconds, found.spread_s, predictor.full, self.age, self._failures, len(predictor),
-            low_s, high_s, found.error_s, cost, in_flight, self._bytes.value, joules, condition,
+            low_s, high_s, found.error_s, cost, in_flight, moved, joules, condition,
             errors, quality, packing, sending,
         ))  # fmt: skip
 
@@ -234,7 +235,6 @@ class SiteMemory:
 
     def _take(self, one: Observation) -> None:
         self.observations.append(one)
-        self._bytes.add(one.bytes_out + one.bytes_in)
         if one.ok:
             self._bytes_in.add(one.bytes_in)
         if one.cpu_s is not None:
@@ -242,7 +242,7 @@ class SiteMemory:
         if one.predicted_s is not None and one.ok:
             self._conformal.learn(one.predicted_s, one.seconds + one.waited_s)
         elif one.predicted_s is not None:
-            self._conformal.miss()
+            self._conformal.miss(one.predicted_s, one.seconds + one.waited_s)
         self._teach(one)
 
     def _teach(self, one: Observation) -> None:
@@ -263,8 +263,3 @@ class SiteMemory:
             )
         else:
             model.learn_late(number, one.seconds, moved=moved, condition=one.condition)
-
-    def _joules(self, seconds: float) -> float:
-        if self._site == ONBOARD:
-            return self._energy.onboard_j(self._cpu_s.value or seconds)
-        return self._energy.remote_j(seconds, self._bytes.value)

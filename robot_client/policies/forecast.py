@@ -25,11 +25,13 @@ class PredictionErrors:
     """How wrong the last predictions for one site were; a value that never changes.
 
     `scores`: the error of each prediction in units of `unit_s`, sorted. `usual_s`: the usual time of a task.
+    `stopped`: the same of late runs that were stopped, mostly because a hedge answered first: at least this.
     The methods return None while fewer than ERRORS_MIN errors are known, unless a spread helps.
     """
 
     scores: tuple[float, ...] = ()
     usual_s: float = 0.0
+    stopped: tuple[float, ...] = ()
 
     def overdue(self, predicted_s: float, worth_s: float) -> float | None:
         """How old, in seconds, a running task is when it should still need more than `worth_s`."""
@@ -56,7 +58,8 @@ class PredictionErrors:
             return 0.5 * math.erfc(normal_of_student(t, count + 1) / math.sqrt(2.0))
         score = (limit_s - predicted_s) / unit_s(predicted_s, self.usual_s)
         # Never 0 or 1: a limit that no error has reached yet may still be missed.
-        return (count - bisect_left(self.scores, score) + 0.5) / (count + 1)
+        above = count - bisect_left(self.scores, score) + len(self.stopped)
+        return (above + 0.5) / (count + len(self.stopped) + 1)
 
     def half_90_s(self, predicted_s: float, spread_s: float) -> float:
         """Half of the width of a 90 % interval while few errors are known."""
@@ -64,11 +67,11 @@ class PredictionErrors:
 
     def below(self, predicted_s: float, share: float) -> float | None:
         """The time in seconds that this share of tasks with this prediction should stay below."""
-        count = len(self.scores)
-        if count < ERRORS_MIN:
+        if len(self.scores) < ERRORS_MIN:
             return None
-        rank = min(count - 1, math.ceil(share * (count + 1)) - 1)
-        return max(0.0, predicted_s + unit_s(predicted_s, self.usual_s) * self.scores[rank])
+        scores = sorted(self.scores + self.stopped) if self.stopped else self.scores
+        rank = min(len(scores), math.ceil(share * (len(scores) + 1))) - 1
+        return max(0.0, predicted_s + unit_s(predicted_s, self.usual_s) * scores[rank])
 
     def _scale_s(self, predicted_s: float, spread_s: float) -> float:
         """The root mean square of the errors and the spread."""

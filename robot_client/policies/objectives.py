@@ -15,13 +15,14 @@ S_PER_QUALITY = 1.0  # seconds that the whole quality is worth
 class Expected(NamedTuple):
     """What running a task on one site should take, and how good its answer is.
 
-    `spread_s` is None while it is unknown.
+    `spread_s` is None while it is unknown. `bytes` are sent and received.
     """
 
     seconds: float
     spread_s: float | None
     joules: float
     quality: Quality = WHOLE
+    bytes: float = 0.0
 
 
 @runtime_checkable
@@ -70,13 +71,15 @@ class Deadline:
 
 
 @dataclass(frozen=True)
-class TimeAndEnergy:
-    """The expected time plus `s_a_joule` seconds for each joule, and the worth of the lost quality."""
+class TimeAndSpending:
+    """The expected time plus the worth of joules, megabytes (both ways) and lost quality, in seconds."""
 
-    s_a_joule: float
+    s_a_joule: float = 0.0
+    s_a_megabyte: float = 0.0
 
     def cost(self, expected: Expected, errors: PredictionErrors) -> float:  # noqa: ARG002
-        return expected.seconds + self.s_a_joule * expected.joules + expected.quality.lost_s
+        spent_s = self.s_a_joule * expected.joules + self.s_a_megabyte * 1e-6 * expected.bytes
+        return expected.seconds + spent_s + expected.quality.lost_s
 
 
 def by_deadline(forecast: Forecast, deadline_s: float) -> Forecast:
@@ -95,19 +98,26 @@ def by_deadline(forecast: Forecast, deadline_s: float) -> Forecast:
     return forecast._replace(sites=sites)
 
 
-OBJECTIVES = ("mean", "p95", "deadline", "energy")
+OBJECTIVES = ("mean", "p95", "deadline", "energy", "metered")
 
 
-def make(name: str, *, deadline_s: float | None = None, s_a_joule: float | None = None) -> Objective:
+def make(
+    name: str,
+    *,
+    deadline_s: float | None = None,
+    s_per_joule: float | None = None,
+    s_per_megabyte: float | None = None,
+) -> Objective:
     """The objective of this name; ConfigError if its setting is missing or wrong."""
     if name == "deadline":
         if deadline_s is None or not deadline_s > 0:
             raise ConfigError(f"objective 'deadline' needs a deadline above 0 s, not {deadline_s}")
         return Deadline(deadline_s)
-    if name == "energy":
-        if s_a_joule is None or not s_a_joule >= 0:
-            raise ConfigError(f"objective 'energy' needs the seconds that a joule is worth, not {s_a_joule}")
-        return TimeAndEnergy(s_a_joule)
+    for of, what, worth_s in (("energy", "joule", s_per_joule), ("metered", "megabyte", s_per_megabyte)):
+        if name == of if worth_s is None else not worth_s >= 0:
+            raise ConfigError(f"objective {name!r} needs the seconds that a {what} is worth, not {worth_s}")
+    if name in ("energy", "metered"):
+        return TimeAndSpending(s_per_joule or 0.0, s_per_megabyte or 0.0)
     if name not in OBJECTIVES:
         raise ConfigError(f"objective {name!r} is not one of {', '.join(OBJECTIVES)}")
     return Tail() if name == "p95" else Mean()

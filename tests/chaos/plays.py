@@ -20,7 +20,9 @@ FEW_FAULTS = {
 WRONG = SHORT if ALL else ["calm"]  # scenarios that are played with policies that must fail
 BROKEN = ["dead-robot", "lying-cloud"] if ALL else ["dead-robot"]  # broken parts that are played
 IN_CONTAINERS = SHORT if ALL else ["cloud-busy"]
-ON_LOOPBACK = SHORT if ALL else []  # WRONG already plays some there
+ON_LOOPBACK = SHORT if ALL else []  # WRONG and HELD already play some there
+# Short ones: a dead spot, stalls, load, a slow link, an objective, several servers.
+HELD = ["outage", "heavy-tail", "robot-busy", "bandwidth", "deadline", "edge-and-cloud"]
 SOAK_TASKS = 400  # 20 seconds
 LEAK_TASKS = 600
 

@@ -11,12 +11,15 @@ from offboard.loadgen.play.play_scenario import Played, play
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.robot_client import policies
+from offboard.robot_client.policies.objectives import OBJECTIVES
 from tests.breaks import BREAKS, bed_with
 from tests.chaos.plays import ALL, BROKEN, LEAK_TASKS, SCENARIOS, WRONG, skip_if_unplayable
 
 # Their answers are compared within a tolerance.
 APPLICATIONS = ("apriltags", "registration", "signs", "pose-graph", "arm")
 SLOWER = 0.5  # CPU share of a robot that plans onboard: on a fast machine that policy might not fail
+
+BY_MEAN = f"{policies.ALIAS}+{OBJECTIVES[0]}"  # the default with another objective than the scenario's
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
 
@@ -29,7 +32,7 @@ def broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Scenari
         if name == "onboard":
             cpus = SLOWER * scenario.robot.cpus
             scenario = replace(scenario, robot=replace(scenario.robot, cpus=cpus))
-        if name in policies.names():
+        if name not in BREAKS:
             return play(scenario.changed(policy=name), tmp_path, quiet=True)
         change, cloud = BREAKS[name]
         monkeypatch.setitem(play_scenario.TESTBEDS, "local", bed_with(cloud))
@@ -51,7 +54,7 @@ def failing(scenario: Scenario) -> dict[str, list[str]]:
 def test_every_check_names_what_it_fails_with(name: str) -> None:
     """Every check fails with a policy or a broken part, or notes why not; lost and wrong ones are checked."""
     scenario = read_scenario(find_scenario(name))
-    assert failing(scenario).keys() <= {*policies.names(), *BREAKS}
+    assert failing(scenario).keys() <= {*policies.names(), BY_MEAN, *BREAKS}
     assert [str(check) for check in scenario.checks if not check.fails_with and not check.note] == []
     assert scenario.about
     for figure, fails_with in (("lost", "dead-robot"), ("wrong", "lying-cloud")):
@@ -65,7 +68,7 @@ def test_every_check_names_what_it_fails_with(name: str) -> None:
             (name, wrong)
             for name in WRONG
             for wrong in failing(read_scenario(find_scenario(name)))
-            if wrong in policies.names()
+            if wrong not in BREAKS
         ),
         *(("calm", part) for part in BROKEN),  # all scenarios have these checks
         *((f"{name}-calm", "lying-cloud") for name in APPLICATIONS if ALL),

@@ -14,7 +14,8 @@ from offboard.loadgen.robot_files import read_trace
 from offboard.loadgen.scenario.event_timeline import Event
 from offboard.loadgen.scenario.outcome_files import read_lines
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
-from tests.chaos.plays import IN_CONTAINERS, ON_LOOPBACK, SOAK_TASKS, skip_if_unplayable
+from offboard.robot_client import policies
+from tests.chaos.plays import HELD, IN_CONTAINERS, ON_LOOPBACK, SOAK_TASKS, skip_if_unplayable
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -46,6 +47,18 @@ def test_a_scenario_is_played_and_judged(
     assert all(event["happened_s"] is not None for event in happened)
     summary = json.loads((tmp_path / play_scenario.SUMMARY).read_text())
     assert [check["holds"] for check in summary["checks"]] == [one.holds for one in played.verdicts]
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", HELD)
+def test_the_default_keeps_its_checks(tmp_path: Path, name: str) -> None:
+    """On loopback, with real processes, every check holds with the policy of the scenario: the default."""
+    scenario = read_scenario(find_scenario(name))
+    assert scenario.robot.policy == policies.ALIAS
+    played = play(scenario, tmp_path, quiet=True)
+    played.check_robots()
+    print(*played.verdicts, sep="\n")
+    assert [str(one) for one in played.verdicts if not one.holds] == []
 
 
 @pytest.mark.integration

@@ -71,10 +71,30 @@ def test_a_task_stopped_after_the_upper_end_counts_as_outside(seed: int) -> None
             asked += 1
             inside += not hangs and ends[0] <= seconds <= ends[1]
         if hangs:
-            conformal.miss()
+            conformal.miss(predicted, seconds)
         else:
             conformal.learn(predicted, seconds)
     assert inside / asked == pytest.approx(COVERAGE, abs=0.015)
+
+
+def test_a_stopped_task_counts_in_the_tail_and_not_in_the_hedge() -> None:
+    """One run in ten is stopped at twice its time: that is known of the tail, and does not delay hedges."""
+    rng, hedged, whole = Random(1), Conformal(), Conformal()
+    for i in range(200):
+        seconds = rng.uniform(0.95, 1.05)
+        whole.learn(1.0, seconds)
+        if i % 10 == 9:
+            hedged.miss(1.0, 2.0)
+        else:
+            hedged.learn(1.0, seconds)
+    assert whole.errors.share_above(1.0, 3.0) == pytest.approx(0.0, abs=0.01)
+    assert hedged.errors.share_above(1.0, 3.0) == pytest.approx(0.1, abs=0.02)
+    assert whole.errors.below(1.0, 0.95) == pytest.approx(1.05, abs=0.01)
+    assert hedged.errors.below(1.0, 0.95) == pytest.approx(2.0, abs=0.1)
+    assert len(hedged.errors.stopped) == 10  # as far back as the errors
+    due_s = hedged.errors.overdue(1.0, 0.5)
+    assert due_s is not None
+    assert due_s < 1.2
 
 
 @pytest.mark.parametrize("draw", [normal, skewed])

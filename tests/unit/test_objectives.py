@@ -101,9 +101,17 @@ def test_a_negative_prediction_is_no_negative_cost(seconds: float) -> None:
 def test_energy_weighs_joules_in_seconds() -> None:
     """If a joule is worth enough seconds, cheap waiting beats fast computing."""
     onboard, cloud = expected(0.2, joules=0.5), expected(0.4, joules=0.01)
-    assert cost("energy", onboard, s_a_joule=0.1) < cost("energy", cloud, s_a_joule=0.1)
-    assert cost("energy", onboard, s_a_joule=1.0) > cost("energy", cloud, s_a_joule=1.0)
-    assert cost("energy", onboard, s_a_joule=2.0) == pytest.approx(0.2 + 2 * 0.5)
+    assert cost("energy", onboard, s_per_joule=0.1) < cost("energy", cloud, s_per_joule=0.1)
+    assert cost("energy", onboard, s_per_joule=1.0) > cost("energy", cloud, s_per_joule=1.0)
+    assert cost("energy", onboard, s_per_joule=2.0) == pytest.approx(0.2 + 2 * 0.5)
+
+
+def test_metered_weighs_megabytes_in_seconds() -> None:
+    """A megabyte is a million bytes, both ways together; with both weights, joules and bytes count."""
+    sent = Expected(0.1, None, 0.5, bytes=20_000)
+    assert cost("metered", sent, s_per_megabyte=10.0) == pytest.approx(0.1 + 0.2)
+    assert cost("metered", sent, s_per_megabyte=10.0, s_per_joule=2.0) == pytest.approx(0.1 + 0.2 + 1.0)
+    assert cost("energy", sent, s_per_joule=2.0) == pytest.approx(0.1 + 1.0)
 
 
 @pytest.mark.parametrize(
@@ -113,7 +121,8 @@ def test_energy_weighs_joules_in_seconds() -> None:
         ("deadline", {}, "needs a deadline above 0 s, not None"),
         ("deadline", {"deadline_s": 0.0}, "needs a deadline above 0 s, not 0.0"),
         ("energy", {}, "needs the seconds that a joule is worth, not None"),
-        ("energy", {"s_a_joule": -1.0}, "not -1.0"),
+        ("energy", {"s_per_joule": -1.0}, "not -1.0"),
+        ("metered", {"s_per_joule": 1.0}, "needs the seconds that a megabyte is worth, not None"),
     ],
 )
 def test_an_objective_says_what_it_needs(name: str, needs: dict[str, float], says: str) -> None:

@@ -14,7 +14,7 @@ from offboard.loadgen.robot_files import read_trace
 from offboard.robot_client import policies
 from offboard.robot_client.policies.allowance import DUPLICATES_MAX
 from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.objectives import S_PER_QUALITY, Mean, TimeAndEnergy
+from offboard.robot_client.policies.objectives import S_PER_QUALITY, Mean, TimeAndSpending
 from offboard.robot_client.policies.probe import PROBE_EVERY
 
 MAP, TASK = {"map": Path("m.yaml")}, {"task": "m:f", "sizes": ("constant:1",)}
@@ -148,7 +148,7 @@ def test_objective_energy_and_limits_are_made_from_the_flags() -> None:
         environ={},
         prefix="R",
     )
-    assert config.settings(1).objective == TimeAndEnergy(2.0)
+    assert config.settings(1).objective == TimeAndSpending(2.0)
     assert config.settings(1).s_per_quality == 3.0
     assert config.settings(1).energy == Energy(3.0, 0.5, 1e-6)
     allowance = config.settings(1).allowance()

@@ -110,6 +110,12 @@ def test_random_faults_restore_the_link() -> None:
         ('[[check]]\nfigure = "late_percent"\nat_most = 2\n', r":8: .* without workload\.deadline"),
         ('[[check]]\nfigure = "lost"\nat_most = 0\nfrom_task = 50\n', r":8: .*task 50 is not among the 50"),
         ("[chaos]\nevery_s = 3\n", r"chaos: .*; workload\.arrivals must not be closed"),
+        ('[robot]\nobjective = "fast"\n', r"robot\.objective: 'fast' is not one of mean, p95, deadline,"),
+        ('[robot]\nobjective = "deadline"\n', r"robot\.objective: 'deadline' needs workload\.deadline_ms"),
+        ('[robot]\nobjective = "energy"\n', r"robot\.objective: 'energy' needs robot\.s_per_joule"),
+        ("[robot]\ns_per_megabyte = 3\n", r"robot\.s_per_megabyte: needs robot\.objective = metered"),
+        ('[robot]\npolicy = "paper+p95"\n', r"robot\.policy: 'paper\+p95': an objective changes nothing"),
+        ('[robot]\npolicy = "default+best"\n', r"robot\.policy: .*: 'best' is not one of mean, p95,"),
         ("reference = -1\n", r"workload\.reference: -1 is below 0"),
         ('planner = "theta"\n', r"workload\.planner: 'theta' is not one of dijkstra, astar, jps"),
     ],
@@ -135,7 +141,7 @@ def test_a_scenario_is_found_by_name_or_path() -> None:
     """A shipped scenario is found by its name; an unknown name is an error that lists all names."""
     assert find_scenario("calm").is_file()
     with pytest.raises(
-        DataError, match=r"scenario 'clam' is neither a file nor one of .*bandwidth, burst, calm"
+        DataError, match=r"scenario 'clam' is neither a file nor one of .*bandwidth, battery, burst, calm"
     ):
         find_scenario("clam")
 

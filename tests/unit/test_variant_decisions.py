@@ -20,7 +20,7 @@ from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Decision, Forecast, Hedge, Outlook, Probe, objectives
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.forecast import WHOLE, PredictionErrors, Quality
-from offboard.robot_client.policies.objectives import Deadline, Expected, Mean, Tail, TimeAndEnergy
+from offboard.robot_client.policies.objectives import Deadline, Expected, Mean, Tail, TimeAndSpending
 from offboard.robot_client.records.trace import Record, as_dict
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution
@@ -167,7 +167,7 @@ def test_a_hedge_with_a_worse_variant_starts_later() -> None:
     assert due_s[0] < due_s[1]
 
 
-@pytest.mark.parametrize("objective", [Mean(), Tail(), TimeAndEnergy(0.0)])
+@pytest.mark.parametrize("objective", [Mean(), Tail(), TimeAndSpending(0.0)])
 def test_lost_quality_counts_as_seconds(objective: objectives.Objective) -> None:
     """With every objective whose cost is a time, it is added to the cost."""
     whole, errors = Expected(0.3, 0.0, 2.0), known(0.3).errors

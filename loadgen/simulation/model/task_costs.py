@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from random import Random
 
 from offboard.common.planning.planner_names import ASTAR, DIJKSTRA, JPS
-from offboard.loadgen.scenario.hash_tasks import rounds_on
+from offboard.loadgen.scenario.hash_tasks import EVERYWHERE, rounds_on
 from offboard.loadgen.testbed.testbed import CLOUD as CLOUD_PART
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
@@ -60,12 +60,14 @@ COSTS: Mapping[str, Cost] = {
     "hash_rounds": HASH,
     "hash_pairs": HASH,
     "hash_rarely_long": HASH,
+    "hash_rarely_long_everywhere": HASH,
 }
 PARTS = {ONBOARD: ROBOT, CLOUD: CLOUD_PART}  # the part of the testbed that runs a site
 ROUNDS: Mapping[str, Callable[[str, int], int]] = {
     "hash_rounds": lambda _, rounds: rounds,
     "hash_pairs": lambda _, count: count * count // 1000,
     "hash_rarely_long": lambda site, rounds: rounds_on(PARTS[site], rounds),
+    "hash_rarely_long_everywhere": lambda _, rounds: rounds_on(EVERYWHERE, rounds),
 }
 
 

@@ -1,0 +1,77 @@
+"""What the tasks of a run cost by the objective of its scenario, from what each task took.
+
+What a robot expects before a task is in `robot_client/policies/objectives`.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from offboard.loadgen.table.measured_rows import Column
+from offboard.loadgen.table.table_two_figures import quantile
+from offboard.robot_client.policies.energy import Energy
+from offboard.robot_client.policies.objectives import S_PER_QUALITY
+from offboard.robot_client.sites.runner import ONBOARD
+
+P95 = 95  # percent, as the objective `p95`
+
+Late = Mapping[tuple[str, str], Mapping[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Spent:
+    """What all runs of a task took: CPU seconds onboard, seconds at servers, and bytes sent and received."""
+
+    compute_s: float = 0.0
+    remote_s: float = 0.0
+    bytes: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Costing:
+    """The price of tasks: an objective by name, and its settings as in `[robot]` and `[workload]`."""
+
+    objective: str = "mean"
+    deadline_s: float | None = None
+    s_per_joule: float = 0.0
+    s_per_megabyte: float = 0.0
+    energy: Energy = Energy()
+
+    def of_task(self, response_s: float, quality: float | None, spent: Spent) -> float:
+        """What one task counts: seconds, or for `deadline` the quality that was lost."""
+        lost = 0.0 if quality is None else 1.0 - quality
+        if self.objective == "deadline":
+            assert self.deadline_s is not None, "checked when the scenario was read"
+            return 1.0 if response_s > self.deadline_s else lost
+        joules = self.energy.onboard_j(spent.compute_s) + self.energy.remote_j(spent.remote_s, spent.bytes)
+        worth_s = self.s_per_joule * joules + self.s_per_megabyte * 1e-6 * spent.bytes
+        return response_s + S_PER_QUALITY * lost + worth_s
+
+    def over(self, costs: Column) -> Column:
+        """The cost of the tasks in the last axis together: their mean, or their P95."""
+        mean: Column = costs.mean(axis=-1)
+        return quantile(costs, P95) if self.objective == "p95" else mean
+
+
+def late_executions(records: Iterable[Mapping[str, Any]]) -> Late:
+    """The executions that ended after their task's record was written, by task id and site."""
+    return {(one["id"], one["site"]): one for record in records for one in record.get("late", ())}
+
+
+def spent_of(record: Mapping[str, Any], late: Late) -> Spent:
+    """What the executions of a record took; a run that was still going on counts with its end."""
+    compute_s, remote_s, moved = 0.0, 0.0, 0.0
+    for one in record["executions"]:
+        one = late.get((record["id"], one["site"]), one)
+        if one["site"] == ONBOARD:
+            compute_s += _onboard_s(one, record["features"].get(f"{ONBOARD}.capacity", 1.0))
+        else:
+            remote_s += one["seconds"]
+            moved += one["bytes_out"] + one["bytes_in"]
+    return Spent(compute_s, remote_s, moved)
+
+
+def _onboard_s(execution: Mapping[str, Any], capacity: float) -> float:
+    """CPU seconds; those of a cancelled run are not known, and it counts with all that it may have had."""
+    cpu_s = execution["cpu_s"]
+    return float(capacity * execution["seconds"] if cpu_s is None else cpu_s)

@@ -1,0 +1,156 @@
+"""What tasks cost by the objective of a scenario, from the trace to the table of a comparison."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from offboard.common.errors import ConfigError
+from offboard.loadgen.compare.compare_settings import CompareConfig
+from offboard.loadgen.compare.comparison_table import comparison_table
+from offboard.loadgen.play.part_setups import setups
+from offboard.loadgen.scenario.outcome import Answered, Outcome
+from offboard.loadgen.scenario.outcome_figures import FIGURES
+from offboard.loadgen.scenario.scenario import RobotPart, Scenario, Workload
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
+from offboard.loadgen.scenario.task_cost import Costing, Spent, late_executions, spent_of
+from offboard.robot_client.policies.energy import Energy
+from offboard.robot_client.policies.objectives import Deadline, Mean, Tail, TimeAndSpending
+
+WORKLOAD = Workload(task="m:f", sizes=("constant:1",), deadline_ms=200)
+ENERGY = Energy(compute_w=5.0, idle_w=1.0, radio_j_byte=1e-6)
+
+
+def execution(site: str, seconds: float, **more: Any) -> dict[str, Any]:
+    return {"site": site, "seconds": seconds, "cpu_s": None, "bytes_out": 0, "bytes_in": 0} | more
+
+
+def test_all_runs_of_a_task_are_spent() -> None:
+    """Late runs count with their ends; a cancelled run onboard counts with the CPU that it may have had."""
+    record = {
+        "id": "a",
+        "features": {"onboard.capacity": 0.2},
+        "executions": [
+            execution("onboard", 0.5),
+            execution("cloud", 0.1, bytes_out=100),
+            execution("edge", 0.2, bytes_out=10, bytes_in=5),
+        ],
+    }
+    later = {"late": [{"id": "a"} | execution("cloud", 0.3, bytes_out=100, bytes_in=50)]}
+    spent = spent_of(record, late_executions([record, later]))
+    assert spent == Spent(pytest.approx(0.1), pytest.approx(0.5), 165)
+    alone = record | {"executions": [execution("onboard", 0.5, cpu_s=0.07)]}
+    assert spent_of(alone, {}) == Spent(0.07)
+
+
+@pytest.mark.parametrize(
+    ("costing", "expected"),
+    [
+        (Costing(), 0.3),
+        (Costing("p95"), 0.3),
+        (Costing("deadline", 0.25), 1.0),
+        (Costing("deadline", 0.35), 0.0),
+        (Costing("energy", s_per_joule=2.0, energy=ENERGY), 0.3 + 2.0 * (5.0 * 0.1 + 0.2 + 0.05)),
+        (Costing("metered", s_per_megabyte=4.0, energy=ENERGY), 0.3 + 4.0 * 0.05),
+    ],
+)
+def test_a_task_costs_what_its_objective_weighs(costing: Costing, expected: float) -> None:
+    """A task of 0.3 s took 0.1 CPU seconds, 0.2 s at a server and 50,000 bytes."""
+    assert costing.of_task(0.3, None, Spent(0.1, 0.2, 50_000)) == pytest.approx(expected)
+
+
+def test_lost_quality_costs_too() -> None:
+    """The whole quality is worth a second; for `deadline`, it is the share that was lost."""
+    assert Costing().of_task(0.3, 0.9, Spent()) == pytest.approx(0.4)
+    assert Costing("deadline", 1.0).of_task(0.3, 0.9, Spent()) == pytest.approx(0.1)
+
+
+def outcome(seconds: float, spent: Spent) -> Outcome:
+    """Twenty tasks of `seconds`, the last two of ten times as long."""
+    return Outcome(
+        {"robot": 20},
+        [
+            Answered(
+                i=i,
+                robot="robot",
+                due_s=i,
+                ended_s=i + seconds * (10 if i > 17 else 1),
+                error=None,
+                answer=None,
+                chosen="cloud",
+                both=False,
+                sites=("cloud",),
+                spent=spent,
+            )
+            for i in range(20)
+        ],
+    )
+
+
+@pytest.mark.parametrize(
+    ("robot", "expected"),
+    [
+        ({"objective": "mean"}, 0.1 * 38 / 20),
+        ({"objective": "p95"}, 1.0),
+        ({"objective": "deadline"}, 0.1),
+        ({"objective": "metered", "s_per_megabyte": 1.0}, 0.1 * 38 / 20 + 0.5),
+    ],
+)
+def test_a_comparison_judges_all_policies_by_the_objective_of_the_scenario(
+    robot: Mapping[str, Any], expected: float
+) -> None:
+    """Also a variant that decides by another objective; the figure `cost` of a run says the same."""
+    scenario = Scenario("small", 1, WORKLOAD, robot=RobotPart(**robot))
+    config = CompareConfig(policies=("default", "default+mean"), seeds=1)
+    cheap, dear = (outcome(seconds, Spent(bytes=moved)) for seconds, moved in ((0.1, 5e5), (0.15, 1e6)))
+    first, *_, second, _low, _high = comparison_table(
+        scenario, config, {"default": [cheap], "default+mean": [dear]}
+    ).lines
+    assert first.cost == pytest.approx(expected)
+    judged = replace(cheap, costing=scenario.costing())
+    assert FIGURES["cost"].compute(judged) == pytest.approx(expected)
+    assert second.cost_over_first == pytest.approx(second.cost / first.cost)
+
+
+@pytest.mark.parametrize(
+    ("robot", "objective", "flags"),
+    [
+        ({}, Mean(), {}),
+        ({"objective": "p95"}, Tail(), {"objective": "p95"}),
+        ({"objective": "deadline"}, Deadline(0.2), {"objective": "deadline", "deadline": 0.2}),
+        ({"objective": "deadline", "policy": "default+mean"}, Mean(), {}),
+        ({"objective": "deadline", "policy": "paper"}, Mean(), {}),
+        (
+            {"objective": "energy", "s_per_joule": 2.0, "compute_watts": 5.0},
+            TimeAndSpending(2.0),
+            {"objective": "energy", "s_per_joule": 2.0, "compute_watts": 5.0},
+        ),
+        (
+            {"objective": "metered", "s_per_megabyte": 3.0, "s_per_joule": 2.0},
+            TimeAndSpending(2.0, 3.0),
+            {"objective": "metered", "s_per_megabyte": 3.0, "s_per_joule": 2.0},
+        ),
+    ],
+)
+def test_a_robot_decides_by_the_objective(
+    tmp_path: Path, robot: Mapping[str, Any], objective: object, flags: Mapping[str, Any]
+) -> None:
+    """The simulation gets the objective, a robot process its flags; a policy without costs gets neither."""
+    scenario = Scenario("small", 1, WORKLOAD, robot=RobotPart(**robot))
+    found = scenario.objective()
+    assert type(found) is type(objective)
+    assert vars(found) == vars(objective)
+    given = setups(scenario, tmp_path)["robot"].flags
+    names = ("objective", "deadline", "s_per_joule", "s_per_megabyte", "compute_watts")
+    assert {name: given[name] for name in names if name in given}.items() >= flags.items()
+    assert ("objective" in given) == bool(flags)
+
+
+def test_a_variant_needs_what_its_objective_needs() -> None:
+    """A scenario without a deadline cannot be played with `default+deadline`."""
+    calm = read_scenario(find_scenario("calm"))
+    with pytest.raises(ConfigError, match=r"'deadline' needs workload\.deadline_ms"):
+        calm.changed(policy="default+deadline")
+    assert calm.changed(policy="default+p95").robot.decides_by == "p95"
