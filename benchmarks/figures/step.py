@@ -8,6 +8,7 @@ import json
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ FOLDER = Path("docs/figures")
 STEPS = FOLDER / "steps.toml"
 PART = "{part}"  # in a command: the name of the part
 DATASETS = ("paper", "congested", "registration")  # in the order of the page
-SOAK = "soak"  # half an hour: it has a step of its own
+SOAK = "soak"  # half an hour: `make chaos` plays it
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,12 +149,12 @@ def _step(section: str, table: Mapping[str, Any]) -> Step:
     return Step(section=section, **values)
 
 
-def checked_scenarios() -> tuple[str, ...]:
-    """The shipped scenarios that have checks, without the soak and the scenarios of applications."""
+def checked_scenarios(*, applications: bool = False) -> tuple[str, ...]:
+    """The shipped scenarios that have checks, without the soak: those of applications, or the others."""
     found = []
     for name in shipped():
         scenario = read_scenario(find_scenario(name))
-        if scenario.checks and scenario.workload.inputs is None and name != SOAK:
+        if scenario.checks and (scenario.workload.inputs is not None) == applications and name != SOAK:
             found.append(name)
     return tuple(found)
 
@@ -173,6 +174,7 @@ def simulated_scenarios() -> tuple[str, ...]:
 # Lists that the file names by a word, so that a new scenario cannot be forgotten.
 PARTS = {
     "checked scenarios": checked_scenarios,
+    "checked applications": partial(checked_scenarios, applications=True),
     "simulated scenarios": simulated_scenarios,
     "datasets": lambda: DATASETS,
 }
