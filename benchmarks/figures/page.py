@@ -25,9 +25,10 @@ ABOUT = """\
 
 # Results
 
-This page holds all measured figures.
+This page holds the measured figures. A figure on another page names its commit, or links to this page.
 `make figures` measures them, and writes this page from what the commands printed.
-Each section names its commit, date, machine and commands. Later commits may give other figures.
+Each section names its commit, date, machine and commands. Later commits may give other figures, also because
+a scenario was changed: `git log -1 -- loadgen/scenarios/NAME.toml` shows when.
 [performance.md](performance.md), [scenarios.md](scenarios.md) and [evaluation.md](evaluation.md) explain
 what is measured.
 """
@@ -117,7 +118,8 @@ def _commits(sections: Sequence[Section], files: Mapping[str, Measured]) -> Iter
         return
     commit = max(there, key=lambda item: (item[1].date, item[1].commit))[1].commit
     same = [one for _, one in there if one.commit == commit]
-    yield f"**{len(same)} of {len(units)} measurements are of commit {commit}** ({_span(same)})."
+    done = f"**{len(there)} of {len(units)} measurements are done**"
+    yield f"{done}, and {len(same)} of them are of commit {commit} ({_span(same)})."
     others: dict[str, list[Unit]] = {}
     for unit, one in there:
         if of_other_rows(unit, one):
@@ -127,7 +129,7 @@ def _commits(sections: Sequence[Section], files: Mapping[str, Measured]) -> Iter
     missing = [unit for unit in units if unit.name not in files]
     for why, some in (*others.items(), ("not measured yet", missing)):
         if some:
-            yield f"{why[0].upper()}{why[1:]}: {'; '.join(_named(some))}."
+            yield from ("", f"{why[0].upper()}{why[1:]}:", "", *(f"- {one}" for one in _named(some)))
 
 
 def _named(units: Sequence[Unit]) -> Iterator[str]:
@@ -198,7 +200,7 @@ def _conditions(there: Mapping[Unit, Measured]) -> Iterator[str]:
     for where, some in lines.items():
         parts = "" if len(lines) == 1 else f"- {', '.join(names[id(one)] for one in some)}: "
         stolen = [one.stolen_percent for one in some if one.stolen_percent is not None]
-        worst = f" Its host took at most {max(stolen):g} % of the CPU time." if stolen else ""
+        worst = f" The host of this virtual machine gave at most {max(stolen):g} % of its CPU time to others." if stolen else ""
         yield f"{parts}Commit {where.format(_span(some))}{worst}"
 
 
