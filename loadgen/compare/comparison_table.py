@@ -73,7 +73,7 @@ HEADINGS: dict[str, Heading] = {
     "over_first": Heading("mean / first policy", "mean / first policy", 3),
     "at_one_speed": Heading("mean / first policy at equal machine speed", "at equal speed", 3),
     "server_over_first": Heading("server time / first policy", "server time / first policy", 3),
-    "cost": Heading("cost per task", "cost", 4),
+    "cost": Heading("cost", "cost", 4),
     "cost_over_first": Heading("cost / first policy", "cost / first policy", 3),
     "p95_ms": Heading("P95 ms", "P95 ms", 1),
     "p99_ms": Heading("P99 ms", "P99 ms", 1),
