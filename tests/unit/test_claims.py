@@ -12,7 +12,7 @@ import pytest
 
 from offboard.common.errors import DataError
 from offboard.loadgen.__main__ import main
-from offboard.loadgen.claims.claim import BELOW_ONE, POSITIVE, Claimed, Figure
+from offboard.loadgen.claims.claim import BELOW_ONE, POSITIVE, Claimed, Figure, mean_of
 from offboard.loadgen.claims.claims import run_claims
 from offboard.loadgen.claims.claims_settings import ClaimsConfig
 from offboard.loadgen.claims.prediction_claims import RIVALS, PredictionClaims
@@ -70,6 +70,16 @@ def found_in(printed: str) -> dict[str, dict[str, Any]]:
 def test_a_claim_agrees_if_the_whole_interval_does(claimed: Claimed, figure: Figure, agrees: str) -> None:
     """Yes and no need the whole interval on one side of the limits; an exact figure needs no interval."""
     assert claimed.agrees(figure) == agrees
+
+
+@pytest.mark.parametrize(("values", "agrees"), [(49, "unclear"), (50, "yes")])
+def test_a_few_blocks_decide_nothing(values: int, agrees: str) -> None:
+    """Windows of 10 rows share rows, so a block has 10 values; below five blocks there is no interval."""
+    blocks = ClaimsConfig().blocks(values, overlap=10)
+    figure = mean_of(blocks, np.linspace(1.0, 2.0, values))
+    assert figure.value == pytest.approx(1.5)
+    assert (figure.low is None) == (figure.high is None) == (agrees == "unclear")
+    assert POSITIVE.agrees(figure) == agrees
 
 
 def test_every_claim_has_lines_that_fit(print_claims: Print) -> None:
