@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -217,6 +218,14 @@ def test_a_missing_library_is_a_note(print_claims: Print, monkeypatch: pytest.Mo
     claims = found_in(print_claims(predictors=("k-means", "huber"), format="json"))
     assert "needs the extra 'learned'" in claims["ahead of k-means"]["note"]
     assert claims["training, huber"]["ours"] > 0
+
+
+def test_a_coarse_clock_is_a_note(print_claims: Print, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where least squares takes no time by the CPU clock, there is no multiple of it."""
+    monkeypatch.setattr(time, "process_time", lambda: 1.0)
+    claims = found_in(print_claims(csv_of(ROWS[:80]), format="json"))
+    for words in ("training, huber", "prediction, huber"):
+        assert (claims[words]["ours"], claims[words]["note"]) == (None, "the CPU clock is too coarse")
 
 
 def test_several_datasets_get_a_table_each(
