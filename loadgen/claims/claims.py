@@ -43,10 +43,7 @@ def run_claims(paths: Sequence[Path], config: ClaimsConfig) -> int:
 
 
 def _table(path: Path, rows: Rows, found: Iterator[Claim]) -> Table:
-    lines = [
-        replace(one, more=MORE.get(one.number, "docs/claims.md").format(file=path))
-        for one in found
-    ]
+    lines = [replace(one, more=MORE.get(one.number, "docs/claims.md").format(file=path)) for one in found]
     left_out = f" ({rows.left_out} tasks without both times left out)" if rows.left_out else ""
     return Table(
         caption=f"{path}: {len(rows)} rows{left_out}. The numbers are those of the claims in docs/claims.md.",

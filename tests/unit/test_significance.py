@@ -44,7 +44,7 @@ def test_a_line_is_significant_and_noise_is_not() -> None:
 
 
 def test_a_falling_line_and_two_points_support_nothing() -> None:
-    """A significantly negative r is against the claim; two points always lie on a line, so there is no test."""
+    """A significantly negative r is against the claim, and two points always lie on a line."""
     size = np.random.default_rng(4).uniform(0, 5, 300)
     rows = Rows(size, onboard_s=0.1 + size, cloud_s=9.0 - size)
     config = ClaimsConfig(windows=("2", "10"), predictors=("least-squares",))
