@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from benchmarks.figures.step import ROOT, Step, Unit
+from benchmarks.figures.step import OUT, ROOT, Step, Unit
 from offboard.common.errors import DataError, OffloadError
 from offboard.loadgen.play.machine import machine as this_machine
 from offboard.loadgen.play.stolen_cpu_time import StolenCpuTime
@@ -57,10 +57,15 @@ class Measured:
         write_whole(path, json.dumps(asdict(self), indent=1, ensure_ascii=False) + "\n")
 
 
-def measure(unit: Unit, commit: str) -> Measured:
-    """Run the commands of a step, copy its pictures and return what it printed; OffloadError if one fails."""
+def measure(unit: Unit, commit: str, *, again: bool = False) -> Measured:
+    """Run the commands of a step and return what they printed; OffloadError if one fails.
+
+    Runs that were finished at this commit are used, but not with `again`.
+    """
     for target in unit.step.ready:
         _build(target)
+    if any(OUT in command for command in unit.step.run):
+        _prepare(unit, commit, again=again)
     here = machine_of(_environment(unit.step))
     reads, stolen, began = unit.reads(ROOT), StolenCpuTime(), time.monotonic()
     date, output = f"{datetime.now(UTC):%Y-%m-%d}", ""
@@ -70,8 +75,6 @@ def measure(unit: Unit, commit: str) -> Measured:
         raise OffloadError("nothing was printed")
     if len(output) > OUTPUT_MAX:
         raise OffloadError(f"{len(output)} characters were printed, at most {OUTPUT_MAX} are kept")
-    for source, target in unit.copies().items():
-        shutil.copyfile(ROOT / source, ROOT / target)
     percent = stolen.percent()
     return Measured(
         commit=commit,
@@ -83,6 +86,13 @@ def measure(unit: Unit, commit: str) -> Measured:
         seconds=round(time.monotonic() - began, 1),
         output=[line.rstrip() for line in output.strip().splitlines()],
     )
+
+
+def keep(unit: Unit, measured: Measured) -> None:
+    """Write the file of a step, and copy its pictures."""
+    for source, target in unit.copies().items():
+        shutil.copyfile(ROOT / source, ROOT / target)
+    measured.write(ROOT / unit.file)
 
 
 def why_old(unit: Unit, measured: Measured | None, commit: str) -> str:
@@ -135,6 +145,16 @@ def _environment(step: Step) -> dict[str, str]:
     if not (folder / "python").exists():
         raise OffloadError(f"{step.environment} is missing: `make figures` builds it")
     return {**os.environ, "PATH": f"{folder}:{os.environ['PATH']}", "COLUMNS": "100"}
+
+
+def _prepare(unit: Unit, commit: str, *, again: bool) -> None:
+    """Empty the folder of a step, unless its commands have begun at this commit."""
+    mark, made = ROOT / unit.work / ".made", "\n".join([commit, *unit.commands()])
+    if again or not mark.is_file() or mark.read_text() != made:
+        if mark.parent.exists():
+            shutil.rmtree(mark.parent)
+        mark.parent.mkdir(parents=True)
+        mark.write_text(made)
 
 
 def _build(target: str) -> None:

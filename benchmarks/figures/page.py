@@ -13,7 +13,7 @@ from pathlib import Path
 
 from benchmarks.figures.markdown_tables import MarkdownTable, blocks_of, first_table, joined, notes_of
 from benchmarks.figures.measured import OTHER_ROWS, Measured, of_other_rows
-from benchmarks.figures.step import PART, Section, Step, Unit, units_of
+from benchmarks.figures.step import Section, Step, Unit, units_of
 from offboard.common.errors import DataError
 from offboard.loadgen.table.table_columns import WIDTH
 
@@ -167,8 +167,8 @@ def _pictures(unit: Unit, folder: Path) -> Iterator[str]:
 
 
 def _commands(step: Step) -> Iterator[str]:
-    for command in step.run:
-        yield " \\\n  ".join(_wrapped(command.replace(PART, "NAME"), WIDTH - 4))
+    for command in Unit(step, "NAME" if step.parts else "").commands():
+        yield " \\\n  ".join(_wrapped(command, WIDTH - 4))
     if step.parts:
         yield from (f"# {line}" for line in _wrapped(f"NAME: {', '.join(step.parts)}", WIDTH - 2))
 

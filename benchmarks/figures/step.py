@@ -21,6 +21,8 @@ ROOT = Path(__file__).parents[2]
 FOLDER = Path("docs/figures")
 STEPS = FOLDER / "steps.toml"
 PART = "{part}"  # in a command: the name of the part
+OUT = "{out}"  # in a command: the folder that belongs to the step or part
+WORK = Path("out/figures/work")
 DATASETS = ("paper", "congested", "registration")  # in the order of the page
 SOAK = "soak"  # half an hour: `make chaos` plays it
 
@@ -29,7 +31,8 @@ SOAK = "soak"  # half an hour: `make chaos` plays it
 class Step:
     """One section of the results page, and what measures it.
 
-    - `run`: commands as a user types them; what they print is shown
+    - `run`: commands as a user types them; what they print is shown. {out} is a folder of their own, and holds
+      only what the same commands have left there at the same commit
     - `parts`: the commands run once for each part, and each part is a file of its own
     - `merge`: heading of the column that holds the parts, if the page shows their tables as
       one; of the text, it then shows only the notes
@@ -80,6 +83,11 @@ class Unit:
         """Where its result is, from the root of the checkout."""
         return FOLDER / f"{self.name}.json"
 
+    @property
+    def work(self) -> Path:
+        """The folder {out} of its commands, from the root of the checkout."""
+        return WORK / self.name
+
     def commands(self) -> list[str]:
         return [self._named(command) for command in self.step.run]
 
@@ -99,7 +107,7 @@ class Unit:
         return found
 
     def _named(self, text: str) -> str:
-        return text.replace(PART, self.part)
+        return text.replace(PART, self.part).replace(OUT, str(self.work))
 
 
 @dataclass(frozen=True)

@@ -127,9 +127,9 @@ def test_the_page_says_what_is_of_another_commit_and_what_is_missing() -> None:
     sections = [Section("S", "", (step(), parts, step(name="third", title="Third")))]
     files = {"speed": MEASURED, "parts/a": replace(MEASURED, commit="def5678", date="2026-11-20")}
     page = results(sections, files)
-    assert "**1 of 4 measurements are of commit abc1234** (2026-11-26)." in page
-    assert "Of commit def5678: [In parts](#in-parts) (a)." in page
-    assert "Not measured yet: [In parts](#in-parts) (b); [Third](#third)." in page
+    assert "**2 of 4 measurements are done**, and 1 of them are of commit abc1234 (2026-11-26)." in page
+    assert "Of commit def5678:\n\n- [In parts](#in-parts) (a)\n" in page
+    assert "Not measured yet:\n\n- [In parts](#in-parts) (b)\n- [Third](#third)\n" in page
     assert "Commit abc1234, 2026-11-26; AMD EPYC, 2 cores, 8 GiB, Linux 6.1, Python 3.11.7." in page
     assert "### Third\n\nHow fast.\n\n```sh\npython -m speed\n```\n\nNot measured yet.\n" in page
 
@@ -142,7 +142,7 @@ def test_the_page_names_tables_of_other_rows_than_those_of_the_checkout() -> Non
     assert why_old(unit, now, "abc1234") == ""
     assert why_old(unit, before, "abc1234") == OTHER_ROWS
     page = results([Section("S", "", (unit.step,))], {unit.name: before})
-    assert "Of rows that were measured again since: [Table II on our own datasets]" in page
+    assert "Of rows that were measured again since:\n\n- [Table II on our own datasets]" in page
     assert "rows of paper.csv of commit def5678" in page
 
 
@@ -205,6 +205,27 @@ def test_what_a_command_prints_is_kept_with_its_machine() -> None:
     assert measured.commit == "abc1234"
     assert measured.machine["python"] == platform.python_version()
     assert measured.seconds >= 0
+
+
+def test_finished_runs_are_used_at_the_same_commit_only() -> None:
+    """The folder of a step is emptied for another commit, for other commands, and if asked for."""
+    code = "from pathlib import Path as P; p = P('{out}', 'runs'); p.write_text(s := p.exists() * '+' + 'run'); print(s)"
+    unit, other = (
+        Unit(step(name="finished", run=(f'python -c "{code}{more}"',), environment=sys.prefix))
+        for more in ("", ";")
+    )
+    first = measure(unit, "abc1234", again=True)
+    assert list(first.output) == ["run"]
+    assert list(measure(unit, "abc1234").output) == ["+run"]
+    assert list(measure(unit, "def5678").output) == ["run"]
+    assert list(measure(unit, "def5678", again=True).output) == ["run"]
+    assert list(measure(other, "def5678").output) == ["run"]
+
+
+def test_no_step_shares_its_folder() -> None:
+    """Runs and pictures are in folders that belong to the step or part, so emptying one hurts no other."""
+    assert [command for unit in UNITS for command in unit.step.run if "out/" in command] == []
+    assert [one for unit in UNITS for one in unit.step.copies if not one.startswith("{out}/")] == []
 
 
 @pytest.mark.parametrize(
