@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from benchmarks.figures.measured import keep, measure, read_all, why_old
+from benchmarks.figures.measured import alone, keep, measure, read_all, why_old
 from benchmarks.figures.page import pages
 from benchmarks.figures.step import ROOT, STEPS, Section, Unit, read_sections, units_of
 from offboard.common.command_line import CommandParser, add_flags, run_command
@@ -52,18 +52,23 @@ def _run(argv: Sequence[str]) -> int:
     if config.write:
         write_pages(sections)
         return 0
-    commit, files = commit_here(), read_all(units)
-    if commit is None:
-        raise ConfigError("this is no checkout of git, so the commit of the figures is unknown")
-    clean = commit.removesuffix("-dirty")
-    states = {unit: why_old(unit, files.get(unit.name), clean) for unit in chosen}
+    if outside := [unit.name for unit in again if unit not in chosen]:
+        raise ConfigError(f"--again: {outside[0]} is not among those of --only")
+    commit, changed = commit_here(), changed_code()
+    if commit is None or changed is None:
+        raise ConfigError("this is no checkout that git can read, so the commit of the figures is unknown")
+    change = f"the code was changed: commit {', '.join(changed[:MORE_FILES])} first"
     if config.list:
-        _print_states(states)
+        files, clean = read_all(chosen), commit.removesuffix("-dirty")
+        _print_states({unit: why_old(unit, files.get(unit.name), clean) for unit in chosen})
+        if changed:
+            print(change)
         return 0
-    if changed := changed_code():
-        raise ConfigError(f"the code was changed: commit {', '.join(changed[:MORE_FILES])} first")
-    write_pages(sections)  # an error in a page is better known before than after hours
-    return _measure(chosen, again, sections, commit)
+    if changed:
+        raise ConfigError(change)
+    with alone():
+        write_pages(sections)  # an error in a page is better known before than after hours
+        return _measure(chosen, again, sections, commit)
 
 
 def _measure(units: Sequence[Unit], again: Sequence[Unit], sections: Sequence[Section], commit: str) -> int:

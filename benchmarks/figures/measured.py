@@ -4,6 +4,7 @@
 """
 
 import contextlib
+import fcntl
 import json
 import os
 import shlex
@@ -12,13 +13,14 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import IO
 
 from benchmarks.figures.step import OUT, ROOT, Step, Unit
-from offboard.common.errors import DataError, OffloadError
+from offboard.common.errors import ConfigError, DataError, OffloadError
 from offboard.loadgen.play.machine import machine as this_machine
 from offboard.loadgen.play.stolen_cpu_time import StolenCpuTime
 from offboard.loadgen.table.measured_rows import write_whole
@@ -157,9 +159,27 @@ def _prepare(unit: Unit, commit: str, *, again: bool) -> None:
         mark.write_text(made)
 
 
+@contextlib.contextmanager
+def alone() -> Iterator[None]:
+    """Nobody else measures figures here meanwhile, and a signal to end also ends the command under way."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job of a shell ignores it
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) != signal.SIG_IGN:  # as with nohup
+            signal.signal(number, signal.default_int_handler)
+    lock = ROOT / LOGS / ".lock"
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    with lock.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError("another `make figures` measures here: wait until it has ended") from None
+        yield
+
+
 def _build(target: str) -> None:
-    done = subprocess.run(["make", target], cwd=ROOT, stdout=sys.stderr, check=False, timeout=BUILD_S)
-    if done.returncode:
+    with _started(["make", target], dict(os.environ), sys.stderr, sys.stderr) as process:
+        code = process.wait(timeout=BUILD_S)
+    if code:
         raise OffloadError(f"`make {target}` failed")
 
 
@@ -173,36 +193,49 @@ def _run(unit: Unit, command: str) -> str:
     program = shutil.which(words[0], path=environment["PATH"])
     if program is None:
         raise OffloadError(f"`{command}`: there is no program {words[0]}")
-    with log.open("w") as errors:
-        process = subprocess.Popen(
-            [program, *words[1:]],
-            cwd=ROOT,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=errors,
-            text=True,
-            process_group=0,
-        )
-        try:
+    try:
+        with (
+            log.open("w") as errors,
+            _started([program, *words[1:]], environment, subprocess.PIPE, errors) as process,
+        ):
             output, _ = process.communicate(timeout=limit_s)
-        except subprocess.TimeoutExpired:
-            _end(process)
-            raise OffloadError(f"`{command}` has not ended after {limit_s / 60:.0f} minutes") from None
-        except KeyboardInterrupt:
-            _end(process)
-            raise
+    except subprocess.TimeoutExpired:
+        raise OffloadError(f"`{command}` has not ended after {limit_s / 60:.0f} minutes") from None
     if process.returncode:
         said = " / ".join(log.read_text().strip().splitlines()[-SAID_LINES:])
         raise OffloadError(f"`{command}` ended with exit code {process.returncode}: {said}")
     return f"{output.rstrip()}\n\n"
 
 
+@contextlib.contextmanager
+def _started(
+    words: Sequence[str], environment: Mapping[str, str], stdout: IO[str] | int, stderr: IO[str]
+) -> "Iterator[subprocess.Popen[str]]":
+    """A command in a process group of its own, which ends with the block at the latest."""
+    process = subprocess.Popen(
+        words,
+        cwd=ROOT,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=stdout,
+        stderr=stderr,
+        text=True,
+        process_group=0,
+    )
+    try:
+        yield process
+    finally:
+        if process.returncode is None:
+            _end(process)
+
+
 def _end(process: "subprocess.Popen[str]") -> None:
-    """End a command and its processes as Ctrl-C in a terminal does; kill what is left after END_S."""
-    os.killpg(process.pid, signal.SIGINT)
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        process.communicate(timeout=END_S)
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait(timeout=END_S)
+    """End a command and its processes as Ctrl-C does; kill what is left after END_S, or at a second Ctrl-C."""
+    try:
+        with contextlib.suppress(subprocess.TimeoutExpired, ProcessLookupError):
+            os.killpg(process.pid, signal.SIGINT)
+            process.communicate(timeout=END_S)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait(timeout=END_S)

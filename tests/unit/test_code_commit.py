@@ -56,6 +56,13 @@ def test_a_change_of_code_is_seen(checkout: Path) -> None:
     assert git("rev-parse", "HEAD").startswith(str(commit_here()))
 
 
+def test_a_git_that_fails_does_not_mean_unchanged(checkout: Path) -> None:
+    """If git cannot read what was committed, the commit is unknown."""
+    (checkout / ".git" / "index").write_bytes(b"broken")
+    assert changed_code() is None
+    assert commit_here() is None
+
+
 def test_outside_a_checkout_there_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Then the figures have no commit."""
     monkeypatch.chdir(tmp_path)

@@ -247,6 +247,7 @@ def test_a_command_that_fails_leaves_no_figures(command: str, said: str) -> None
     [
         (["--only", "decisions"], "--only: unknown step 'decisions'; did you mean 'decision'?"),
         (["--again", "checks-local/clam"], "did you mean 'checks-local/calm'?"),
+        (["--only", "calls", "--again", "decision"], "--again: decision is not among those of --only"),
     ],
 )
 def test_a_wrong_name_is_one_line(flags: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
