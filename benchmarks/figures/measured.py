@@ -39,7 +39,7 @@ class Measured:
     """The result of a step or of one part of it, as its file holds it."""
 
     commit: str
-    date: str
+    date: str  # when it began, in UTC; older files hold the day only
     machine: Mapping[str, str | int | float]
     stolen_percent: float | None
     commands: Sequence[str]
@@ -70,7 +70,7 @@ def measure(unit: Unit, commit: str, *, again: bool = False) -> Measured:
         _prepare(unit, commit, again=again)
     here = machine_of(_environment(unit.step))
     reads, stolen, began = unit.reads(ROOT), StolenCpuTime(), time.monotonic()
-    date, output = f"{datetime.now(UTC):%Y-%m-%d}", ""
+    date, output = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}", ""
     for command in unit.commands():
         output += _run(unit, command)
     if not output.strip():

@@ -20,6 +20,7 @@ from offboard.loadgen.table.table_columns import WIDTH
 RESULTS = Path("docs/results.md")
 BLOCK = re.compile(r"<!-- figure: (?P<what>[^\n]*?) -->\n(?P<shown>.*?)<!-- end -->", re.DOTALL)
 SHOW = "show"
+DAY = len("2026-11-26")  # characters of a date that are the day
 ABOUT = """\
 <!-- `make figures` writes this page from docs/figures/. Change docs/figures/steps.toml instead. -->
 
@@ -116,16 +117,18 @@ def _commits(sections: Sequence[Section], files: Mapping[str, Measured]) -> Iter
     if not there:
         yield "Nothing is measured yet."
         return
-    commit = max(there, key=lambda item: (item[1].date, item[1].commit))[1].commit
-    same = [one for _, one in there if one.commit == commit]
-    done = f"**{len(there)} of {len(units)} measurements are done**"
-    yield f"{done}, and {len(same)} of them are of commit {commit} ({_span(same)})."
-    others: dict[str, list[Unit]] = {}
+    commit = max((one for _, one in there), key=lambda one: one.date).commit
+    same, others = [], dict[str, list[Unit]]()
     for unit, one in there:
         if of_other_rows(unit, one):
             others.setdefault(OTHER_ROWS, []).append(unit)
         elif one.commit != commit:
             others.setdefault(f"of commit {one.commit}", []).append(unit)
+        else:
+            same.append(one)
+    done = f"**{len(there)} of {len(units)} measurements are done**"
+    dates = f" ({_span(same)})" if same else ""
+    yield f"{done}, and {len(same)} of them are of commit {commit}{dates}."
     missing = [unit for unit in units if unit.name not in files]
     for why, some in (*others.items(), ("not measured yet", missing)):
         if some:
@@ -214,7 +217,7 @@ def _where(one: Measured) -> str:
 
 
 def _span(some: Sequence[Measured]) -> str:
-    dates = sorted(one.date for one in some)
+    dates = sorted(one.date[:DAY] for one in some)
     return dates[0] if dates[0] == dates[-1] else f"{dates[0]} to {dates[-1]}"
 
 

@@ -101,9 +101,12 @@ class Unit:
             path = root / name
             if not path.is_file():
                 raise OffloadError(f"{name} is missing: measure it first")
-            digest = hashlib.sha256(path.read_bytes()).hexdigest()
-            about = json.loads(path.with_suffix(".json").read_text())
-            found[name] = {"sha256": digest, "commit": str(about.get("commit") or "unknown")}
+            digest, about = hashlib.sha256(path.read_bytes()).hexdigest(), path.with_suffix(".json")
+            try:
+                commit = json.loads(about.read_text()).get("commit")
+            except (OSError, ValueError, AttributeError) as error:
+                raise DataError(f"{about}: does not tell how {path.name} was measured: {error}") from None
+            found[name] = {"sha256": digest, "commit": str(commit or "unknown")}
         return found
 
     def _named(self, text: str) -> str:
@@ -131,7 +134,7 @@ def read_sections(path: Path) -> list[Section]:
             )
             for one in tables
         ]
-    except (OSError, tomllib.TOMLDecodeError, KeyError, TypeError) as error:
+    except (OSError, tomllib.TOMLDecodeError, KeyError, TypeError, AttributeError) as error:
         raise DataError(f"{path}: {error!r}") from None
     names = [step.name for section in sections for step in section.steps]
     if doubled := {name for name in names if names.count(name) > 1}:

@@ -146,6 +146,20 @@ def test_the_page_names_tables_of_other_rows_than_those_of_the_checkout() -> Non
     assert "rows of paper.csv of commit def5678" in page
 
 
+def test_the_newest_commit_is_that_of_the_latest_second() -> None:
+    """The page names it; a file without a time is of midnight, and one of other rows is not of the commit."""
+    (table,) = (one for one in UNITS if one.name == "table-two/paper")
+    parts = step(name="parts", title="In parts", parts=("a", "b"))
+    files = {
+        "parts/a": replace(MEASURED, commit="fff9999"),
+        "parts/b": replace(MEASURED, commit="eee8888", date="2026-11-26T08:00:00Z"),
+        "speed": replace(MEASURED, date="2026-11-26T09:00:00Z"),
+        table.name: replace(MEASURED, reads={"rows.csv": {"sha256": "0", "commit": "def5678"}}),
+    }
+    page = results([Section("S", "", (parts, step(), replace(table.step, parts=("paper",))))], files)
+    assert "**4 of 4 measurements are done**, and 1 of them are of commit abc1234 (2026-11-26)." in page
+
+
 def test_a_block_holds_chosen_rows_and_columns() -> None:
     """It shows rows with the cells that it names, and the commit; an unknown column is an error."""
     text = "A\n\n<!-- figure: speed | case: busy | show: ms -->\nold\n<!-- end -->\nB\n"
@@ -176,6 +190,40 @@ def test_tables_of_parts_become_one() -> None:
     assert wide.rows == (("calm", "2 [1, 3]", "5 [5, 6]"), ("busy", "2 [1, 3]", "–"))  # noqa: RUF001
     assert notes_of({"calm": lines, "busy": lines[:5]}) == ["- calm: one note"]
     assert len(tables_of(lines)) == 1
+
+
+def test_bounds_belong_to_the_row_above_them() -> None:
+    """A row may have none; two others than its own, or only one, are an error."""
+    row, low, high, other = "| a |  | 2 |", "| a | 2.5 % | 1 |", "| a | 97.5 % | 3 |", "| b |  | 5 |"
+
+    def bracketed(*rows: str) -> tuple[tuple[str, ...], ...]:
+        (table,) = tables_of(["| policy | bound | ms |", "| --- | --- | ---: |", *rows])
+        return table.bracketed().rows
+
+    assert bracketed(other, row, low, high) == (("b", "5"), ("a", "2 [1, 3]"))
+    for rows in ((row, low), (row, other, low, high), (low, high, row)):
+        with pytest.raises(DataError, match="bounds"):
+            bracketed(*rows)
+
+
+@pytest.mark.parametrize("about", [None, "{", "[]"])
+def test_rows_without_their_machine_are_one_line(tmp_path: Path, about: str | None) -> None:
+    """A missing or broken JSON file next to rows is named, and their tables are not up to date."""
+    (tmp_path / "rows.csv").write_text("1")
+    if about is not None:
+        (tmp_path / "rows.json").write_text(about)
+    unit = Unit(step(reads=(str(tmp_path / "rows.csv"),)))
+    with pytest.raises(DataError, match=r"rows.json: does not tell how rows.csv was measured"):
+        unit.reads(tmp_path)
+    assert why_old(unit, MEASURED, "abc1234") == OTHER_ROWS
+
+
+def test_a_step_whose_text_is_a_number_is_one_line(tmp_path: Path) -> None:
+    """The file is named."""
+    path = tmp_path / "steps.toml"
+    path.write_text('[[section]]\ntitle = "S"\n[[section.step]]\nname = "a"\nabout = 3\n')
+    with pytest.raises(DataError, match=r"steps.toml: "):
+        read_sections(path)
 
 
 def test_a_file_is_old_if_code_or_command_changed() -> None:
