@@ -230,7 +230,7 @@ def _started(
 
 
 def _end(process: "subprocess.Popen[str]") -> None:
-    """End a command and its processes as Ctrl-C does; kill what is left after END_S, or at a second Ctrl-C."""
+    """End a command and its processes as Ctrl-C does; kill what is left after END_S or a second Ctrl-C."""
     try:
         with contextlib.suppress(subprocess.TimeoutExpired, ProcessLookupError):
             os.killpg(process.pid, signal.SIGINT)

@@ -203,7 +203,11 @@ def _conditions(there: Mapping[Unit, Measured]) -> Iterator[str]:
     for where, some in lines.items():
         parts = "" if len(lines) == 1 else f"- {', '.join(names[id(one)] for one in some)}: "
         stolen = [one.stolen_percent for one in some if one.stolen_percent is not None]
-        worst = f" The host of this virtual machine gave at most {max(stolen):g} % of its CPU time to others." if stolen else ""
+        worst = (
+            f" The host of this virtual machine gave at most {max(stolen):g} % of its CPU time to others."
+            if stolen
+            else ""
+        )
         yield f"{parts}Commit {where.format(_span(some))}{worst}"
 
 

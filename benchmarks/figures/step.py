@@ -31,8 +31,8 @@ SOAK = "soak"  # half an hour: `make chaos` plays it
 class Step:
     """One section of the results page, and what measures it.
 
-    - `run`: commands as a user types them; what they print is shown. {out} is a folder of their own, and holds
-      only what the same commands have left there at the same commit
+    - `run`: commands as a user types them; what they print is shown. {out} is a folder of their
+      own, and holds only what the same commands have left there at the same commit
     - `parts`: the commands run once for each part, and each part is a file of its own
     - `merge`: heading of the column that holds the parts, if the page shows their tables as
       one; of the text, it then shows only the notes

@@ -98,7 +98,9 @@ def test_nothing_is_kept_if_the_code_changes_meanwhile(checkout: Path) -> None:
     assert code == 0
     assert said.splitlines()[-1] == "the code was changed: commit code.py first"
     (checkout / "code.py").unlink()
-    assert run(checkout, step("picture", "cp -v README.md {out}/a.svg", more=picture.splitlines()[-1]))[0] == 0
+    assert (
+        run(checkout, step("picture", "cp -v README.md {out}/a.svg", more=picture.splitlines()[-1]))[0] == 0
+    )
     assert (checkout / "docs" / "a.svg").exists()
 
 

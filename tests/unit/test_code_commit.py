@@ -31,7 +31,9 @@ def commit(name: str, text: str) -> None:
     git("commit", "--quiet", "-m", name)
 
 
-@pytest.mark.parametrize("name", ["docs/figures/a.json", "docs/page.md", "README.md", "tests/unit/test_a.py", "tests/ray/a.py"])
+@pytest.mark.parametrize(
+    "name", ["docs/figures/a.json", "docs/page.md", "README.md", "tests/unit/test_a.py", "tests/ray/a.py"]
+)
 def test_files_that_no_measurement_needs_do_not_change_it(checkout: Path, name: str) -> None:
     """Neither a commit of such a file, nor a change of it."""
     first = commit_here()
@@ -60,6 +62,8 @@ def test_the_goals_by_ros_2_are_code(checkout: Path) -> None:
     """They are measured by a test."""
     first = commit_here()
     commit("tests/ros2/test_goals.py", "1")
+    (checkout / "tests" / "ros2" / "test_goals.py").write_text("2")
+    assert changed_code() == ["tests/ros2/test_goals.py"]
     assert commit_here() != first
 
 

@@ -257,7 +257,10 @@ def test_what_a_command_prints_is_kept_with_its_machine() -> None:
 
 def test_finished_runs_are_used_at_the_same_commit_only() -> None:
     """The folder of a step is emptied for another commit, for other commands, and if asked for."""
-    code = "from pathlib import Path as P; p = P('{out}', 'runs'); p.write_text(s := p.exists() * '+' + 'run'); print(s)"
+    code = (
+        "from pathlib import Path; p = Path('{out}', 'runs'); "
+        "p.write_text(said := p.exists() * '+' + 'run'); print(said)"
+    )
     unit, other = (
         Unit(step(name="finished", run=(f'python -c "{code}{more}"',), environment=sys.prefix))
         for more in ("", ";")
