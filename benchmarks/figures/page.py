@@ -13,13 +13,14 @@ from pathlib import Path
 
 from benchmarks.figures.markdown_tables import MarkdownTable, blocks_of, first_table, joined, notes_of
 from benchmarks.figures.measured import OTHER_ROWS, Measured, of_other_rows
-from benchmarks.figures.step import PART, Section, Step, Unit, units_of
+from benchmarks.figures.step import Section, Step, Unit, units_of
 from offboard.common.errors import DataError
 from offboard.loadgen.table.table_columns import WIDTH
 
 RESULTS = Path("docs/results.md")
 BLOCK = re.compile(r"<!-- figure: (?P<what>[^\n]*?) -->\n(?P<shown>.*?)<!-- end -->", re.DOTALL)
 SHOW = "show"
+DAY = len("2026-11-26")  # characters of a date that are the day
 ABOUT = """\
 <!-- `make figures` writes this page from docs/figures/. Change docs/figures/steps.toml instead. -->
 
@@ -116,16 +117,18 @@ def _commits(sections: Sequence[Section], files: Mapping[str, Measured]) -> Iter
     if not there:
         yield "Nothing is measured yet."
         return
-    commit = max(there, key=lambda item: (item[1].date, item[1].commit))[1].commit
-    same = [one for _, one in there if one.commit == commit]
-    done = f"**{len(there)} of {len(units)} measurements are done**"
-    yield f"{done}, and {len(same)} of them are of commit {commit} ({_span(same)})."
-    others: dict[str, list[Unit]] = {}
+    commit = max((one for _, one in there), key=lambda one: one.date).commit
+    same, others = [], dict[str, list[Unit]]()
     for unit, one in there:
         if of_other_rows(unit, one):
             others.setdefault(OTHER_ROWS, []).append(unit)
         elif one.commit != commit:
             others.setdefault(f"of commit {one.commit}", []).append(unit)
+        else:
+            same.append(one)
+    done = f"**{len(there)} of {len(units)} measurements are done**"
+    dates = f" ({_span(same)})" if same else ""
+    yield f"{done}, and {len(same)} of them are of commit {commit}{dates}."
     missing = [unit for unit in units if unit.name not in files]
     for why, some in (*others.items(), ("not measured yet", missing)):
         if some:
@@ -167,8 +170,8 @@ def _pictures(unit: Unit, folder: Path) -> Iterator[str]:
 
 
 def _commands(step: Step) -> Iterator[str]:
-    for command in step.run:
-        yield " \\\n  ".join(_wrapped(command.replace(PART, "NAME"), WIDTH - 4))
+    for command in Unit(step, "NAME" if step.parts else "").commands():
+        yield " \\\n  ".join(_wrapped(command, WIDTH - 4))
     if step.parts:
         yield from (f"# {line}" for line in _wrapped(f"NAME: {', '.join(step.parts)}", WIDTH - 2))
 
@@ -218,7 +221,7 @@ def _where(one: Measured) -> str:
 
 
 def _span(some: Sequence[Measured]) -> str:
-    dates = sorted(one.date for one in some)
+    dates = sorted(one.date[:DAY] for one in some)
     return dates[0] if dates[0] == dates[-1] else f"{dates[0]} to {dates[-1]}"
 
 
