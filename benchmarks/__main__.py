@@ -13,6 +13,7 @@ TABLES = (
     "planner",
     "decision",
     "lower_bounds",
+    "same_decisions",
     "calls",
     "server_load",
     "hundred_robots",

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from benchmarks.figures.measured import measure, read_all, why_old
+from benchmarks.figures.measured import alone, keep, measure, read_all, why_old
 from benchmarks.figures.page import pages
 from benchmarks.figures.step import ROOT, STEPS, Section, Unit, read_sections, units_of
 from offboard.common.command_line import CommandParser, add_flags, run_command
@@ -52,38 +52,47 @@ def _run(argv: Sequence[str]) -> int:
     if config.write:
         write_pages(sections)
         return 0
-    commit, files = commit_here(), read_all(units)
-    if commit is None:
-        raise ConfigError("this is no checkout of git, so the commit of the figures is unknown")
-    clean = commit.removesuffix("-dirty")
-    states = {unit: why_old(unit, files.get(unit.name), clean) for unit in chosen}
+    if outside := [unit.name for unit in again if unit not in chosen]:
+        raise ConfigError(f"--again: {outside[0]} is not among those of --only")
+    commit, changed = commit_here(), changed_code()
+    if commit is None or changed is None:
+        raise ConfigError("this is no checkout that git can read, so the commit of the figures is unknown")
+    change = f"the code was changed: commit {', '.join(changed[:MORE_FILES])} first"
     if config.list:
-        _print_states(states)
+        files, clean = read_all(chosen), commit.removesuffix("-dirty")
+        _print_states({unit: why_old(unit, files.get(unit.name), clean) for unit in chosen})
+        if changed:
+            print(change)
         return 0
-    if changed := changed_code():
-        raise ConfigError(f"the code was changed: commit {', '.join(changed[:MORE_FILES])} first")
-    write_pages(sections)  # an error in a page is better known before than after hours
-    return _measure([unit for unit, why in states.items() if why or unit in again], sections, commit)
+    if changed:
+        raise ConfigError(change)
+    with alone():
+        write_pages(sections)  # an error in a page is better known before than after hours
+        return _measure(chosen, again, sections, commit)
 
 
-def _measure(units: Sequence[Unit], sections: Sequence[Section], commit: str) -> int:
+def _measure(units: Sequence[Unit], again: Sequence[Unit], sections: Sequence[Section], commit: str) -> int:
     """Measure one after the other. A step that fails leaves its older file; the others go on."""
     failed = []
     for number, unit in enumerate(units, 1):
-        _say(f"{number} of {len(units)}: {unit.name}, about {unit.step.minutes:g} minutes")
+        why = why_old(unit, read_all([unit]).get(unit.name), commit)  # rows may be new since the last step
+        if not why and unit not in again:
+            continue
+        about = f"{why or 'again'}, about {unit.step.minutes:g} minutes"
+        _say(f"{number} of {len(units)}: {unit.name}, {about}")
         try:
-            measured = measure(unit, commit)
+            measured = measure(unit, commit, again=unit in again)
         except (OffloadError, OSError, subprocess.SubprocessError) as error:
             failed.append(f"{unit.name} is not measured: {error}")
             _say(failed[-1])
             continue
         if (now := commit_here()) != commit:
             raise OffloadError(f"the code is no longer that of commit {commit}, but {now}")
-        measured.write(ROOT / unit.file)
         try:
+            keep(unit, measured)
             write_pages(sections)
-        except OffloadError as error:
-            failed.append(f"the pages are not written: {error}")
+        except (OffloadError, OSError) as error:
+            failed.append(f"{unit.name} is measured, but not all is written: {error}")
             _say(failed[-1])
     if failed:
         _say("\n".join(["", *failed]))

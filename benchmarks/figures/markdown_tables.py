@@ -37,13 +37,22 @@ class MarkdownTable:
     def bracketed(self) -> "MarkdownTable":
         """With the ends of the intervals, which are lines of their own, in brackets behind the figures."""
         at = self.headings.index(BOUND)
-        rows = [[*row] for row in self.rows if not row[at]]
-        ends = [row for row in self.rows if row[at]]
-        for row, low, high in zip(rows, ends[::2], ends[1::2], strict=True):
-            for number, cell in enumerate(row):
-                interval = {low[number], high[number]}
-                if not interval & {"", UNDEFINED} and interval not in ({cell}, {low[at], high[at]}):
-                    row[number] = f"{cell} [{low[number]}, {high[number]}]"
+        rows: list[list[str]] = []
+        ends: list[list[tuple[str, ...]]] = []  # of each row
+        for line in self.rows:
+            if not line[at]:
+                rows.append([*line])
+                ends.append([])
+            elif rows and line[:at] == tuple(rows[-1][:at]):
+                ends[-1].append(line)
+            else:
+                raise DataError(f"bounds are not below their figures: {' | '.join(line)}")
+        for row, bounds in zip(rows, ends, strict=True):
+            if len(bounds) not in (0, 2):
+                raise DataError(f"{len(bounds)} bounds instead of 2: {' | '.join(row)}")
+            for number, cells in enumerate(zip(*bounds, strict=True)):
+                if number != at and not {*cells} & {"", UNDEFINED} and {*cells} != {row[number]}:
+                    row[number] += f" [{', '.join(cells)}]"
         table = MarkdownTable(self.headings, self.rule, tuple(map(tuple, rows)))
         return table.chosen({}, [one for one in self.headings if one != BOUND])
 

@@ -4,6 +4,7 @@
 """
 
 import contextlib
+import fcntl
 import json
 import os
 import shlex
@@ -12,13 +13,14 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import IO
 
-from benchmarks.figures.step import ROOT, Step, Unit
-from offboard.common.errors import DataError, OffloadError
+from benchmarks.figures.step import OUT, ROOT, Step, Unit
+from offboard.common.errors import ConfigError, DataError, OffloadError
 from offboard.loadgen.play.machine import machine as this_machine
 from offboard.loadgen.play.stolen_cpu_time import StolenCpuTime
 from offboard.loadgen.table.measured_rows import write_whole
@@ -37,7 +39,7 @@ class Measured:
     """The result of a step or of one part of it, as its file holds it."""
 
     commit: str
-    date: str
+    date: str  # when it began, in UTC; older files hold the day only
     machine: Mapping[str, str | int | float]
     stolen_percent: float | None
     commands: Sequence[str]
@@ -57,21 +59,24 @@ class Measured:
         write_whole(path, json.dumps(asdict(self), indent=1, ensure_ascii=False) + "\n")
 
 
-def measure(unit: Unit, commit: str) -> Measured:
-    """Run the commands of a step, copy its pictures and return what it printed; OffloadError if one fails."""
+def measure(unit: Unit, commit: str, *, again: bool = False) -> Measured:
+    """Run the commands of a step and return what they printed; OffloadError if one fails.
+
+    Runs that were finished at this commit are used, but not with `again`.
+    """
     for target in unit.step.ready:
         _build(target)
+    if any(OUT in command for command in unit.step.run):
+        _prepare(unit, commit, again=again)
     here = machine_of(_environment(unit.step))
     reads, stolen, began = unit.reads(ROOT), StolenCpuTime(), time.monotonic()
-    date, output = f"{datetime.now(UTC):%Y-%m-%d}", ""
+    date, output = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}", ""
     for command in unit.commands():
         output += _run(unit, command)
     if not output.strip():
         raise OffloadError("nothing was printed")
     if len(output) > OUTPUT_MAX:
         raise OffloadError(f"{len(output)} characters were printed, at most {OUTPUT_MAX} are kept")
-    for source, target in unit.copies().items():
-        shutil.copyfile(ROOT / source, ROOT / target)
     percent = stolen.percent()
     return Measured(
         commit=commit,
@@ -83,6 +88,13 @@ def measure(unit: Unit, commit: str) -> Measured:
         seconds=round(time.monotonic() - began, 1),
         output=[line.rstrip() for line in output.strip().splitlines()],
     )
+
+
+def keep(unit: Unit, measured: Measured) -> None:
+    """Write the file of a step, and copy its pictures."""
+    for source, target in unit.copies().items():
+        shutil.copyfile(ROOT / source, ROOT / target)
+    measured.write(ROOT / unit.file)
 
 
 def why_old(unit: Unit, measured: Measured | None, commit: str) -> str:
@@ -137,9 +149,37 @@ def _environment(step: Step) -> dict[str, str]:
     return {**os.environ, "PATH": f"{folder}:{os.environ['PATH']}", "COLUMNS": "100"}
 
 
+def _prepare(unit: Unit, commit: str, *, again: bool) -> None:
+    """Empty the folder of a step, unless its commands have begun at this commit."""
+    mark, made = ROOT / unit.work / ".made", "\n".join([commit, *unit.commands()])
+    if again or not mark.is_file() or mark.read_text() != made:
+        if mark.parent.exists():
+            shutil.rmtree(mark.parent)
+        mark.parent.mkdir(parents=True)
+        mark.write_text(made)
+
+
+@contextlib.contextmanager
+def alone() -> Iterator[None]:
+    """Nobody else measures figures here meanwhile, and a signal to end also ends the command under way."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job of a shell ignores it
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) != signal.SIG_IGN:  # as with nohup
+            signal.signal(number, signal.default_int_handler)
+    lock = ROOT / LOGS / ".lock"
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    with lock.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError("another `make figures` measures here: wait until it has ended") from None
+        yield
+
+
 def _build(target: str) -> None:
-    done = subprocess.run(["make", target], cwd=ROOT, stdout=sys.stderr, check=False, timeout=BUILD_S)
-    if done.returncode:
+    with _started(["make", target], dict(os.environ), sys.stderr, sys.stderr) as process:
+        code = process.wait(timeout=BUILD_S)
+    if code:
         raise OffloadError(f"`make {target}` failed")
 
 
@@ -153,36 +193,49 @@ def _run(unit: Unit, command: str) -> str:
     program = shutil.which(words[0], path=environment["PATH"])
     if program is None:
         raise OffloadError(f"`{command}`: there is no program {words[0]}")
-    with log.open("w") as errors:
-        process = subprocess.Popen(
-            [program, *words[1:]],
-            cwd=ROOT,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=errors,
-            text=True,
-            process_group=0,
-        )
-        try:
+    try:
+        with (
+            log.open("w") as errors,
+            _started([program, *words[1:]], environment, subprocess.PIPE, errors) as process,
+        ):
             output, _ = process.communicate(timeout=limit_s)
-        except subprocess.TimeoutExpired:
-            _end(process)
-            raise OffloadError(f"`{command}` has not ended after {limit_s / 60:.0f} minutes") from None
-        except KeyboardInterrupt:
-            _end(process)
-            raise
+    except subprocess.TimeoutExpired:
+        raise OffloadError(f"`{command}` has not ended after {limit_s / 60:.0f} minutes") from None
     if process.returncode:
         said = " / ".join(log.read_text().strip().splitlines()[-SAID_LINES:])
         raise OffloadError(f"`{command}` ended with exit code {process.returncode}: {said}")
     return f"{output.rstrip()}\n\n"
 
 
+@contextlib.contextmanager
+def _started(
+    words: Sequence[str], environment: Mapping[str, str], stdout: IO[str] | int, stderr: IO[str]
+) -> "Iterator[subprocess.Popen[str]]":
+    """A command in a process group of its own, which ends with the block at the latest."""
+    process = subprocess.Popen(
+        words,
+        cwd=ROOT,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=stdout,
+        stderr=stderr,
+        text=True,
+        process_group=0,
+    )
+    try:
+        yield process
+    finally:
+        if process.returncode is None:
+            _end(process)
+
+
 def _end(process: "subprocess.Popen[str]") -> None:
-    """End a command and its processes as Ctrl-C in a terminal does; kill what is left after END_S."""
-    os.killpg(process.pid, signal.SIGINT)
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        process.communicate(timeout=END_S)
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait(timeout=END_S)
+    """End a command and its processes as Ctrl-C does; kill what is left after END_S or a second Ctrl-C."""
+    try:
+        with contextlib.suppress(subprocess.TimeoutExpired, ProcessLookupError):
+            os.killpg(process.pid, signal.SIGINT)
+            process.communicate(timeout=END_S)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait(timeout=END_S)

@@ -13,21 +13,23 @@ from pathlib import Path
 
 from benchmarks.figures.markdown_tables import MarkdownTable, blocks_of, first_table, joined, notes_of
 from benchmarks.figures.measured import OTHER_ROWS, Measured, of_other_rows
-from benchmarks.figures.step import PART, Section, Step, Unit, units_of
+from benchmarks.figures.step import Section, Step, Unit, units_of
 from offboard.common.errors import DataError
 from offboard.loadgen.table.table_columns import WIDTH
 
 RESULTS = Path("docs/results.md")
 BLOCK = re.compile(r"<!-- figure: (?P<what>[^\n]*?) -->\n(?P<shown>.*?)<!-- end -->", re.DOTALL)
 SHOW = "show"
+DAY = len("2026-11-26")  # characters of a date that are the day
 ABOUT = """\
 <!-- `make figures` writes this page from docs/figures/. Change docs/figures/steps.toml instead. -->
 
 # Results
 
-This page holds all measured figures.
+This page holds the measured figures. A figure on another page names its commit, or links to this page.
 `make figures` measures them, and writes this page from what the commands printed.
-Each section names its commit, date, machine and commands. Later commits may give other figures.
+Each section names its commit, date, machine and commands. Later commits may give other figures, also because
+a scenario was changed: `git log -1 -- loadgen/scenarios/NAME.toml` shows when.
 [performance.md](performance.md), [scenarios.md](scenarios.md) and [evaluation.md](evaluation.md) explain
 what is measured.
 """
@@ -115,19 +117,22 @@ def _commits(sections: Sequence[Section], files: Mapping[str, Measured]) -> Iter
     if not there:
         yield "Nothing is measured yet."
         return
-    commit = max(there, key=lambda item: (item[1].date, item[1].commit))[1].commit
-    same = [one for _, one in there if one.commit == commit]
-    yield f"**{len(same)} of {len(units)} measurements are of commit {commit}** ({_span(same)})."
-    others: dict[str, list[Unit]] = {}
+    commit = max((one for _, one in there), key=lambda one: one.date).commit
+    same, others = [], dict[str, list[Unit]]()
     for unit, one in there:
         if of_other_rows(unit, one):
             others.setdefault(OTHER_ROWS, []).append(unit)
         elif one.commit != commit:
             others.setdefault(f"of commit {one.commit}", []).append(unit)
+        else:
+            same.append(one)
+    done = f"**{len(there)} of {len(units)} measurements are done**"
+    dates = f" ({_span(same)})" if same else ""
+    yield f"{done}, and {len(same)} of them are of commit {commit}{dates}."
     missing = [unit for unit in units if unit.name not in files]
     for why, some in (*others.items(), ("not measured yet", missing)):
         if some:
-            yield f"{why[0].upper()}{why[1:]}: {'; '.join(_named(some))}."
+            yield from ("", f"{why[0].upper()}{why[1:]}:", "", *(f"- {one}" for one in _named(some)))
 
 
 def _named(units: Sequence[Unit]) -> Iterator[str]:
@@ -165,8 +170,8 @@ def _pictures(unit: Unit, folder: Path) -> Iterator[str]:
 
 
 def _commands(step: Step) -> Iterator[str]:
-    for command in step.run:
-        yield " \\\n  ".join(_wrapped(command.replace(PART, "NAME"), WIDTH - 4))
+    for command in Unit(step, "NAME" if step.parts else "").commands():
+        yield " \\\n  ".join(_wrapped(command, WIDTH - 4))
     if step.parts:
         yield from (f"# {line}" for line in _wrapped(f"NAME: {', '.join(step.parts)}", WIDTH - 2))
 
@@ -198,7 +203,11 @@ def _conditions(there: Mapping[Unit, Measured]) -> Iterator[str]:
     for where, some in lines.items():
         parts = "" if len(lines) == 1 else f"- {', '.join(names[id(one)] for one in some)}: "
         stolen = [one.stolen_percent for one in some if one.stolen_percent is not None]
-        worst = f" Its host took at most {max(stolen):g} % of the CPU time." if stolen else ""
+        worst = (
+            f" The host of this virtual machine gave at most {max(stolen):g} % of its CPU time to others."
+            if stolen
+            else ""
+        )
         yield f"{parts}Commit {where.format(_span(some))}{worst}"
 
 
@@ -212,7 +221,7 @@ def _where(one: Measured) -> str:
 
 
 def _span(some: Sequence[Measured]) -> str:
-    dates = sorted(one.date for one in some)
+    dates = sorted(one.date[:DAY] for one in some)
     return dates[0] if dates[0] == dates[-1] else f"{dates[0]} to {dates[-1]}"
 
 

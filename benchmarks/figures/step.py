@@ -21,6 +21,8 @@ ROOT = Path(__file__).parents[2]
 FOLDER = Path("docs/figures")
 STEPS = FOLDER / "steps.toml"
 PART = "{part}"  # in a command: the name of the part
+OUT = "{out}"  # in a command: the folder that belongs to the step or part
+WORK = Path("out/figures/work")
 DATASETS = ("paper", "congested", "registration")  # in the order of the page
 SOAK = "soak"  # half an hour: `make chaos` plays it
 
@@ -29,7 +31,8 @@ SOAK = "soak"  # half an hour: `make chaos` plays it
 class Step:
     """One section of the results page, and what measures it.
 
-    - `run`: commands as a user types them; what they print is shown
+    - `run`: commands as a user types them; what they print is shown. {out} is a folder of their
+      own, and holds only what the same commands have left there at the same commit
     - `parts`: the commands run once for each part, and each part is a file of its own
     - `merge`: heading of the column that holds the parts, if the page shows their tables as
       one; of the text, it then shows only the notes
@@ -80,6 +83,11 @@ class Unit:
         """Where its result is, from the root of the checkout."""
         return FOLDER / f"{self.name}.json"
 
+    @property
+    def work(self) -> Path:
+        """The folder {out} of its commands, from the root of the checkout."""
+        return WORK / self.name
+
     def commands(self) -> list[str]:
         return [self._named(command) for command in self.step.run]
 
@@ -93,13 +101,16 @@ class Unit:
             path = root / name
             if not path.is_file():
                 raise OffloadError(f"{name} is missing: measure it first")
-            digest = hashlib.sha256(path.read_bytes()).hexdigest()
-            about = json.loads(path.with_suffix(".json").read_text())
-            found[name] = {"sha256": digest, "commit": str(about.get("commit") or "unknown")}
+            digest, about = hashlib.sha256(path.read_bytes()).hexdigest(), path.with_suffix(".json")
+            try:
+                commit = json.loads(about.read_text()).get("commit")
+            except (OSError, ValueError, AttributeError) as error:
+                raise DataError(f"{about}: does not tell how {path.name} was measured: {error}") from None
+            found[name] = {"sha256": digest, "commit": str(commit or "unknown")}
         return found
 
     def _named(self, text: str) -> str:
-        return text.replace(PART, self.part)
+        return text.replace(PART, self.part).replace(OUT, str(self.work))
 
 
 @dataclass(frozen=True)
@@ -123,7 +134,7 @@ def read_sections(path: Path) -> list[Section]:
             )
             for one in tables
         ]
-    except (OSError, tomllib.TOMLDecodeError, KeyError, TypeError) as error:
+    except (OSError, tomllib.TOMLDecodeError, KeyError, TypeError, AttributeError) as error:
         raise DataError(f"{path}: {error!r}") from None
     names = [step.name for section in sections for step in section.steps]
     if doubled := {name for name in names if names.count(name) > 1}:

@@ -14,6 +14,7 @@ from offboard.loadgen.table.measured_rows import Column
 from offboard.loadgen.table.table_formats import UNDEFINED, Heading
 
 YES, NO, UNCLEAR = "yes", "no", "unclear"
+BLOCKS_MIN = 5  # in a resample; resamples of fewer blocks hardly differ from each other
 DIGITS, INTERVAL_DIGITS = 4, 3  # of the figures in Markdown and LaTeX
 
 
@@ -128,12 +129,17 @@ def unknown(number: int, words: str, why: str) -> Claim:
 
 
 def bootstrapped(blocks: Blocks, figure: Callable[[Picks], Column]) -> Figure:
-    """A figure of all rows, with its interval. `figure` returns one value for each resample."""
+    """A figure of all rows. It has an interval if the rows are BLOCKS_MIN blocks or more.
+
+    `figure` returns one value for each resample.
+    """
     if not blocks.rows:
         return Figure(None)
     value = float(figure(np.arange(blocks.rows)[np.newaxis])[0])
     if not math.isfinite(value):
         return Figure(None)
+    if blocks.rows < BLOCKS_MIN * blocks.length:
+        return Figure(value)
     low, high = blocks.intervals(lambda picks: {"it": figure(picks)})
     return Figure(value, low.get("it"), high.get("it"))
 

@@ -13,7 +13,7 @@ from offboard.loadgen.claims.claims_settings import ClaimsConfig
 from offboard.loadgen.claims.computing_time import ROUNDS, computing_time
 from offboard.loadgen.claims.prediction_claims import K_MEANS, RIVALS, PredictionClaims
 from offboard.loadgen.claims.sample_order import sample_order
-from offboard.loadgen.claims.several_inputs import several_inputs
+from offboard.loadgen.claims.several_inputs import Inputs, read_inputs, several_inputs
 from offboard.loadgen.claims.significance import significance
 from offboard.loadgen.progress import Progress, progress
 from offboard.loadgen.table.measured_rows import Rows
@@ -34,18 +34,16 @@ MORE = {  # for each claim, the command that shows more of it
 
 def run_claims(paths: Sequence[Path], config: ClaimsConfig) -> int:
     """Print one table for each dataset to stdout."""
-    read = [(path, read_noted(path, config.kind)) for path in paths]  # first, so that mistakes show at once
+    # All files first, so that mistakes show at once.
+    read = [(path, read_noted(path, config.kind), read_inputs(path)) for path in paths]
     with progress("claims", len(paths) * _steps(config)) as shown:
-        tables = [_table(path, rows, config, shown) for path, rows in read]
+        tables = [_table(path, rows, claims(rows, inputs, config, shown)) for path, rows, inputs in read]
     sys.stdout.write(ColumnSettings().text(tables, config.format))
     return 0
 
 
-def _table(path: Path, rows: Rows, config: ClaimsConfig, shown: Progress) -> Table:
-    lines = [
-        replace(one, more=MORE.get(one.number, "docs/claims.md").format(file=path))
-        for one in claims(path, rows, config, shown)
-    ]
+def _table(path: Path, rows: Rows, found: Iterator[Claim]) -> Table:
+    lines = [replace(one, more=MORE.get(one.number, "docs/claims.md").format(file=path)) for one in found]
     left_out = f" ({rows.left_out} tasks without both times left out)" if rows.left_out else ""
     return Table(
         caption=f"{path}: {len(rows)} rows{left_out}. The numbers are those of the claims in docs/claims.md.",
@@ -59,7 +57,7 @@ def _table(path: Path, rows: Rows, config: ClaimsConfig, shown: Progress) -> Tab
     )
 
 
-def claims(path: Path, rows: Rows, config: ClaimsConfig, shown: Progress) -> Iterator[Claim]:
+def claims(rows: Rows, inputs: Inputs | None, config: ClaimsConfig, shown: Progress) -> Iterator[Claim]:
     """The lines of one dataset, by claim."""
     of_predictions = PredictionClaims(rows, config)
     yield from significance(rows, config)
@@ -75,7 +73,7 @@ def claims(path: Path, rows: Rows, config: ClaimsConfig, shown: Progress) -> Ite
         shown.step()
     yield from (one for one in compared if one.number == RIVALS)
     yield from computing_time(rows, config, shown.step)
-    yield from several_inputs(path, rows, config)
+    yield from several_inputs(inputs, rows, config)
     yield from (one for one in compared if one.number == K_MEANS)
     yield from of_predictions.saving()
 

@@ -53,6 +53,9 @@ def computing_time(
             ("training", times[name].training_s, line.training_s),
             ("prediction", times[name].prediction_s, line.prediction_s),
         ):
+            if not all(base):
+                yield unknown(CLAIM, f"{words}, {name}", "the CPU clock is too coarse")
+                continue
             ratios = [one / other for one, other in zip(own, base, strict=True)]
             yield claim(CLAIM, f"{words}, {name}", _median(ratios), theirs=theirs, claimed=claimed)
 

@@ -19,15 +19,21 @@ from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 CLAIM = 7
 
+Inputs = Mapping[str, Sequence[float | None]]  # the values of each column; None: an empty cell
 
-def several_inputs(path: Path, rows: Rows, config: ClaimsConfig) -> Iterator[Claim]:
+
+def several_inputs(read: Inputs | None, rows: Rows, config: ClaimsConfig) -> Iterator[Claim]:
     """All inputs against the size alone, at 80:20: accuracy in points, and the ratio of the mean errors."""
-    if not is_csv(path):
-        yield unknown(CLAIM, "several inputs", "only a dataset has inputs: loadgen export RUN --csv FILE")
-        return
-    inputs, split = read_inputs(path), len(rows) * 4 // 5
-    if not inputs or not 2 <= split < len(rows):
-        yield unknown(CLAIM, "several inputs", "the file has only sizes" if not inputs else "not enough rows")
+    split = len(rows) * 4 // 5
+    inputs = {name: _filled(values) for name, values in (read or {}).items() if _known(values[:split])}
+    if read is None:
+        why = "only a dataset has inputs: loadgen export RUN --csv FILE"
+    elif not 2 <= split < len(rows):
+        why = "not enough rows"
+    else:
+        why = "" if inputs else "only sizes are known in the first 80 % of the rows"
+    if why:
+        yield unknown(CLAIM, "several inputs", why)
         return
     alone, several = _predicted(rows, split, {}), _predicted(rows, split, inputs)
     blocks = config.blocks(len(rows) - split)
@@ -42,15 +48,17 @@ def several_inputs(path: Path, rows: Rows, config: ClaimsConfig) -> Iterator[Cla
             )
 
 
-def read_inputs(path: Path) -> dict[str, Column]:
-    """The columns of a dataset that are known before a task. An empty cell holds the last known value."""
+def read_inputs(path: Path) -> Inputs | None:
+    """The columns of a dataset that are known before a task; None: it is a trace."""
+    if not is_csv(path):
+        return None
     names = [name for site in SITES for name in of_site(site)]
     found: dict[str, list[float | None]] = {}
     for where, cells in read_cells(path, names):
         for name in filter(cells.__contains__, names):
             text = cells[name].strip()
             found.setdefault(name, []).append(number(where, name, text) if text else None)
-    return {name: _filled(values) for name, values in found.items() if any(one is not None for one in values)}
+    return found
 
 
 def of_site(site: str) -> tuple[str, ...]:
@@ -78,6 +86,10 @@ def _predicted(rows: Rows, split: int, inputs: Mapping[str, Column]) -> Scored:
         onboard_predicted_s=predicted[ONBOARD],
         cloud_predicted_s=predicted[CLOUD],
     )
+
+
+def _known(values: Sequence[float | None]) -> bool:
+    return any(one is not None for one in values)
 
 
 def _filled(values: Sequence[float | None]) -> Column:

@@ -28,14 +28,17 @@ from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 CLAIM = 1
 P_MAX = 0.005  # of the paper
 SHARE_MIN = 95.0  # per cent of the windows in which r must be significant
-TESTED_MIN = 3  # rows; with fewer, any r may be chance
+TESTED_MIN = 3  # rows; two points always lie on a line
 HALVINGS = 60  # of the range in which the smallest significant r is; more would change no digit
 STEPS_MAX = 10_000  # of the continued fraction; for a million rows it takes a tenth of that
 CONVERGED = 1e-15  # the continued fraction ends when a step changes it less
 
 
 def significance(rows: Rows, config: ClaimsConfig) -> Iterator[Claim]:
-    """r and its p over all rows, then the share of the windows of each length in which r is significant."""
+    """r and its p over all rows, then the share of the windows of each length in which r is significant.
+
+    The claim is about a positive r, so a significantly negative one does not count.
+    """
     for site in (CLOUD, ONBOARD):
         yield from _all_rows(rows, config, site)
     for length in config.lengths():
@@ -80,12 +83,13 @@ def _all_rows(rows: Rows, config: ClaimsConfig, site: str) -> Iterator[Claim]:
 
 def _windows(rows: Rows, config: ClaimsConfig, site: str, length: int) -> Claim:
     words = f"{site}: N = {length}, % with p < {P_MAX}"
-    if length > len(rows):
-        return unknown(CLAIM, words, "not enough rows")
+    if length < TESTED_MIN or length > len(rows):
+        why = "too few rows for a test" if length < TESTED_MIN else "not enough rows"
+        return unknown(CLAIM, words, why)
     found = window_r(rows.size, getattr(rows, f"{site}_s"), length)
     if not len(found):
         return unknown(CLAIM, words, "too few different rows")
-    significant = np.where(np.abs(found) >= smallest_significant_r(length), 100.0, 0.0)
+    significant = np.where(found >= smallest_significant_r(length), 100.0, 0.0)
     share = mean_of(config.blocks(len(found), overlap=length), significant)
     their_r = _their_r(str(length), site)
     theirs = None if their_r is None else f"p {p_value(their_r, length):.1g}"

@@ -20,7 +20,7 @@ from offboard.loadgen.scenario.task_cost import Costing
 from offboard.loadgen.table.confidence_intervals import BOUNDS, Blocks, Picks, percentiles
 from offboard.loadgen.table.measured_rows import Column
 from offboard.loadgen.table.table_formats import Heading, Table
-from offboard.loadgen.table.table_two_figures import quantile
+from offboard.loadgen.table.table_two_figures import known_mean, quantile
 from offboard.robot_client.policies.objectives import OBJECTIVES
 from offboard.robot_client.sites.runner import CLOUD
 
@@ -73,7 +73,7 @@ HEADINGS: dict[str, Heading] = {
     "over_first": Heading("mean / first policy", "mean / first policy", 3),
     "at_one_speed": Heading("mean / first policy at equal machine speed", "at equal speed", 3),
     "server_over_first": Heading("server time / first policy", "server time / first policy", 3),
-    "cost": Heading("cost per task", "cost", 4),
+    "cost": Heading("cost", "cost", 4),
     "cost_over_first": Heading("cost / first policy", "cost / first policy", 3),
     "p95_ms": Heading("P95 ms", "P95 ms", 1),
     "p99_ms": Heading("P99 ms", "P99 ms", 1),
@@ -188,17 +188,14 @@ def _columns(runs: Sequence[Outcome], first: Sequence[Outcome], costing: Costing
     def column(value: Callable[[_Pair], float | None]) -> Column:
         return np.array([value(pair) for pair in pairs], dtype=float)
 
-    def cost(one: Answered | None) -> float | None:
-        return None if one is None else costing.of_task(one.response_s, one.quality, one.spent)
-
     pairs = _pairs(runs, first)
     return {
         "response_s": column(lambda pair: pair.mine.response_s),
         "first_s": column(lambda pair: pair.first.response_s if pair.first else None),
         "server_s": column(lambda pair: pair.mine.server_s),
         "first_server_s": column(lambda pair: pair.first.server_s if pair.first else None),
-        "cost": column(lambda pair: cost(pair.mine)),
-        "first_cost": column(lambda pair: cost(pair.first)),
+        "cost": column(lambda pair: pair.mine.cost(costing)),
+        "first_cost": column(lambda pair: pair.first.cost(costing) if pair.first else None),
         "late": column(_late),
         "cloud": column(_sent_to_cloud),
         "twice": column(lambda pair: len(pair.mine.sites) > 1),
@@ -227,6 +224,7 @@ def _referenced(runs: Sequence[Outcome]) -> dict[str, Column]:
 def _task_figures(columns: Mapping[str, Column], picks: Picks, costing: Costing) -> dict[str, Column]:
     """The figures over all tasks, for each resample (one row of `picks`)."""
     cost, first_cost = columns["cost"][picks], columns["first_cost"][picks]
+    shared = np.where(np.isnan(first_cost), np.nan, cost)
     response, first = columns["response_s"][picks], columns["first_s"][picks]
     server, first_server = columns["server_s"][picks], columns["first_server_s"][picks]
     return {
@@ -234,12 +232,12 @@ def _task_figures(columns: Mapping[str, Column], picks: Picks, costing: Costing)
         "over_first": _ratio(response, first),
         "server_over_first": _ratio(server, first_server),
         "cost": costing.over(cost),
-        "cost_over_first": _over(costing.over(cost), costing.over(first_cost)),
+        "cost_over_first": _over(costing.over(shared), costing.over(first_cost)),
         "p95_ms": 1e3 * quantile(response, 95),
         "p99_ms": 1e3 * quantile(response, 99),
-        "late_percent": 100 * _mean(columns["late"][picks]),
-        "cloud_percent": 100 * _mean(columns["cloud"][picks]),
-        "twice_percent": 100 * _mean(columns["twice"][picks]),
+        "late_percent": 100 * known_mean(columns["late"][picks]),
+        "cloud_percent": 100 * known_mean(columns["cloud"][picks]),
+        "twice_percent": 100 * known_mean(columns["twice"][picks]),
         **interval_figures(columns, picks),
     }
 
@@ -253,14 +251,6 @@ def _reference_figures(columns: Mapping[str, Column], picks: Picks) -> dict[str,
     }
 
 
-def _mean(values: Column) -> Column:
-    """The mean of each row, without its NaN; NaN if nothing is left."""
-    there = ~np.isnan(values)
-    total, count = np.where(there, values, 0.0).sum(axis=-1), there.sum(axis=-1)
-    mean: Column = np.divide(total, count, where=count > 0, out=np.full(len(values), np.nan))
-    return mean
-
-
 def _ratio(over: Column, under: Column) -> Column:
     """The ratio of the sums of each row, over the tasks that both have; NaN if there are none."""
     both = ~(np.isnan(over) | np.isnan(under))
@@ -270,7 +260,7 @@ def _ratio(over: Column, under: Column) -> Column:
 
 
 def _over(cost: Column, first: Column) -> Column:
-    """NaN where the first policy costs nothing, or did not answer all of these tasks."""
+    """NaN where the first policy costs nothing, or answered none of these tasks."""
     ratio: Column = np.divide(cost, first, where=first > 0, out=np.full(len(cost), np.nan))
     return ratio
 

@@ -19,7 +19,7 @@ from offboard.loadgen.play.play_scenario import TESTBEDS
 from offboard.loadgen.progress import progress
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.outcome_figures import FIGURES
-from offboard.loadgen.scenario.pass_fail_check import Verdict
+from offboard.loadgen.scenario.pass_fail_check import Check, Verdict
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import check_calls, find_scenario, read_scenario
 from offboard.loadgen.simulation.simulated_testbed import check_simulated
@@ -80,6 +80,8 @@ def run_checks(names: Sequence[str], config: ChecksConfig) -> int:
             raise ConfigError(f"{scenario.name} has no checks")
         if config.simulate:
             check_simulated(scenario)
+            if not _judged(scenario, config):
+                raise ConfigError(f"{scenario.name} has no checks that a simulation can judge")
     played = _simulated(scenarios, config) if config.simulate else _played(scenarios, config)
     tables = [checks_table(scenario, config, runs) for scenario, runs in zip(scenarios, played, strict=True)]
     sys.stdout.write(render(tables, config.format))
@@ -94,9 +96,7 @@ def checks_table(scenario: Scenario, config: ChecksConfig, runs: Mapping[str, Se
     headings = {name: Heading(name.replace("_", " "), name.replace("_", " "), None) for name in names}
     lines = []
     for policy, outcomes in runs.items():
-        for one in scenario.checks:
-            if config.simulate and FIGURES[one.figure].real:
-                continue
+        for one in _judged(scenario, config):
             verdicts = [one.judge(outcome) for outcome in outcomes]
             cells = (policy, str(one), *map(_value, verdicts), _verdict(verdicts))
             lines.append(line(**dict(zip(names, cells, strict=True))))
@@ -105,6 +105,11 @@ def checks_table(scenario: Scenario, config: ChecksConfig, runs: Mapping[str, Se
     caption = f"Checks of {scenario.name} {where}, {seeds} {scenario.seed + config.seeds - 1}."
     about = {"scenario": scenario.name, "testbed": SIMULATION if config.simulate else config.testbed}
     return Table(caption, about, headings, lines)
+
+
+def _judged(scenario: Scenario, config: ChecksConfig) -> list[Check]:
+    """Without the checks that need real processes, if the runs are simulated."""
+    return [one for one in scenario.checks if not (config.simulate and FIGURES[one.figure].real)]
 
 
 def _value(verdict: Verdict) -> str:

@@ -7,7 +7,8 @@ from offboard.loadgen.play.machine import output_of
 
 NOT_CODE = (  # as patterns of git, from the root of the checkout
     "docs",
-    "tests",
+    "tests/[!r]*",  # all but tests/ros2, which is measured
+    "tests/r[!o]*",
     "*.md",
     "loadgen/datasets",
     "benchmarks/capacity.json",
@@ -22,13 +23,19 @@ _CODE = (":(top)", *(f":(top,exclude){pattern}" for pattern in NOT_CODE))
 def commit_here() -> str | None:
     """The last commit that changed code in the checkout of the current folder.
 
-    `-dirty` is added if code files were changed since then. None outside a checkout.
+    `-dirty` is added if code files were changed since then. None if git does not tell, as outside a checkout.
     """
     commit = output_of(("git", "log", "-1", "--format=%h", "--abbrev=12", "--", *_CODE))
-    return commit and f"{commit}{'-dirty' if changed_code() else ''}"
+    changed = changed_code()
+    if commit is None or changed is None:
+        return None
+    return f"{commit}{'-dirty' if changed else ''}"
 
 
-def changed_code() -> list[str]:
-    """The code files that differ from the last commit, new ones included, from the root of the checkout."""
-    changed = output_of(("git", "status", "--porcelain", "--untracked-files=all", "--", *_CODE))
-    return [line.split(maxsplit=1)[1] for line in (changed or "").splitlines()]
+def changed_code() -> list[str] | None:
+    """The code files that differ from the last commit, new ones included, from the root of the checkout.
+
+    None if git does not tell.
+    """
+    lines = output_of(("git", "status", "--porcelain", "--branch", "--untracked-files=all", "--", *_CODE))
+    return None if lines is None else [line.split(maxsplit=1)[1] for line in lines.splitlines()[1:]]

@@ -78,8 +78,9 @@ def run_dataset(name: str, config: DatasetConfig, command: Sequence[str]) -> int
         "disturbance": disturbed.as_dict() if disturbed else None,
     }
     path = config.out / f"{scenario.name}.csv"
-    write_dataset(path, measured_tasks(read_recorded(run / TRACE, None)))
+    tasks = measured_tasks(read_recorded(run / TRACE, None))
     write_whole(path.with_suffix(".json"), json.dumps(about, indent=2, ensure_ascii=False) + "\n")
+    write_dataset(path, tasks)  # last, so that no rows are without their machine
     print(f"\n{render([table_one(scenario.name, specified)], 'md')}")
     print(f"written: {path} ({len(rows)} rows, {rows.left_out} left out) and {path.with_suffix('.json')}")
     return 0

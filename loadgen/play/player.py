@@ -145,6 +145,8 @@ class Player:
             self._start(part)
         else:
             event.apply(self._testbed)
+            if part is not None and event.action in ("start", "restart"):
+                self._parts.add(part)
         if part is not None and event.action == "pause":
             self._paused.add(part)
         elif part is not None and event.action not in ("cut", "join"):

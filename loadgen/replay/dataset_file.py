@@ -91,12 +91,13 @@ def _values(task: RecordedTask) -> dict[str, Any]:
         unknown = condition is UNMEASURED
         values |= {f"{site}.{name}": None if unknown else getattr(condition, name) for name in FEATURES[site]}
     sending, run = task.sendings.get(CLOUD, NOTHING), task.runs[CLOUD]
+    moved = run.bytes_out or run.bytes_in  # no message has 0 bytes
     return values | {
         "cloud_send_bytes": sending.bytes or None,
         "cloud_send_large": " ".join(f"{number}:{size}" for number, size in sending.large) or None,
         "cloud_packed": " ".join(map(_packed_text, run.packed)) or None,
-        "cloud_bytes_out": run.bytes_out,
-        "cloud_bytes_in": run.bytes_in,
+        "cloud_bytes_out": run.bytes_out if moved else None,
+        "cloud_bytes_in": run.bytes_in if moved else None,
     }
 
 
@@ -136,6 +137,9 @@ def _task(values: Mapping[str, Any]) -> RecordedTask:
 
 def _execution(site: str, values: Mapping[str, Any]) -> Execution:
     part_s = {part: values.get(f"{site}_{part}") for part in PARTS}
+    bytes_out, bytes_in = values.get(f"{site}_bytes_out"), values.get(f"{site}_bytes_in")
+    if bytes_out is None or bytes_in is None:
+        bytes_out = bytes_in = 0  # unknown: their sum is learned, and half of it would be wrong
     return Execution(
         site,
         values[f"{site}_s"],
@@ -144,8 +148,8 @@ def _execution(site: str, values: Mapping[str, Any]) -> Execution:
         run_s=part_s["run_s"],
         network_s=part_s["network_s"],
         cpu_s=part_s["cpu_s"],
-        bytes_out=values.get(f"{site}_bytes_out") or 0,
-        bytes_in=values.get(f"{site}_bytes_in") or 0,
+        bytes_out=bytes_out,
+        bytes_in=bytes_in,
         packed=values.get(f"{site}_packed") or (),
     )
 

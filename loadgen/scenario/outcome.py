@@ -50,6 +50,10 @@ class Answered:
         """The time from when the task was due to its answer."""
         return self.ended_s - self.due_s
 
+    def cost(self, costing: Costing) -> float:
+        """What the task cost at these prices."""
+        return costing.of_task(self.response_s, self.quality, self.spent, failed=self.error is not None)
+
 
 @dataclass(frozen=True, slots=True)
 class Reference:
@@ -111,8 +115,7 @@ class Outcome:
 
     def costs(self) -> Sequence[float]:
         """What each answered task cost."""
-        of_task = self.costing.of_task
-        return [of_task(one.response_s, one.quality, one.spent) for one in self.answered]
+        return [one.cost(self.costing) for one in self.answered]
 
     def between(self, first: int, last: int | None = None) -> "Outcome":
         """The tasks of each robot from number `first` up to, but without, number `last`."""

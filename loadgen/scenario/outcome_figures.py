@@ -190,13 +190,13 @@ FIGURES: dict[str, Figure] = {
         "reference",
     ),
     "time_over_oracle": Figure(
-        "times",
+        "",
         "time of the reference tasks on the chosen site, divided by their time on the faster site",
         _time_over_oracle,
         "reference",
     ),
     "wait_over_oracle": Figure(
-        "times",
+        "",
         "time that the robot waited for the reference tasks, with hedges, divided by their time on the"
         " faster site",
         _wait_over_oracle,

@@ -47,10 +47,13 @@ class Check:
 
     def __str__(self) -> str:
         which, limit = ("at most", self.at_most) if self.at_most is not None else ("at least", self.at_least)
-        span = f" from task {self.from_task}" if self.from_task else ""
-        span += f" before task {self.to_task}" if self.to_task is not None else ""
-        of = f" of {self.site}" if self.site else ""
-        return f"{self.figure}{of} {which} {limit:g} {FIGURES[self.figure].unit}{span}"
+        of, unit = f" of {self.site}" if self.site else "", FIGURES[self.figure].unit
+        return f"{self.figure}{of} {which} {limit:g}{f' {unit}' if unit else ''}{self._span()}"
+
+    def _span(self) -> str:
+        if self.to_task is not None:
+            return f", tasks {self.from_task} to {self.to_task - 1}"
+        return f", from task {self.from_task} on" if self.from_task else ""
 
     def judge(self, run: Outcome) -> "Verdict":
         run = run.between(self.from_task, self.to_task)

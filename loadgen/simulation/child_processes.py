@@ -2,10 +2,11 @@
 
 import contextlib
 import ctypes
+import os
 import signal
 import sys
 from collections.abc import Iterator
-from multiprocessing import resource_tracker
+from multiprocessing import parent_process, resource_tracker
 
 PR_SET_PDEATHSIG = 1  # prctl(2)
 
@@ -28,8 +29,12 @@ def end_quietly() -> None:
     """Called first in a child: from now on Ctrl-C ends it. The command says that it was interrupted.
 
     A child would wait for work for ever if the command were killed: it holds both ends of its pipe.
+    So it is killed when the thread ends that started it, which must be the main thread of the command.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        command = parent_process()
+        if command is not None and os.getppid() != command.pid:  # it was killed before
+            signal.raise_signal(signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

@@ -160,6 +160,19 @@ def quantile(values: Column, percent: int) -> Column:
     return found
 
 
+def known_quantile(values: Column, percent: int) -> Column:
+    """The same without NaN; NaN if nothing is left."""
+    rank = -(-percent * (~np.isnan(values)).sum(axis=-1, keepdims=True) // 100) - 1
+    found: Column = np.take_along_axis(np.sort(values, axis=-1), rank, axis=-1)[..., 0]  # NaN come last
+    return found
+
+
+def known_mean(values: Column) -> Column:
+    """The mean along the last axis without NaN; NaN if nothing is left."""
+    there = ~np.isnan(values)
+    return _divided(np.where(there, values, 0.0).sum(-1), there.sum(-1).astype(float))
+
+
 def mean_r(sizes: Column, seconds: Column, length: int) -> float | None:
     """Mean Pearson r over all sliding windows of `length` rows; leaves out windows with a constant column."""
     found = window_r(sizes, seconds, length)

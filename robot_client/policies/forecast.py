@@ -58,7 +58,7 @@ class PredictionErrors:
             return 0.5 * math.erfc(normal_of_student(t, count + 1) / math.sqrt(2.0))
         score = (limit_s - predicted_s) / unit_s(predicted_s, self.usual_s)
         # Never 0 or 1: a limit that no error has reached yet may still be missed.
-        above = count - bisect_left(self.scores, score) + len(self.stopped)
+        above = count - bisect_left(self.scores, score) + len(self.stopped)  # they might never have ended
         return (above + 0.5) / (count + len(self.stopped) + 1)
 
     def half_90_s(self, predicted_s: float, spread_s: float) -> float:

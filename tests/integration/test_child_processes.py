@@ -76,6 +76,31 @@ def test_no_process_outlives_a_killed_command(name: str, tmp_path: Path) -> None
         until(lambda: not any(map(_runs, computing)))
 
 
+ORPHAN = """
+import multiprocessing, os, signal, time
+from offboard.loadgen.simulation.child_processes import end_quietly
+
+def child():
+    print("child began", flush=True)
+    while os.getppid() == multiprocessing.parent_process().pid:
+        time.sleep(0.01)
+    end_quietly()
+    print("child goes on", flush=True)
+
+if __name__ == "__main__":
+    multiprocessing.get_context("spawn").Process(target=child).start()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_process_ends_if_its_command_was_killed_before_it_began(tmp_path: Path) -> None:
+    """The kernel reports only a death that is still to come, so the process looks whether there was one."""
+    (tmp_path / "orphan.py").write_text(ORPHAN)
+    command = [sys.executable, str(tmp_path / "orphan.py")]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (run.returncode, run.stdout, run.stderr) == (-signal.SIGKILL, "child began\n", "")
+
+
 def _runs(process: Path) -> bool:
     with contextlib.suppress(OSError):
         return (process / "stat").read_text().rpartition(")")[2].split()[0] != "Z"

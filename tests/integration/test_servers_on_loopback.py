@@ -10,6 +10,13 @@ from offboard.loadgen.scenario.outcome_figures import site_percent
 from offboard.loadgen.scenario.scenario_file import read_scenario
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
+COMES = """[[event]]
+at_task = 8
+start = "edge"
+[[event]]
+at_task = 24
+stop = "edge"
+"""
 SCENARIO = """name = "pair"
 [workload]
 task = "offboard.loadgen.scenario.hash_tasks:hash_rounds"
@@ -49,3 +56,17 @@ def test_the_near_server_is_used_until_it_dies(tmp_path: Path) -> None:
     assert {one.name for one in (tmp_path / "out").glob("link*.jsonl")} == {"link.jsonl", "link-edge.jsonl"}
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["site_shares"].keys() == {"onboard", "cloud", "edge"}
+
+
+def test_a_server_that_an_event_starts_can_be_stopped(tmp_path: Path) -> None:
+    """Both events happen, its memory is read, and it is used only between them."""
+    path = tmp_path / "comes.toml"
+    path.write_text(SCENARIO.partition("[[event]]")[0] + COMES)
+    played = play(read_scenario(path), tmp_path / "out", quiet=True)
+    played.check_robots()
+    events = map(json.loads, (tmp_path / "out" / "events.jsonl").read_text().splitlines())
+    assert [one.get("skipped") for one in events] == [None, None]
+    readings = map(json.loads, (tmp_path / "out" / "usage.jsonl").read_text().splitlines())
+    assert "edge" in {one["part"] for one in readings}
+    assert (site_percent(played.outcome.between(12, 24), "edge") or 0) > 0
+    assert site_percent(played.outcome.between(26), "edge") == 0

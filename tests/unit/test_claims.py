@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,11 @@ import pytest
 
 from offboard.common.errors import DataError
 from offboard.loadgen.__main__ import main
-from offboard.loadgen.claims.claim import BELOW_ONE, POSITIVE, Claimed, Figure
+from offboard.loadgen.claims.claim import BELOW_ONE, POSITIVE, Claimed, Figure, mean_of
 from offboard.loadgen.claims.claims import run_claims
 from offboard.loadgen.claims.claims_settings import ClaimsConfig
 from offboard.loadgen.claims.prediction_claims import RIVALS, PredictionClaims
-from offboard.loadgen.claims.several_inputs import read_inputs
+from offboard.loadgen.claims.several_inputs import _filled, read_inputs
 from offboard.loadgen.table.measured_rows import Rows
 from offboard.loadgen.table.table_formats import UNDEFINED
 from tests.table_loops import THOUSAND, csv_of, lines_of
@@ -70,6 +71,16 @@ def found_in(printed: str) -> dict[str, dict[str, Any]]:
 def test_a_claim_agrees_if_the_whole_interval_does(claimed: Claimed, figure: Figure, agrees: str) -> None:
     """Yes and no need the whole interval on one side of the limits; an exact figure needs no interval."""
     assert claimed.agrees(figure) == agrees
+
+
+@pytest.mark.parametrize(("values", "agrees"), [(49, "unclear"), (50, "yes")])
+def test_a_few_blocks_decide_nothing(values: int, agrees: str) -> None:
+    """Windows of 10 rows share rows, so a block has 10 values; below five blocks there is no interval."""
+    blocks = ClaimsConfig().blocks(values, overlap=10)
+    figure = mean_of(blocks, np.linspace(1.0, 2.0, values))
+    assert figure.value == pytest.approx(1.5)
+    assert (figure.low is None) == (figure.high is None) == (agrees == "unclear")
+    assert POSITIVE.agrees(figure) == agrees
 
 
 def test_every_claim_has_lines_that_fit(print_claims: Print) -> None:
@@ -154,16 +165,16 @@ def test_a_rule_that_halves_the_time_agrees(print_claims: Print) -> None:
     assert claims["cloud MAE %, N = 50, chosen"]["ours"] == pytest.approx(0.0, abs=1e-9)
 
 
-def with_load() -> str:
+def with_load(first: int = 0) -> str:
     """A dataset whose onboard time depends on its size and on a load that is known before the task.
 
-    The load is measured before every second task and holds for both.
+    The load is measured before every second task and holds for both; before task `first` it is unknown.
     """
     random = np.random.default_rng(6)
     lines = ["size,onboard_s,cloud_s,onboard.load,cloud_run_s,cloud.queue"]
     loads = random.uniform(0, 2, 100).repeat(2).tolist()
     for at, (size, load) in enumerate(zip(random.uniform(0, 2, 200).tolist(), loads, strict=True)):
-        known = "" if at % 2 else repr(load)
+        known = "" if at % 2 or at < first else repr(load)
         lines.append(f"{size!r},{0.1 + size + load!r},{1.6 + 0.1 * size!r},{known},{9 * size!r},")
     return "\n".join(lines) + "\n"
 
@@ -175,18 +186,34 @@ def test_several_inputs_are_used_if_the_dataset_has_them(print_claims: Print) ->
     assert claims["several inputs: accuracy points"]["low"] > 0
     assert claims["several inputs: onboard MAE, ratio"]["high"] < 1e-9
     assert "several inputs: cloud MAE, ratio" not in claims
-    assert set(read_inputs(Path("rows.csv"))) == {"onboard.load"}
+
+
+def test_no_value_comes_from_the_rows_that_are_predicted(print_claims: Print) -> None:
+    """Of 200 rows, 160 are learned: a load that is first known in row 158 is an input, in row 160 none."""
+    assert "several inputs: accuracy points" in found_in(print_claims(with_load(158), format="json"))
+    line = found_in(print_claims(with_load(160), format="json"))["several inputs"]
+    assert (line["ours"], line["note"]) == (None, "only sizes are known in the first 80 % of the rows")
+
+
+def test_empty_cells_before_the_first_value_hold_that_value(tmp_path: Path) -> None:
+    """The others hold the last known value."""
+    path = tmp_path / "rows.csv"
+    path.write_text("size,onboard_s,cloud_s,onboard.load\n1,2,3,\n1,2,3,4\n1,2,3,\n1,2,3,5\n")
+    read = read_inputs(path)
+    assert read == {"onboard.load": [None, 4.0, None, 5.0]}
+    assert _filled(read["onboard.load"]).tolist() == [4.0, 4.0, 4.0, 5.0]
 
 
 def test_a_dataset_of_sizes_says_so(print_claims: Print) -> None:
     """Without further columns the line has no figure, and a note says why."""
     line = found_in(print_claims(format="json"))["several inputs"]
-    assert (line["ours"], line["note"]) == (None, "the file has only sizes")
-    assert "- 7: the file has only sizes" in print_claims()
+    assert (line["ours"], line["note"]) == (None, "only sizes are known in the first 80 % of the rows")
+    assert "- 7: only sizes are known in" in print_claims()
 
 
-def test_a_wrong_input_is_one_line(print_claims: Print) -> None:
-    """The error names file, line, column and value."""
+def test_a_wrong_input_is_one_line(print_claims: Print, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The error names file, line, column and value, and comes before anything is computed."""
+    monkeypatch.delattr("offboard.loadgen.claims.claims.claims")
     with pytest.raises(
         DataError, match=r"^rows\.csv:2: onboard\.load: 'busy' is not a finite number from 0 to"
     ):
@@ -207,6 +234,14 @@ def test_a_missing_library_is_a_note(print_claims: Print, monkeypatch: pytest.Mo
     claims = found_in(print_claims(predictors=("k-means", "huber"), format="json"))
     assert "needs the extra 'learned'" in claims["ahead of k-means"]["note"]
     assert claims["training, huber"]["ours"] > 0
+
+
+def test_a_coarse_clock_is_a_note(print_claims: Print, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where least squares takes no time by the CPU clock, there is no multiple of it."""
+    monkeypatch.setattr(time, "process_time", lambda: 1.0)
+    claims = found_in(print_claims(csv_of(ROWS[:80]), format="json"))
+    for words in ("training, huber", "prediction, huber"):
+        assert (claims[words]["ours"], claims[words]["note"]) == (None, "the CPU clock is too coarse")
 
 
 def test_several_datasets_get_a_table_each(

@@ -31,7 +31,9 @@ def commit(name: str, text: str) -> None:
     git("commit", "--quiet", "-m", name)
 
 
-@pytest.mark.parametrize("name", ["docs/figures/a.json", "docs/page.md", "README.md", "tests/test_a.py"])
+@pytest.mark.parametrize(
+    "name", ["docs/figures/a.json", "docs/page.md", "README.md", "tests/unit/test_a.py", "tests/ray/a.py"]
+)
 def test_files_that_no_measurement_needs_do_not_change_it(checkout: Path, name: str) -> None:
     """Neither a commit of such a file, nor a change of it."""
     first = commit_here()
@@ -54,6 +56,22 @@ def test_a_change_of_code_is_seen(checkout: Path) -> None:
     commit("code.py", "3")
     assert commit_here() not in (first, f"{first}-dirty")
     assert git("rev-parse", "HEAD").startswith(str(commit_here()))
+
+
+def test_the_goals_by_ros_2_are_code(checkout: Path) -> None:
+    """They are measured by a test."""
+    first = commit_here()
+    commit("tests/ros2/test_goals.py", "1")
+    (checkout / "tests" / "ros2" / "test_goals.py").write_text("2")
+    assert changed_code() == ["tests/ros2/test_goals.py"]
+    assert commit_here() != first
+
+
+def test_a_git_that_fails_does_not_mean_unchanged(checkout: Path) -> None:
+    """If git cannot read what was committed, the commit is unknown."""
+    (checkout / ".git" / "index").write_bytes(b"broken")
+    assert changed_code() is None
+    assert commit_here() is None
 
 
 def test_outside_a_checkout_there_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -65,6 +65,21 @@ def test_a_dataset_holds_all_that_a_replay_needs(tmp_path: Path) -> None:
     assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "d.csv").read_bytes()
 
 
+def test_unknown_bytes_are_not_written_as_0(tmp_path: Path) -> None:
+    """A file without known bytes has no columns of them."""
+    write_dataset(tmp_path / "d.csv", [BARE])
+    assert (tmp_path / "d.csv").read_text().splitlines()[0] == "size,onboard_s,cloud_s,timeout_s"
+
+
+@pytest.mark.parametrize(("cells", "known"), [("50,7", (50, 7)), ("50,", (0, 0)), (",7", (0, 0))])
+def test_half_of_the_bytes_are_none(tmp_path: Path, cells: str, known: tuple[int, int]) -> None:
+    """If the bytes of one direction are unknown, those of both are; 0 stands for that."""
+    header = "size,onboard_s,cloud_s,cloud_bytes_out,cloud_bytes_in"
+    (tmp_path / "d.csv").write_text(f"{header}\n3,0.5,0.5,{cells}\n")
+    (task,) = read_dataset(tmp_path / "d.csv")
+    assert (task.runs[CLOUD].bytes_out, task.runs[CLOUD].bytes_in) == known
+
+
 def test_sizes_and_times_are_enough(tmp_path: Path) -> None:
     """A dataset of an earlier version, with three columns, is read; columns without a meaning are ignored."""
     (tmp_path / "d.csv").write_text("size,onboard_s,cloud_s,weather\n3,0.5,0.5,fine\n")

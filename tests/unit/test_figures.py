@@ -127,9 +127,9 @@ def test_the_page_says_what_is_of_another_commit_and_what_is_missing() -> None:
     sections = [Section("S", "", (step(), parts, step(name="third", title="Third")))]
     files = {"speed": MEASURED, "parts/a": replace(MEASURED, commit="def5678", date="2026-11-20")}
     page = results(sections, files)
-    assert "**1 of 4 measurements are of commit abc1234** (2026-11-26)." in page
-    assert "Of commit def5678: [In parts](#in-parts) (a)." in page
-    assert "Not measured yet: [In parts](#in-parts) (b); [Third](#third)." in page
+    assert "**2 of 4 measurements are done**, and 1 of them are of commit abc1234 (2026-11-26)." in page
+    assert "Of commit def5678:\n\n- [In parts](#in-parts) (a)\n" in page
+    assert "Not measured yet:\n\n- [In parts](#in-parts) (b)\n- [Third](#third)\n" in page
     assert "Commit abc1234, 2026-11-26; AMD EPYC, 2 cores, 8 GiB, Linux 6.1, Python 3.11.7." in page
     assert "### Third\n\nHow fast.\n\n```sh\npython -m speed\n```\n\nNot measured yet.\n" in page
 
@@ -142,8 +142,22 @@ def test_the_page_names_tables_of_other_rows_than_those_of_the_checkout() -> Non
     assert why_old(unit, now, "abc1234") == ""
     assert why_old(unit, before, "abc1234") == OTHER_ROWS
     page = results([Section("S", "", (unit.step,))], {unit.name: before})
-    assert "Of rows that were measured again since: [Table II on our own datasets]" in page
+    assert "Of rows that were measured again since:\n\n- [Table II on our own datasets]" in page
     assert "rows of paper.csv of commit def5678" in page
+
+
+def test_the_newest_commit_is_that_of_the_latest_second() -> None:
+    """The page names it; a file without a time is of midnight, and one of other rows is not of the commit."""
+    (table,) = (one for one in UNITS if one.name == "table-two/paper")
+    parts = step(name="parts", title="In parts", parts=("a", "b"))
+    files = {
+        "parts/a": replace(MEASURED, commit="fff9999"),
+        "parts/b": replace(MEASURED, commit="eee8888", date="2026-11-26T08:00:00Z"),
+        "speed": replace(MEASURED, date="2026-11-26T09:00:00Z"),
+        table.name: replace(MEASURED, reads={"rows.csv": {"sha256": "0", "commit": "def5678"}}),
+    }
+    page = results([Section("S", "", (parts, step(), replace(table.step, parts=("paper",))))], files)
+    assert "**4 of 4 measurements are done**, and 1 of them are of commit abc1234 (2026-11-26)." in page
 
 
 def test_a_block_holds_chosen_rows_and_columns() -> None:
@@ -178,6 +192,40 @@ def test_tables_of_parts_become_one() -> None:
     assert len(tables_of(lines)) == 1
 
 
+def test_bounds_belong_to_the_row_above_them() -> None:
+    """A row may have none; two others than its own, or only one, are an error."""
+    row, low, high, other = "| a |  | 2 |", "| a | 2.5 % | 1 |", "| a | 97.5 % | 3 |", "| b |  | 5 |"
+
+    def bracketed(*rows: str) -> tuple[tuple[str, ...], ...]:
+        (table,) = tables_of(["| policy | bound | ms |", "| --- | --- | ---: |", *rows])
+        return table.bracketed().rows
+
+    assert bracketed(other, row, low, high) == (("b", "5"), ("a", "2 [1, 3]"))
+    for rows in ((row, low), (row, other, low, high), (low, high, row)):
+        with pytest.raises(DataError, match="bounds"):
+            bracketed(*rows)
+
+
+@pytest.mark.parametrize("about", [None, "{", "[]"])
+def test_rows_without_their_machine_are_one_line(tmp_path: Path, about: str | None) -> None:
+    """A missing or broken JSON file next to rows is named, and their tables are not up to date."""
+    (tmp_path / "rows.csv").write_text("1")
+    if about is not None:
+        (tmp_path / "rows.json").write_text(about)
+    unit = Unit(step(reads=(str(tmp_path / "rows.csv"),)))
+    with pytest.raises(DataError, match=r"rows.json: does not tell how rows.csv was measured"):
+        unit.reads(tmp_path)
+    assert why_old(unit, MEASURED, "abc1234") == OTHER_ROWS
+
+
+def test_a_step_whose_text_is_a_number_is_one_line(tmp_path: Path) -> None:
+    """The file is named."""
+    path = tmp_path / "steps.toml"
+    path.write_text('[[section]]\ntitle = "S"\n[[section.step]]\nname = "a"\nabout = 3\n')
+    with pytest.raises(DataError, match=r"steps.toml: "):
+        read_sections(path)
+
+
 def test_a_file_is_old_if_code_or_command_changed() -> None:
     """Then, and only then, its step is measured again."""
     unit = Unit(step())
@@ -207,6 +255,30 @@ def test_what_a_command_prints_is_kept_with_its_machine() -> None:
     assert measured.seconds >= 0
 
 
+def test_finished_runs_are_used_at_the_same_commit_only() -> None:
+    """The folder of a step is emptied for another commit, for other commands, and if asked for."""
+    code = (
+        "from pathlib import Path; p = Path('{out}', 'runs'); "
+        "p.write_text(said := p.exists() * '+' + 'run'); print(said)"
+    )
+    unit, other = (
+        Unit(step(name="finished", run=(f'python -c "{code}{more}"',), environment=sys.prefix))
+        for more in ("", ";")
+    )
+    first = measure(unit, "abc1234", again=True)
+    assert list(first.output) == ["run"]
+    assert list(measure(unit, "abc1234").output) == ["+run"]
+    assert list(measure(unit, "def5678").output) == ["run"]
+    assert list(measure(unit, "def5678", again=True).output) == ["run"]
+    assert list(measure(other, "def5678").output) == ["run"]
+
+
+def test_no_step_shares_its_folder() -> None:
+    """Runs and pictures are in folders that belong to the step or part, so emptying one hurts no other."""
+    assert [command for unit in UNITS for command in unit.step.run if "out/" in command] == []
+    assert [one for unit in UNITS for one in unit.step.copies if not one.startswith("{out}/")] == []
+
+
 @pytest.mark.parametrize(
     ("command", "said"),
     [
@@ -226,6 +298,7 @@ def test_a_command_that_fails_leaves_no_figures(command: str, said: str) -> None
     [
         (["--only", "decisions"], "--only: unknown step 'decisions'; did you mean 'decision'?"),
         (["--again", "checks-local/clam"], "did you mean 'checks-local/calm'?"),
+        (["--only", "calls", "--again", "decision"], "--again: decision is not among those of --only"),
     ],
 )
 def test_a_wrong_name_is_one_line(flags: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -152,7 +152,7 @@ def test_growth_is_the_growth_of_the_part_that_grew_most() -> None:
         (Check(figure="lost", at_most=0), "FAILS  lost at most 0 tasks: 1, 1 above the limit"),
         (
             Check(figure="cloud_percent", at_least=80, from_task=2, to_task=6, note="known"),
-            "FAILS  cloud_percent at least 80 % from task 2 before task 6: 50, 30 below the limit (known)",
+            "FAILS  cloud_percent at least 80 %, tasks 2 to 5: 50, 30 below the limit (known)",
         ),
     ],
 )

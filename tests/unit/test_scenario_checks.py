@@ -1,6 +1,7 @@
 """`loadgen checks`: the verdict of every check, in simulation."""
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -8,6 +9,7 @@ from offboard.loadgen.__main__ import main
 from offboard.loadgen.scenario.outcome_figures import FIGURES
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from tests.mazes import warm
+from tests.testbeds import MAP
 
 warm()  # compiles before the clock of any test runs
 CHECKS = ("checks", "outage", "--simulate", "--seeds", "2", "--jobs", "1")
@@ -48,3 +50,16 @@ def test_a_wrong_flag_is_one_line(flags: list[str], said: str, capsys: pytest.Ca
     assert main(flags) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
+
+
+def test_checks_that_need_real_processes_cannot_be_simulated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A scenario with no other checks is refused, instead of an empty table."""
+    workload = f'map = "{MAP}"\ntasks = 20'
+    scenario = tmp_path / "mine.toml"
+    scenario.write_text(
+        f'name = "mine"\nseed = 1\n[workload]\n{workload}\n[[check]]\nfigure = "overhead_ms"\nat_most = 0\n'
+    )
+    assert main(["checks", str(scenario), "--simulate", "--format", "csv"]) == 2
+    assert "mine has no checks that a simulation can judge" in capsys.readouterr().err

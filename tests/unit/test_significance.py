@@ -43,6 +43,19 @@ def test_a_line_is_significant_and_noise_is_not() -> None:
     assert agreed["cloud: N = 50, % with p < 0.005"] == "no"
 
 
+def test_a_falling_line_and_two_points_support_nothing() -> None:
+    """A significantly negative r is against the claim, and two points always lie on a line."""
+    size = np.random.default_rng(4).uniform(0, 5, 300)
+    rows = Rows(size, onboard_s=0.1 + size, cloud_s=9.0 - size)
+    config = ClaimsConfig(windows=("2", "10"), predictors=("least-squares",))
+    found = {one.claim: one for one in significance(rows, config)}
+    assert found["onboard: N = 10, % with p < 0.005"].ours == pytest.approx(100.0)
+    assert found["cloud: N = 10, % with p < 0.005"].ours == pytest.approx(0.0)
+    for site in ("onboard", "cloud"):
+        line = found[f"{site}: N = 2, % with p < 0.005"]
+        assert (line.ours, line.note) == (None, "too few rows for a test")
+
+
 def test_equal_sizes_have_no_correlation() -> None:
     """A dataset with one size only, and one that is shorter than the window, get lines without figures."""
     rows = Rows(np.ones(40), onboard_s=np.arange(40.0), cloud_s=np.arange(40.0))

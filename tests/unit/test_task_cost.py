@@ -24,7 +24,8 @@ ENERGY = Energy(compute_w=5.0, idle_w=1.0, radio_j_byte=1e-6)
 
 
 def execution(site: str, seconds: float, **more: Any) -> dict[str, Any]:
-    return {"site": site, "seconds": seconds, "cpu_s": None, "bytes_out": 0, "bytes_in": 0} | more
+    unknown = {"cpu_s": None, "queue_s": None}
+    return {"site": site, "seconds": seconds, "started": True, "bytes_out": 0, "bytes_in": 0} | unknown | more
 
 
 def test_all_runs_of_a_task_are_spent() -> None:
@@ -32,6 +33,7 @@ def test_all_runs_of_a_task_are_spent() -> None:
     record = {
         "id": "a",
         "features": {"onboard.capacity": 0.2},
+        "waited_s": 0.5,
         "executions": [
             execution("onboard", 0.5),
             execution("cloud", 0.1, bytes_out=100),
@@ -40,9 +42,23 @@ def test_all_runs_of_a_task_are_spent() -> None:
     }
     later = {"late": [{"id": "a"} | execution("cloud", 0.3, bytes_out=100, bytes_in=50)]}
     spent = spent_of(record, late_executions([record, later]))
-    assert spent == Spent(pytest.approx(0.1), pytest.approx(0.5), 165)
-    alone = record | {"executions": [execution("onboard", 0.5, cpu_s=0.07)]}
-    assert spent_of(alone, {}) == Spent(0.07)
+    assert spent == Spent(pytest.approx(0.1), pytest.approx(0.3), 165)
+    answered_sooner = spent_of(record | {"waited_s": 0.25}, {})
+    assert answered_sooner.remote_s == 0.25, "two servers at once are one wait"
+
+
+@pytest.mark.parametrize(
+    ("run", "cpu_s"),
+    [
+        (execution("onboard", 0.5, cpu_s=0.07), 0.07),
+        (execution("onboard", 0.5, queue_s=0.3), 0.2 * 0.2),
+        (execution("onboard", 0.5, started=False), 0.0),
+    ],
+)
+def test_a_run_onboard_takes_no_cpu_while_it_waits(run: dict[str, Any], cpu_s: float) -> None:
+    """A run that was cancelled before it began takes none at all."""
+    record = {"id": "a", "features": {"onboard.capacity": 0.2}, "waited_s": 0.5, "executions": [run]}
+    assert spent_of(record, {}) == Spent(pytest.approx(cpu_s))
 
 
 @pytest.mark.parametrize(
@@ -67,7 +83,14 @@ def test_lost_quality_costs_too() -> None:
     assert Costing("deadline", 1.0).of_task(0.3, 0.9, Spent()) == pytest.approx(0.1)
 
 
-def outcome(seconds: float, spent: Spent) -> Outcome:
+def test_a_task_that_failed_has_missed_its_deadline() -> None:
+    """However soon its error came; an objective without a deadline counts its time."""
+    (failed, *_) = outcome(0.1, Spent(), error="TaskFailed").answered
+    assert failed.cost(Costing("deadline", 1.0)) == 1.0
+    assert failed.cost(Costing()) == pytest.approx(0.1)
+
+
+def outcome(seconds: float, spent: Spent, error: str | None = None) -> Outcome:
     """Twenty tasks of `seconds`, the last two of ten times as long."""
     return Outcome(
         {"robot": 20},
@@ -77,7 +100,7 @@ def outcome(seconds: float, spent: Spent) -> Outcome:
                 robot="robot",
                 due_s=i,
                 ended_s=i + seconds * (10 if i > 17 else 1),
-                error=None,
+                error=error,
                 answer=None,
                 chosen="cloud",
                 both=False,
@@ -112,6 +135,17 @@ def test_a_comparison_judges_all_policies_by_the_objective_of_the_scenario(
     judged = replace(cheap, costing=scenario.costing())
     assert FIGURES["cost"].compute(judged) == pytest.approx(expected)
     assert second.cost_over_first == pytest.approx(second.cost / first.cost)
+
+
+@pytest.mark.parametrize("objective", ["mean", "p95"])
+def test_a_cost_is_compared_on_the_tasks_that_both_policies_answered(objective: str) -> None:
+    """The first policy lost the two long tasks; on the others, the second one is as good."""
+    scenario = Scenario("small", 1, WORKLOAD, robot=RobotPart(objective=objective))
+    config = CompareConfig(policies=("default", "cloud"), seeds=1)
+    whole = outcome(0.1, Spent())
+    lost = replace(whole, answered=whole.answered[:18])
+    lines = comparison_table(scenario, config, {"default": [lost], "cloud": [whole]}).lines
+    assert [line.cost_over_first for line in lines] == [pytest.approx(1.0)] * len(lines)
 
 
 @pytest.mark.parametrize(

@@ -99,6 +99,17 @@ def test_a_run_that_was_stopped_in_the_run_is_stopped_when_the_task_is_answered(
     assert [forecast.sites[ONBOARD].in_flight for forecast in seen] == [0, 0]
 
 
+def test_a_task_may_not_tell_its_work(caplog: pytest.LogCaptureFixture) -> None:
+    """Among tasks that tell it, this is no error: nothing is logged, and every task is played."""
+    tasks = [
+        RecordedTask(1.0, {site: Execution(site, 0.1, work) for site in (ONBOARD, CLOUD)})
+        for work in (5.0, None) * 10
+    ]
+    found = replay(tasks, "greedy", predictor=None, window=4, feedback="chosen")
+    assert len(found.spent_s) == 16
+    assert caplog.text == ""
+
+
 def test_second_runs_end_with_the_allowance() -> None:
     """Of 100 hedges that are due, only as many start as the allowance permits."""
     found = played([(1.0, 0.05)] * 100, *[sent(ONBOARD, Hedge(CLOUD, 0.2))] * 100)
