@@ -26,7 +26,7 @@ class Conformal:
 
     def __init__(self) -> None:
         self._order: deque[float] = deque()
-        self._stopped: deque[float | None] = deque(maxlen=ERRORS_MAX)  # of each run; None: it was not stopped
+        self._stopped: deque[tuple[int, float]] = deque(maxlen=ERRORS_MAX)  # with the runs learnt before each
         self._sorted: list[float] = []
         self._usual_s = RunningMean()
         self._outside = 1 - COVERAGE  # the share of errors that the interval leaves out
@@ -37,8 +37,10 @@ class Conformal:
     def errors(self) -> PredictionErrors:
         """The errors until now, as a value; made again only after something was learnt."""
         if self._errors is None:
-            stopped = sorted(score for score in self._stopped if score is not None)
-            self._errors = PredictionErrors(tuple(self._sorted), self._usual_s.value, tuple(stopped))
+            while self._stopped and self._stopped[0][0] <= self._usual_s.count - ERRORS_MAX:
+                self._stopped.popleft()
+            stopped = tuple(sorted([score for _, score in self._stopped])) if self._stopped else ()
+            self._errors = PredictionErrors(tuple(self._sorted), self._usual_s.value, stopped)
         return self._errors
 
     def learn(self, predicted_s: float, seconds: float) -> None:
@@ -49,7 +51,6 @@ class Conformal:
                 low, high = self._ends or self._interval()
                 self._adapt(missed=not low <= score <= high)
             self._add(score)
-            self._stopped.append(None)
         self._usual_s.add(max(seconds, predicted_s))
         self._errors = None
 
@@ -57,7 +58,8 @@ class Conformal:
         """Learn that a task was stopped after the upper end; how late it would have been is unknown."""
         if len(self._sorted) >= ERRORS_MIN:
             self._adapt(missed=True)
-            self._stopped.append((seconds - predicted_s) / unit_s(predicted_s, self._usual_s.value))
+            score = (seconds - predicted_s) / unit_s(predicted_s, self._usual_s.value)
+            self._stopped.append((self._usual_s.count, score))
             self._errors = None
 
     def interval(self, predicted_s: float, spread_s: float | None) -> tuple[float, float] | None:
@@ -73,8 +75,7 @@ class Conformal:
         return (low_s if low_s > 0 else 0.0), (high_s if high_s > 0 else 0.0)
 
     def _adapt(self, *, missed: bool) -> None:
-        outside = self._outside + RATE * (1 - COVERAGE - missed)
-        # Below 0, the interval is wider than all errors seen.
+        outside = self._outside + RATE * (1 - COVERAGE - missed)  # below 0: wider than all errors seen
         self._outside = min(COVERAGE, max(COVERAGE - 1, outside))
         self._ends = None
 

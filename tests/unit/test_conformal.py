@@ -91,7 +91,7 @@ def test_a_stopped_task_counts_in_the_tail_and_not_in_the_hedge() -> None:
     assert hedged.errors.share_above(1.0, 3.0) == pytest.approx(0.1, abs=0.02)
     assert whole.errors.below(1.0, 0.95) == pytest.approx(1.05, abs=0.01)
     assert hedged.errors.below(1.0, 0.95) == pytest.approx(2.0, abs=0.1)
-    assert len(hedged.errors.stopped) == 10  # as far back as the errors
+    assert len(hedged.errors.stopped) == 12  # those since the oldest of the 100 errors
     due_s = hedged.errors.overdue(1.0, 0.5)
     assert due_s is not None
     assert due_s < 1.2
