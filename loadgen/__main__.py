@@ -118,28 +118,15 @@ def _watch(argv: Sequence[str]) -> int:
 def _compare(argv: Sequence[str]) -> int:
     from offboard.loadgen.compare.compare import run_compare
     from offboard.loadgen.compare.compare_settings import CompareConfig
-    from offboard.loadgen.scenario.scenario_file import shipped
 
-    parser = _parser("compare", "SCENARIO ...")
-    help = f"TOML files, or some of {', '.join(shipped())}"
-    parser.add_argument("scenarios", metavar="SCENARIO", nargs="+", help=help)
-    add_flags(parser, CompareConfig, PREFIX)
-    flags = parser.parse_args(argv)
-    _find_modules_here()
-    return run_compare(flags.scenarios, resolve(CompareConfig, flags, environ=os.environ, prefix=PREFIX))
+    return run_compare(*_scenarios_and_config("compare", CompareConfig, argv))
 
 
 def _checks(argv: Sequence[str]) -> int:
-    from offboard.loadgen.compare.scenario_checks import ChecksConfig, run_checks
-    from offboard.loadgen.scenario.scenario_file import shipped
+    from offboard.loadgen.compare.compare_settings import RunsConfig
+    from offboard.loadgen.compare.scenario_checks import run_checks
 
-    parser = _parser("checks", "SCENARIO ...")
-    help = f"TOML files, or some of {', '.join(shipped())}"
-    parser.add_argument("scenarios", metavar="SCENARIO", nargs="+", help=help)
-    add_flags(parser, ChecksConfig, PREFIX)
-    flags = parser.parse_args(argv)
-    _find_modules_here()
-    return run_checks(flags.scenarios, resolve(ChecksConfig, flags, environ=os.environ, prefix=PREFIX))
+    return run_checks(*_scenarios_and_config("checks", RunsConfig, argv))
 
 
 def _table(argv: Sequence[str]) -> int:
@@ -273,6 +260,19 @@ def _file_and_config(name: str, cls: type[C], argv: Sequence[str]) -> tuple[Path
     flags = parser.parse_args(argv)
     _find_modules_here()
     return flags.trace, resolve(cls, flags, environ=os.environ, prefix=PREFIX)
+
+
+def _scenarios_and_config(name: str, cls: type[C], argv: Sequence[str]) -> tuple[list[str], C]:
+    """The scenarios and the settings of a command that plays several of them."""
+    from offboard.loadgen.scenario.scenario_file import shipped
+
+    parser = _parser(name, "SCENARIO ...")
+    help = f"TOML files, or some of {', '.join(shipped())}"
+    parser.add_argument("scenarios", metavar="SCENARIO", nargs="+", help=help)
+    add_flags(parser, cls, PREFIX)
+    flags = parser.parse_args(argv)
+    _find_modules_here()
+    return flags.scenarios, resolve(cls, flags, environ=os.environ, prefix=PREFIX)
 
 
 def _find_modules_here() -> None:

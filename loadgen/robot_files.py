@@ -5,7 +5,7 @@
 
 import json
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +29,19 @@ TRACE_FIELDS = (
 
 SUMMARY = "summary.json"  # of a run, next to the traces of its robots
 
+Late = Mapping[tuple[str, str], Mapping[str, Any]]
+
 log = logging.getLogger(__name__)
 
 
 def read_trace(path: Path) -> Iterator[dict[str, Any]]:
     """The fields of each line of a trace."""
     return read_fields(path, TRACE_FIELDS)
+
+
+def late_executions(records: Iterable[Mapping[str, Any]]) -> Late:
+    """The executions that ended after their task's record was written, by task id and site."""
+    return {(one["id"], one["site"]): one for record in records for one in record.get("late", ())}
 
 
 def read_fields(path: Path, names: Sequence[str]) -> Iterator[dict[str, Any]]:

@@ -35,7 +35,7 @@ MEASURED = re.compile(
     )
 )
 CELL = re.compile(rf"[-+]?{NUMBER} ?(?:{UNIT}|times)?")
-CELLS = 2  # so many cells of numbers in one row, one of them with a fraction, make a table of figures
+CELLS = 2  # a table holds figures if a row has two cells with numbers, one of them with a fraction
 COMMIT = re.compile(r"\b(?=[0-9a-f]*\d)(?=[0-9a-f]*[a-f])[0-9a-f]{7,12}\b")
 # What is printed there is no measurement of ours: the published table, and an example worked out by hand.
 ALLOWED = {"docs/evaluation.md": ("The paper's own table", "Twelve rows by hand")}

@@ -25,7 +25,8 @@ from offboard.loadgen.play.machine import machine as this_machine
 from offboard.loadgen.play.stolen_cpu_time import StolenCpuTime
 from offboard.loadgen.table.measured_rows import write_whole
 
-LIMIT_FACTOR, LIMIT_MORE_S = 5.0, 600.0  # a command may take so much longer than the step is expected to
+# A command is ended after LIMIT_FACTOR times the minutes that its step is expected to take, and LIMIT_MORE_S.
+LIMIT_FACTOR, LIMIT_MORE_S = 5.0, 600.0
 END_S = 30.0  # for a command to end after Ctrl-C
 BUILD_S = 3600.0
 OUTPUT_MAX = 1_000_000  # characters

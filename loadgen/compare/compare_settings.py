@@ -17,18 +17,22 @@ from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 SEEDS_MAX = 1000
 JOBS_MAX = 256
 SIMULATION = "simulation"
+NAMES = "NAME,NAME,.."
+POLICIES = (
+    f"policies to play: {rivals.POLICY_HELP}; POLICY@PREDICTOR uses another predictor than its own,"
+    " and POLICY+OBJECTIVE, such as default+mean, decides by another objective than the scenario's"
+)
+OUT = (
+    "folder for the runs, SCENARIO/SEED-POLICY; a finished run of the same software and settings is"
+    " not played again"
+)
 
 
 @dataclass(frozen=True)
-class CompareConfig(ColumnSettings):
-    """What is compared, and where the runs are played."""
+class RunsConfig:
+    """The settings that `compare` and `checks` share: which runs are played, and where."""
 
-    policies: tuple[str, ...] = setting(
-        ("paper", policies.DEFAULT, ONBOARD, CLOUD),
-        f"policies to compare: {rivals.POLICY_HELP}; POLICY@PREDICTOR uses another predictor than its own,"
-        " and POLICY+OBJECTIVE, such as default+mean, decides by another objective than the scenario's",
-        metavar="NAME,NAME,..",
-    )
+    policies: tuple[str, ...] = setting((policies.ALIAS,), POLICIES, metavar=NAMES)
     seeds: int = setting(
         3,
         "number of runs of each policy; the seeds count up from the scenario's seed",
@@ -38,33 +42,12 @@ class CompareConfig(ColumnSettings):
     testbed: str = setting(
         "local", "where to play: in local processes or in Docker containers", choices=tuple(TESTBEDS)
     )
-    out: Path = setting(
-        Path("out/compare"),
-        "folder for the runs, SCENARIO/SEED-POLICY; a finished run of the same software and settings is"
-        " not played again",
-        metavar="DIR",
-    )
-    tasks: int | None = setting(None, "number of tasks (default: as in the scenario)", minimum=1)
-    reference: int | None = setting(
-        None,
-        "run every K-th task again on each site alone (default: as in the scenario); 0: none (faster)",
-        minimum=0,
-    )
-    heartbeats: bool | None = setting(
-        None, "whether the robots send heartbeats (default: as the scenario, or else each policy, says)"
-    )
-    from_task: int = setting(0, "first task that counts, for example the first one after warm-up", minimum=0)
+    out: Path = setting(Path("out/checks"), OUT, metavar="DIR")
     format: str = setting("md", "output format", choices=FORMATS)
-    stolen_max: float | None = setting(
-        None,
-        "play a run again if the host of this virtual machine took more than this share of its CPU time,"
-        f" up to {PLAYS_MAX} times; without it, the table reports the share",
-        minimum=0,
-        maximum=100,
-        metavar="PERCENT",
-    )
     simulate: bool = setting(
-        False, "simulate the runs: virtual time and modelled sites, no processes are started"
+        False,
+        "simulate the runs: virtual time and modelled sites, no processes are started; checks that need real"
+        " processes are left out",
     )
     jobs: int | None = setting(
         None,
@@ -85,13 +68,42 @@ class CompareConfig(ColumnSettings):
             )
         if self.simulate and self.testbed != "local":
             raise ConfigError(f"--testbed: {self.testbed} cannot be combined with --simulate")
-        if self.simulate and self.stolen_max is not None:
-            raise ConfigError(f"--stolen-max: {self.stolen_max:g} cannot be combined with --simulate")
 
     @property
     def where(self) -> str:
         """The testbed that tables name."""
         return SIMULATION if self.simulate else self.testbed
+
+
+@dataclass(frozen=True)
+class CompareConfig(ColumnSettings, RunsConfig):
+    """What is compared, and where the runs are played."""
+
+    policies: tuple[str, ...] = setting(("paper", policies.DEFAULT, ONBOARD, CLOUD), POLICIES, metavar=NAMES)
+    out: Path = setting(Path("out/compare"), OUT, metavar="DIR")
+    tasks: int | None = setting(None, "number of tasks (default: as in the scenario)", minimum=1)
+    reference: int | None = setting(
+        None,
+        "run every K-th task again on each site alone (default: as in the scenario); 0: none (faster)",
+        minimum=0,
+    )
+    heartbeats: bool | None = setting(
+        None, "whether the robots send heartbeats (default: as the scenario, or else each policy, says)"
+    )
+    from_task: int = setting(0, "first task that counts, for example the first one after warm-up", minimum=0)
+    stolen_max: float | None = setting(
+        None,
+        "play a run again if the host of this virtual machine took more than this share of its CPU time,"
+        f" up to {PLAYS_MAX} times; without it, the table reports the share",
+        minimum=0,
+        maximum=100,
+        metavar="PERCENT",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.simulate and self.stolen_max is not None:
+            raise ConfigError(f"--stolen-max: {self.stolen_max:g} cannot be combined with --simulate")
 
 
 def split_strategy(name: str) -> tuple[str, str | None]:

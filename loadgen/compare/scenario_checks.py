@@ -5,17 +5,13 @@
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, make_dataclass
-from pathlib import Path
+from dataclasses import make_dataclass
 from typing import Any
 
-from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError
-from offboard.loadgen import rivals
 from offboard.loadgen.compare.compare import rotated
-from offboard.loadgen.compare.compare_settings import JOBS_MAX, SEEDS_MAX, SIMULATION, split_strategy
+from offboard.loadgen.compare.compare_settings import SIMULATION, RunsConfig, split_strategy
 from offboard.loadgen.compare.resume import play_once
-from offboard.loadgen.play.play_scenario import TESTBEDS
 from offboard.loadgen.progress import progress
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.outcome_figures import FIGURES
@@ -24,53 +20,10 @@ from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import check_calls, find_scenario, read_scenario
 from offboard.loadgen.simulation.simulated_testbed import check_simulated
 from offboard.loadgen.simulation.simulation_pool import SimulationPool
-from offboard.loadgen.table.table_formats import FORMATS, UNDEFINED, Heading, Table, render
-from offboard.robot_client import policies
+from offboard.loadgen.table.table_formats import UNDEFINED, Heading, Table, render
 
 
-@dataclass(frozen=True)
-class ChecksConfig:
-    """What is played, and where."""
-
-    policies: tuple[str, ...] = setting(
-        (policies.ALIAS,),
-        f"policies to judge: {rivals.POLICY_HELP}; POLICY@PREDICTOR uses another predictor than its own",
-        metavar="NAME,NAME,..",
-    )
-    seeds: int = setting(
-        3,
-        "number of runs of each policy; the seeds count up from the scenario's seed",
-        minimum=1,
-        maximum=SEEDS_MAX,
-    )
-    testbed: str = setting(
-        "local", "where to play: in local processes or in Docker containers", choices=tuple(TESTBEDS)
-    )
-    simulate: bool = setting(False, "simulate the runs, and leave out the checks that need real processes")
-    jobs: int | None = setting(
-        None, "with --simulate: number of processes (default: one for each CPU)", minimum=1, maximum=JOBS_MAX
-    )
-    out: Path = setting(
-        Path("out/checks"),
-        "folder for the runs, SCENARIO/SEED-POLICY; a finished run of the same software and settings is"
-        " not played again",
-        metavar="DIR",
-    )
-    format: str = setting("md", "output format", choices=FORMATS)
-
-    def __post_init__(self) -> None:
-        check(self)
-        for policy in self.policies:
-            split_strategy(policy)
-        if len(set(self.policies)) < len(self.policies):
-            raise ConfigError(f"--policies: {','.join(self.policies)}: a policy is named twice")
-        if self.jobs is not None and not self.simulate:
-            raise ConfigError(f"--jobs: {self.jobs} needs --simulate: real runs are played one by one")
-        if self.simulate and self.testbed != "local":
-            raise ConfigError(f"--testbed: {self.testbed} cannot be combined with --simulate")
-
-
-def run_checks(names: Sequence[str], config: ChecksConfig) -> int:
+def run_checks(names: Sequence[str], config: RunsConfig) -> int:
     """Play all scenarios, then print one table for each. A check that fails is a result, not an error."""
     paths = [find_scenario(name) for name in names]
     scenarios = [read_scenario(path) for path in paths]
@@ -88,7 +41,7 @@ def run_checks(names: Sequence[str], config: ChecksConfig) -> int:
     return 0
 
 
-def checks_table(scenario: Scenario, config: ChecksConfig, runs: Mapping[str, Sequence[Outcome]]) -> Table:
+def checks_table(scenario: Scenario, config: RunsConfig, runs: Mapping[str, Sequence[Outcome]]) -> Table:
     """One line for each policy and check: its value in each run, and in how many runs it fails."""
     values = [f"run_{number}" for number in range(1, config.seeds + 1)]
     names = ("policy", "check", *values, "verdict")
@@ -103,11 +56,11 @@ def checks_table(scenario: Scenario, config: ChecksConfig, runs: Mapping[str, Se
     where = f"in {SIMULATION}" if config.simulate else f"on the {config.testbed} testbed"
     seeds = "seed" if config.seeds == 1 else f"seeds {scenario.seed} to"
     caption = f"Checks of {scenario.name} {where}, {seeds} {scenario.seed + config.seeds - 1}."
-    about = {"scenario": scenario.name, "testbed": SIMULATION if config.simulate else config.testbed}
+    about = {"scenario": scenario.name, "testbed": config.where}
     return Table(caption, about, headings, lines)
 
 
-def _judged(scenario: Scenario, config: ChecksConfig) -> list[Check]:
+def _judged(scenario: Scenario, config: RunsConfig) -> list[Check]:
     """Without the checks that need real processes, if the runs are simulated."""
     return [one for one in scenario.checks if not (config.simulate and FIGURES[one.figure].real)]
 
@@ -123,7 +76,7 @@ def _verdict(verdicts: Sequence[Verdict]) -> str:
     return "**fails**" if failed == len(verdicts) else f"**fails** in {failed} of {len(verdicts)}"
 
 
-def _played(scenarios: Sequence[Scenario], config: ChecksConfig) -> list[dict[str, list[Outcome]]]:
+def _played(scenarios: Sequence[Scenario], config: RunsConfig) -> list[dict[str, list[Outcome]]]:
     """The outcomes of real runs by policy, for each scenario. Each policy comes first equally often."""
     found = []
     with progress("runs", len(scenarios) * config.seeds * len(config.policies)) as shown:
@@ -141,7 +94,7 @@ def _played(scenarios: Sequence[Scenario], config: ChecksConfig) -> list[dict[st
     return found
 
 
-def _simulated(scenarios: Sequence[Scenario], config: ChecksConfig) -> list[dict[str, list[Outcome]]]:
+def _simulated(scenarios: Sequence[Scenario], config: RunsConfig) -> list[dict[str, list[Outcome]]]:
     strategies = {policy: _strategy(policy) for policy in config.policies}
     with SimulationPool(config.jobs) as pool:
         return [

@@ -5,16 +5,14 @@ If it was given up earlier, its true time is unknown and it does not count.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from typing import Any
 
 import numpy as np
 
+from offboard.loadgen.robot_files import Late
 from offboard.loadgen.table.measured_rows import Column
-
-Late = Mapping[tuple[str, str], float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,12 +29,6 @@ class Interval:
     held: bool
 
 
-def late_seconds(records: Iterable[Mapping[str, Any]]) -> Late:
-    """(task id, site) -> seconds, for executions that succeeded after their task's record was written."""
-    late = chain.from_iterable(record.get("late", ()) for record in records)
-    return {(one["id"], one["site"]): one["seconds"] for one in late if one["ok"]}
-
-
 def intervals_of(record: Mapping[str, Any], late: Late) -> tuple[Interval, ...]:
     """The intervals of one record's executions.
 
@@ -48,7 +40,8 @@ def intervals_of(record: Mapping[str, Any], late: Late) -> tuple[Interval, ...]:
         low_s, high_s = outlook.get("low_s"), outlook.get("high_s")
         if low_s is None or high_s is None or not outlook["predicted_s"]:
             continue
-        seconds = one["seconds"] if one["ok"] else late.get((record["id"], one["site"]))
+        ended = one if one["ok"] else late.get((record["id"], one["site"]), one)
+        seconds = ended["seconds"] if ended["ok"] else None
         if seconds is None and one["censored"] and one["seconds"] > high_s:
             seconds = math.inf
         if seconds is not None:

@@ -174,8 +174,8 @@ FIGURES: dict[str, Figure] = {
     "quality": Figure("of 1", "mean quality of the variants that answered", _quality),
     "cost": Figure(
         "per task",
-        "what the robot's objective makes small: mean seconds, P95 in seconds, share of late tasks, or mean"
-        " seconds with the worth of joules and megabytes",
+        "what the objective of the robot minimises: the mean time, the P95 of the time, the share of late"
+        " tasks, or the mean time plus the value of joules and megabytes, in seconds",
         _cost,
     ),
     SHARE: Figure(

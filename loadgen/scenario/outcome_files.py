@@ -9,17 +9,17 @@ from pathlib import Path
 from typing import Any
 
 from offboard.common.errors import DataError
-from offboard.loadgen.robot_files import read_trace
-from offboard.loadgen.scenario.interval_coverage import intervals_of, late_seconds
+from offboard.loadgen.robot_files import late_executions, read_trace
+from offboard.loadgen.scenario.interval_coverage import intervals_of
 from offboard.loadgen.scenario.outcome import Answered, Reading, Reference
-from offboard.loadgen.scenario.task_cost import Spent, late_executions, spent_of
+from offboard.loadgen.scenario.task_cost import Spent, spent_of
 from offboard.robot_client.sites.runner import ONBOARD
 
 
 def read_answered(answers: Path, records: Path, robot: str) -> list[Answered]:
     """The answers of one robot, joined with its trace by task id. Without a trace record no site is known."""
     by_id = {record["id"]: record for record in read_trace(records)} if records.is_file() else {}
-    late, ended_late = late_seconds(by_id.values()), late_executions(by_id.values())
+    late = late_executions(by_id.values())
     found = []
     for line in read_lines(answers):
         record = by_id.get(line["id"], {})
@@ -44,7 +44,7 @@ def read_answered(answers: Path, records: Path, robot: str) -> list[Answered]:
                 used=used,
                 probed=is_probed(record) if record else False,
                 quality=record["sites"][used].get("quality") if used else None,
-                spent=spent_of(record, ended_late) if record else Spent(),
+                spent=spent_of(record, late) if record else Spent(),
             )
         )
     return found

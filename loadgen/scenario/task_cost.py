@@ -3,10 +3,11 @@
 What a robot expects before a task is in `robot_client/policies/objectives`.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from offboard.loadgen.robot_files import Late
 from offboard.loadgen.table.measured_rows import Column
 from offboard.loadgen.table.table_two_figures import known_mean, known_quantile
 from offboard.robot_client.policies.energy import Energy
@@ -14,8 +15,6 @@ from offboard.robot_client.policies.objectives import S_PER_QUALITY
 from offboard.robot_client.sites.runner import ONBOARD
 
 P95 = 95  # percent, as the objective `p95`
-
-Late = Mapping[tuple[str, str], Mapping[str, Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,11 +54,6 @@ class Costing:
     def over(self, costs: Column) -> Column:
         """The cost of the tasks in the last axis together: their mean, or their P95. NaN are left out."""
         return known_quantile(costs, P95) if self.objective == "p95" else known_mean(costs)
-
-
-def late_executions(records: Iterable[Mapping[str, Any]]) -> Late:
-    """The executions that ended after their task's record was written, by task id and site."""
-    return {(one["id"], one["site"]): one for record in records for one in record.get("late", ())}
 
 
 def spent_of(record: Mapping[str, Any], late: Late) -> Spent:

@@ -11,12 +11,13 @@ from typing import Any
 
 from offboard.loadgen.robot.run import OwnRecord
 from offboard.loadgen.robot.workload import CLOSED, due_instants
+from offboard.loadgen.robot_files import late_executions
 from offboard.loadgen.scenario.event_timeline import Timeline
-from offboard.loadgen.scenario.interval_coverage import intervals_of, late_seconds
+from offboard.loadgen.scenario.interval_coverage import intervals_of
 from offboard.loadgen.scenario.outcome import Answered, Outcome, Reference
 from offboard.loadgen.scenario.outcome_files import is_probed
 from offboard.loadgen.scenario.scenario import Scenario
-from offboard.loadgen.scenario.task_cost import late_executions, spent_of
+from offboard.loadgen.scenario.task_cost import spent_of
 from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks
 from offboard.loadgen.simulation.model.stepped_offloader import SteppedOffloader
 from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
@@ -174,8 +175,7 @@ class _Run:
 
     def answered(self) -> list[Answered]:
         """All tasks, each with the runs that ended after the task itself."""
-        late = late_seconds(ended.line for ended in self._ended)
-        ended_late = late_executions(ended.line for ended in self._ended)
+        late = late_executions(ended.line for ended in self._ended)
         return [
             Answered(
                 i=ended.number,
@@ -189,7 +189,7 @@ class _Run:
                 sites=tuple(execution["site"] for execution in ended.line["executions"]),
                 intervals=intervals_of(ended.line, late),
                 probed=is_probed(ended.line),
-                spent=spent_of(ended.line, ended_late),
+                spent=spent_of(ended.line, late),
             )
             for ended in self._ended
         ]

@@ -25,7 +25,7 @@ class PredictionErrors:
     """How wrong the last predictions for one site were; a value that never changes.
 
     `scores`: the error of each prediction in units of `unit_s`, sorted. `usual_s`: the usual time of a task.
-    `stopped`: the same of late runs that were stopped, mostly because a hedge answered first: at least this.
+    `stopped`: the errors so far of late runs that were stopped, mostly because a hedge answered first.
     The methods return None while fewer than ERRORS_MIN errors are known, unless a spread helps.
     """
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from offboard.loadgen.robot_files import late_executions
 from offboard.loadgen.scenario.interval_coverage import (
     Interval,
     interval_columns,
     interval_figures,
     intervals_of,
-    late_seconds,
 )
 
 SITES = {
@@ -45,7 +45,7 @@ def test_a_late_execution_counts_with_its_true_time() -> None:
     """An overtaken execution counts with the time that a later record reports for it."""
     overtaken = record("cloud", 0.01, ok=False, censored=True)
     late = [{"id": "a-1", "site": "cloud", "seconds": 0.09, "ok": True, "censored": False}]
-    (found,) = intervals_of(overtaken, late_seconds([overtaken, record("onboard", 0.2, late=late)]))
+    (found,) = intervals_of(overtaken, late_executions([overtaken, record("onboard", 0.2, late=late)]))
     assert found.held
     assert (found.width_s, found.error_s) == (pytest.approx(0.05), pytest.approx(-0.01))
 

@@ -11,11 +11,12 @@ from offboard.common.errors import ConfigError
 from offboard.loadgen.compare.compare_settings import CompareConfig
 from offboard.loadgen.compare.comparison_table import comparison_table
 from offboard.loadgen.play.part_setups import setups
+from offboard.loadgen.robot_files import late_executions
 from offboard.loadgen.scenario.outcome import Answered, Outcome
 from offboard.loadgen.scenario.outcome_figures import FIGURES
 from offboard.loadgen.scenario.scenario import RobotPart, Scenario, Workload
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
-from offboard.loadgen.scenario.task_cost import Costing, Spent, late_executions, spent_of
+from offboard.loadgen.scenario.task_cost import Costing, Spent, spent_of
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.objectives import Deadline, Mean, Tail, TimeAndSpending
 
