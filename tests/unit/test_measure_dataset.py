@@ -28,7 +28,8 @@ def test_exported_rows_are_read_back_exactly(tmp_path: Path) -> None:
     trace = Trace(tmp_path / "trace.jsonl")
     for i in range(5):
         sites = {"onboard": 0.1 + i / 3, "cloud": 0.2 + i / 7} if i != 2 else {"onboard": 0.1}
-        executions = tuple(Execution(site, seconds) for site, seconds in sites.items())
+        moved = {"cloud": {"bytes_out": 90 + i, "bytes_in": 10}}
+        executions = tuple(Execution(site, s, **moved.get(site, {})) for site, s in sites.items())
         decision = Decision("onboard", "", "pinned", both=len(sites) > 1)
         trace.write(Record(i, str(i), "plan", i / 9, {}, decision, executions, "onboard", 0.1))
     trace.close()

@@ -204,14 +204,15 @@ def test_the_wait_for_the_cpu_is_learnt() -> None:
     assert outlook(one, ONBOARD).predicted_s == pytest.approx(0.7)
 
 
-def test_bytes_and_joules_are_the_usual_ones() -> None:
-    """Bytes are a running mean; joules come from CPU time onboard, and from bytes on a server."""
+def test_bytes_are_those_of_the_task_and_of_the_usual_answer() -> None:
+    """Bytes to send are those of the task itself, and bytes of answers a mean; joules come from both."""
     one = memory()
-    for bytes_out in (100, 300):
-        learn(one, Execution(CLOUD, 0.2, bytes_out=bytes_out, bytes_in=50))
-    found = outlook(one)
-    assert found.bytes == 250.0
-    assert found.joules == pytest.approx(250 * Energy().radio_j_byte)
+    for bytes_in in (40, 60):
+        learn(one, Execution(CLOUD, 0.2, bytes_out=100, bytes_in=bytes_in))
+    for bytes_out in (100, 700):
+        found = outlook(one, bytes_out=bytes_out)
+        assert found.bytes == bytes_out + 50
+        assert found.joules == pytest.approx((bytes_out + 50) * Energy().radio_j_byte)
     learn(one, Execution(ONBOARD, 0.5, cpu_s=0.4))
     assert outlook(one, ONBOARD).joules == pytest.approx(0.4 * Energy().compute_w)
     assert math.isfinite(outlook(one, ONBOARD).cost or 0.0)
