@@ -37,7 +37,7 @@ except ImportError as error:
 CONNECTIONS_A_S, CONNECTIONS_AT_ONCE = 100, 512  # new connections per second, and at once
 STALL_S = 2.0  # a turn of the server's loop takes at most 0.5 s
 STOP_S = 2.0
-LOOKS_A_STREAM = 8  # then the page asks again: `bounded_http` ends a request that takes 10 s
+LOOKS_A_STREAM = 6  # at most; then the page asks again: `bounded_http` ends a request that takes 10 s
 TICKS, UVICORN_TICK_S = 5, 0.1  # five of uvicorn's ten ticks per second are done at once
 
 
@@ -118,12 +118,12 @@ def add_looks(app: FastAPI, live: Source) -> None:
     app.state.closing = False
 
     async def send(looks: Generator[Look]) -> AsyncIterator[bytes]:
+        loop = asyncio.get_running_loop()
+        end_s = loop.time() + LOOKS_A_STREAM * EVERY_S  # on a busy machine, a look takes longer than EVERY_S
         with viewers.one(looks):
-            for _ in range(LOOKS_A_STREAM):
+            while loop.time() < end_s and not app.state.closing:
                 yield encode(next(looks))
                 await asyncio.sleep(EVERY_S)
-                if app.state.closing:
-                    return
 
     @app.get(LOOKS, include_in_schema=False)  # a stream, which takes seconds to end
     async def looks() -> Response:

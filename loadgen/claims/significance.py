@@ -5,9 +5,12 @@ The test is the t-test of Pearson's r, two-sided. It takes the rows for independ
 
 import math
 from collections.abc import Iterator
+from importlib import import_module
+from types import ModuleType
 
 import numpy as np
 
+from offboard.common.errors import MissingExtra
 from offboard.loadgen.claims.claim import (
     POSITIVE,
     Claim,
@@ -29,9 +32,6 @@ CLAIM = 1
 P_MAX = 0.005  # of the paper
 SHARE_MIN = 95.0  # per cent of the windows in which r must be significant
 TESTED_MIN = 3  # rows; two points always lie on a line
-HALVINGS = 60  # of the range in which the smallest significant r is; more would change no digit
-STEPS_MAX = 10_000  # of the continued fraction; for a million rows it takes a tenth of that
-CONVERGED = 1e-15  # the continued fraction ends when a step changes it less
 
 
 def significance(rows: Rows, config: ClaimsConfig) -> Iterator[Claim]:
@@ -54,16 +54,20 @@ def p_value(r: float, rows: int) -> float:
     """
     if rows < TESTED_MIN:
         return 1.0
-    return _beta(max(0.0, 1 - r * r), (rows - 2) / 2, 0.5)
+    return float(_special().betainc((rows - 2) / 2, 0.5, max(0.0, 1 - r * r)))
 
 
 def smallest_significant_r(rows: int, p: float = P_MAX) -> float:
-    """The r whose p-value is `p`, by halving."""
-    low, high = 0.0, 1.0
-    for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        low, high = (low, middle) if p_value(middle, rows) <= p else (middle, high)
-    return high
+    """The r whose p-value is `p`."""
+    return math.sqrt(1 - _special().betaincinv((rows - 2) / 2, 0.5, p))
+
+
+def _special() -> ModuleType:
+    """scipy.special, which takes long to import and is needed by `loadgen claims` alone."""
+    try:
+        return import_module("scipy.special")
+    except ImportError as error:
+        raise MissingExtra("loadgen claims", "learned") from error
 
 
 def _all_rows(rows: Rows, config: ClaimsConfig, site: str) -> Iterator[Claim]:
@@ -100,30 +104,3 @@ def _their_r(window: str, site: str) -> float | None:
     return next(
         (getattr(score, f"r_{site}") for score in published_table_two.SCORES if score.window == window), None
     )
-
-
-def _beta(x: float, a: float, b: float) -> float:
-    """The regularised incomplete beta function I(x; a, b)."""
-    if x <= 0 or x >= 1:
-        return float(x >= 1)
-    if x > (a + 1) / (a + b + 2):  # where the fraction converges slowly
-        return 1 - _beta(1 - x, b, a)
-    log = math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b) + a * math.log(x) + b * math.log1p(-x)
-    return math.exp(log) / (a * _fraction(x, a, b))
-
-
-def _fraction(x: float, a: float, b: float) -> float:
-    """1 + d1 / (1 + d2 / (1 + ..)), the continued fraction DLMF 8.17.22, by Lentz's method."""
-    value, up, down = 1.0, 1.0, 0.0
-    for step in range(1, STEPS_MAX):
-        m, odd = divmod(step, 2)
-        if odd:
-            term = -(a + m) * (a + b + m) * x / ((a + 2 * m) * (a + 2 * m + 1))
-        else:
-            term = m * (b - m) * x / ((a + 2 * m - 1) * (a + 2 * m))
-        down = 1 / (1 + term * down)
-        up = 1 + term / up
-        value *= up * down
-        if abs(up * down - 1) < CONVERGED:
-            break
-    return value

@@ -1,11 +1,14 @@
 """The commit of measured figures: that of the code, whatever happens to files that no measurement needs."""
 
+import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
 
 from offboard.loadgen.play.code_commit import changed_code, commit_here
+
+pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="no git; remedy: apt-get install git")
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+import offboard
 from benchmarks.figures.__main__ import main
 from benchmarks.figures.markdown_tables import joined, notes_of, tables_of
 from benchmarks.figures.measured import OTHER_ROWS, Measured, measure, read_all, why_old
@@ -32,6 +33,10 @@ SPEED = """\
 
 - calm: 1.25, at most 2: holds
 """
+needs_checkout = pytest.mark.skipif(
+    not Path(offboard.__file__).is_relative_to(ROOT),
+    reason="Python runs an installed offboard; figures are measured of this checkout",
+)
 MEASURED = Measured(
     commit="abc1234",
     date="2026-11-26",
@@ -244,6 +249,7 @@ def test_a_file_survives_writing_and_reading(tmp_path: Path) -> None:
         Measured.read(tmp_path / "broken.json")
 
 
+@needs_checkout
 def test_what_a_command_prints_is_kept_with_its_machine() -> None:
     """The output of all commands is, with the commands, the commit and the Python that ran them."""
     commands = ("python -c 'print(\"| a |\")'", "python -c 'print(2 + 2)'")
@@ -255,6 +261,7 @@ def test_what_a_command_prints_is_kept_with_its_machine() -> None:
     assert measured.seconds >= 0
 
 
+@needs_checkout
 def test_finished_runs_are_used_at_the_same_commit_only() -> None:
     """The folder of a step is emptied for another commit, for other commands, and if asked for."""
     code = (
@@ -279,6 +286,7 @@ def test_no_step_shares_its_folder() -> None:
     assert [one for unit in UNITS for one in unit.step.copies if not one.startswith("{out}/")] == []
 
 
+@needs_checkout
 @pytest.mark.parametrize(
     ("command", "said"),
     [

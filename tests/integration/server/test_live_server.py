@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
 import httpx
@@ -12,12 +12,21 @@ import pytest
 from offboard.cloud_server.http_api import LOOKS_A_STREAM, HttpServer, create_app
 from offboard.cloud_server.metrics import ServerLive
 from offboard.common.live.live_files import LOOKS, PATHS
-from offboard.common.live.look import EVERY_S, VIEWERS_MAX
+from offboard.common.live.look import EVERY_S, VIEWERS_MAX, Look
 from tests.integration.server.peers import WAIT_S, Join, Running, Serve
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
 
 TOKEN = "a-token-of-the-tests"
+
+
+class SlowLive(ServerLive):
+    """Each look takes 0.8 s, as on a busy machine."""
+
+    def looks(self) -> Generator[Look]:
+        for look in super().looks():
+            time.sleep(0.8)
+            yield look
 
 
 @pytest.fixture
@@ -93,6 +102,19 @@ def test_a_stream_ends_cleanly_before_its_connection_is_cut(web: tuple[Running, 
     begun = time.monotonic()
     assert len(looks(address, LOOKS_A_STREAM + 1)) == LOOKS_A_STREAM
     assert time.monotonic() - begun < LOOKS_A_STREAM * EVERY_S + 1.5
+
+
+def test_a_stream_with_slow_looks_ends_before_its_connection_is_cut(serve: Serve) -> None:
+    """A busy machine makes each look late; the answer is complete all the same."""
+    running = serve()
+    live = SlowLive(running.metrics, running.server.status, running.server.robots, workers=1)
+    app = create_app(running.server.status, running.metrics.registry, {}, token=TOKEN, live=live)
+    http = HttpServer(app, ("127.0.0.1", 0))
+    http.start()
+    try:
+        assert 0 < len(looks(f"http://{http.address}", LOOKS_A_STREAM + 1)) < LOOKS_A_STREAM
+    finally:
+        http.close()
 
 
 def test_viewers_of_a_server_are_limited(web: tuple[Running, str]) -> None:
