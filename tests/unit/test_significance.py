@@ -9,7 +9,6 @@ from offboard.loadgen.claims.claims_settings import ClaimsConfig
 from offboard.loadgen.claims.significance import P_MAX, p_value, significance, smallest_significant_r
 from offboard.loadgen.table.measured_rows import Rows
 
-
 pytestmark = pytest.mark.skipif(find_spec("scipy") is None, reason="needs the extra 'learned'")
 
 
