@@ -8,7 +8,6 @@ from offboard.common.errors import ConfigError
 from offboard.loadgen import rivals
 from offboard.loadgen.compare.resume import PLAYS_MAX
 from offboard.loadgen.play.play_scenario import TESTBEDS
-from offboard.loadgen.scenario.scenario import split_objective
 from offboard.loadgen.table.table_columns import ColumnSettings
 from offboard.loadgen.table.table_formats import FORMATS
 from offboard.robot_client import policies
@@ -112,7 +111,7 @@ def split_strategy(name: str) -> tuple[str, str | None]:
     None: the predictor that the policy brings.
     """
     policy, at, predictor = name.partition("@")
-    rivals.policy(split_objective(policy, "--policies")[0], "--policies")
+    rivals.policy(rivals.split_objective(policy, "--policies")[0], "--policies")
     if at:
         rivals.predictor(predictor, "--policies")
     return policy, predictor if at else None

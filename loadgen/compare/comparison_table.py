@@ -21,7 +21,7 @@ from offboard.loadgen.table.confidence_intervals import BOUNDS, Blocks, Picks, p
 from offboard.loadgen.table.measured_rows import Column
 from offboard.loadgen.table.table_formats import Heading, Table
 from offboard.loadgen.table.table_two_figures import known_mean, quantile
-from offboard.robot_client.policies.objectives import OBJECTIVES
+from offboard.robot_client.policies.objectives import MEAN
 from offboard.robot_client.sites.runner import CLOUD
 
 
@@ -126,7 +126,7 @@ def comparison_table(
         " Below each policy are the bounds of its 95 % intervals, from blocks of neighbouring tasks."
     )
     about = {"scenario": scenario.name, "testbed": config.where, "seeds": config.seeds}
-    columns = FIRST if scenario.robot.objective == OBJECTIVES[0] else BY_COST
+    columns = FIRST if scenario.robot.objective == MEAN else BY_COST
     return Table(caption=caption, about=about, headings=HEADINGS, lines=lines, first=columns)
 
 

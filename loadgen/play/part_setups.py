@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from offboard.loadgen.play.run_files import PICTURE, ROBOT_SEED_STEP, RobotFiles, link_file
-from offboard.loadgen.robot.decision_settings import MEAN
 from offboard.loadgen.scenario.event_timeline import absent_at_first
 from offboard.loadgen.scenario.scenario import SPENDING, Scenario, Workload
 from offboard.loadgen.testbed.testbed import ROBOT, Setup, relay_of
+from offboard.robot_client.policies.objectives import MEAN
 
 PLANNER = "offboard.common.planning.planner"
 ABSENT_CONNECT_S = 2.0  # that a robot waits for its servers if some are not there at first

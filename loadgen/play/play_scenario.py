@@ -194,6 +194,7 @@ def write_summary(out: Path, played: Played, about: Mapping[str, Any]) -> None:
         "policy": scenario.robot.policy,
         "predictor": scenario.robot.predictor,
         "window": scenario.robot.window,
+        "decided_by": scenario.decided_by(),
         "tasks": scenario.workload.tasks * scenario.workload.robots,
         "software": VERSION,
         **about,

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from offboard.common.config import check, setting
-from offboard.common.errors import DataError
+from offboard.common.errors import ConfigError, DataError
 from offboard.loadgen import rivals
 from offboard.loadgen.progress import progress
 from offboard.loadgen.replay import same_decisions
 from offboard.loadgen.replay.dataset_file import measured_tasks, read_recorded
 from offboard.loadgen.replay.recorded_tasks import RecordedTask
-from offboard.loadgen.replay.settings_of_run import settings_of_run
+from offboard.loadgen.replay.settings_of_run import DecidedBy, settings_of_run
 from offboard.loadgen.replay.virtual_robot import VirtualRobot
 from offboard.loadgen.table import confidence_intervals, table_two_figures
 from offboard.loadgen.table.confidence_intervals import Picks
@@ -30,12 +30,14 @@ from offboard.loadgen.table.table_two_figures import Scored, Sides
 from offboard.robot_client import policies
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.policies import Policy
+from offboard.robot_client.policies.objectives import MEAN, Mean
 from offboard.robot_client.predictors.window import WINDOW, WINDOW_MAX
 from offboard.robot_client.settings import Settings
 
 ORACLE = "oracle"
 RECORDED = "as recorded"
 OWN = "each policy's own"
+OF_NO_RUN = DecidedBy()
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,10 @@ class ReplayConfig(MeasuredTimesConfig):
     """Which policies to replay, and with which predictor."""
 
     policies: tuple[str, ...] = setting(
-        (*rivals.RULES, policies.DEFAULT), f"policies to replay: {rivals.POLICY_HELP}", metavar="NAME,NAME,.."
+        (*rivals.RULES, policies.DEFAULT),
+        f"policies to replay: {rivals.POLICY_HELP}; POLICY+OBJECTIVE, such as default+p95, decides by another"
+        " objective than the run",
+        metavar="NAME,NAME,..",
     )
     predictor: str | None = setting(
         None,
@@ -58,11 +63,12 @@ class ReplayConfig(MeasuredTimesConfig):
         minimum=2,
         maximum=WINDOW_MAX,
     )
+    decided_by: DecidedBy = OF_NO_RUN
 
     def __post_init__(self) -> None:
         check(self)
         for policy in self.policies:
-            rivals.policy(policy, "--policies")
+            rivals.policy(rivals.split_objective(policy, "--policies")[0], "--policies")
         if self.predictor is not None:
             rivals.predictor(self.predictor, "--predictor")
 
@@ -72,9 +78,23 @@ class ReplayConfig(MeasuredTimesConfig):
         return WINDOW if self.window is None else self.window
 
     def as_in_the_run(self, path: Path) -> "ReplayConfig":
-        """With the window and the predictor of the run of this trace, unless the user gave them."""
+        """With the objective of the run of this trace, and with its window and predictor if none are given.
+
+        ConfigError if a policy has an objective that needs what the run does not say.
+        """
         run = settings_of_run(path)
-        return replace(self, window=self.window or run.window, predictor=self.predictor or run.predictor)
+        for policy in self.policies:
+            objective = rivals.split_objective(policy, "--policies")[1]
+            try:
+                run.decided_by.make(objective)
+            except ConfigError as error:
+                raise ConfigError(f"--policies: {policy!r}: {error} in the summary of the run") from None
+        return replace(
+            self,
+            window=self.window or run.window,
+            predictor=self.predictor or run.predictor,
+            decided_by=run.decided_by,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,9 +189,10 @@ def replay(
     window: int,
     feedback: str,
     seed: int = 1,
+    decided_by: DecidedBy = OF_NO_RUN,
 ) -> Replayed:
-    """Replay the policy with this name; without a `predictor` it uses its own."""
-    chosen, memories = _made(policy, predictor=predictor, window=window, seed=seed)
+    """Replay the policy with this name, POLICY or POLICY+OBJECTIVE; without a `predictor` it uses its own."""
+    chosen, memories = _made(policy, predictor=predictor, window=window, seed=seed, decided_by=decided_by)
     return replay_policy(tasks, chosen, memories=memories, window=window, feedback=feedback)
 
 
@@ -201,17 +222,31 @@ def _same_percent(run: Sequence[RecordedTask], policy: str, config: ReplayConfig
     """The share of the run's decisions that this policy makes too."""
 
     def robot(sites: Sequence[str]) -> VirtualRobot:
-        made = _made(policy, predictor=config.predictor, window=config.length, seed=config.seed)
+        made = _made(
+            policy,
+            predictor=config.predictor,
+            window=config.length,
+            seed=config.seed,
+            decided_by=config.decided_by,
+        )
         return VirtualRobot(*made, tells_work=_tell_work(run), sites=sites)
 
     return same_decisions.same_percent(same_decisions.compare(run, robot))
 
 
-def _made(policy: str, *, predictor: str | None, window: int, seed: int) -> tuple[Policy, Memories]:
+def _made(
+    policy: str, *, predictor: str | None, window: int, seed: int, decided_by: DecidedBy
+) -> tuple[Policy, Memories]:
     """The policy with this name, and what it knows of its tasks at first: nothing."""
+    policy, objective = rivals.split_objective(policy, "policy")
     name = rivals.policy(policy)
-    learnt_with = None if predictor is None else rivals.predictor(predictor)
-    settings = Settings(predictor=learnt_with, window=window, seed=seed)
+    settings = Settings(
+        predictor=None if predictor is None else rivals.predictor(predictor),
+        window=window,
+        objective=decided_by.make(objective) if policies.weighs_cost(name) else Mean(),
+        energy=decided_by.energy,
+        seed=seed,
+    )
     return policies.make(name, seed), settings.make_memories(name)
 
 
@@ -227,7 +262,9 @@ def _about(config: ReplayConfig, asked: ReplayConfig) -> str:
         if getattr(config, name) != getattr(asked, name)
     }
     predictor, window = of_run.get("predictor", ""), of_run.get("window", "")
-    return f"predictor {config.predictor or OWN}{predictor}, window {config.length}{window}"
+    objective = config.decided_by.objective
+    weighed = "" if objective == MEAN else f", objective {objective} of the run"
+    return f"predictor {config.predictor or OWN}{predictor}, window {config.length}{window}{weighed}"
 
 
 def _table(
@@ -290,6 +327,7 @@ def _lines(
             window=config.length,
             feedback=feedback,
             seed=config.seed,
+            decided_by=config.decided_by,
         )
     sent = Scored(scored.onboard_s, scored.cloud_s, played.to_cloud)
     yield replace(line, scored=len(scored), **table_two_figures.plain(_figures(sent, played)))

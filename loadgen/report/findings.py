@@ -30,7 +30,7 @@ class Findings:
     def __init__(self, source: Path, table: TableConfig, replay: ReplayConfig) -> None:
         self._source = source
         self._table = table
-        self.settings = replay
+        self.settings = replay.as_in_the_run(source)
         self.lived = read_lived(source, replay.kind)
         self.rows = read_noted(source, replay.kind, least=0 if len(self.lived.waited_s) else 1)
         self.scored = self.rows.since(replay.length)
@@ -113,6 +113,7 @@ class Findings:
                 window=settings.length,
                 feedback=settings.feedback,
                 seed=settings.seed,
+                decided_by=settings.decided_by,
             )
             for policy in settings.policies
         }

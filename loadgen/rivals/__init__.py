@@ -4,7 +4,9 @@ A robot knows them only by the path of their class, as it knows the classes of a
 """
 
 from offboard.common.class_path import MODULE_CLASS
+from offboard.common.errors import ConfigError
 from offboard.robot_client import policies, predictors
+from offboard.robot_client.policies.objectives import OBJECTIVES
 from offboard.robot_client.predictors import Predictor
 
 _HOME = "offboard.loadgen.rivals"
@@ -47,6 +49,21 @@ def policy(name: str, where: str = "policy") -> str:
     known = f"{wrappers}{colon}{_HOME}.{_RULES[rule]}" if rule in _RULES else name
     policies.check_name(known, where, POLICY_HELP)
     return known
+
+
+def split_objective(name: str, where: str) -> tuple[str, str | None]:
+    """The policy and the objective of POLICY or POLICY+OBJECTIVE; None: no objective is named.
+
+    ConfigError if the policy weighs no costs; `where` names the flag or the key.
+    """
+    chosen, plus, objective = name.partition("+")
+    if not plus:
+        return chosen, None
+    if objective not in OBJECTIVES:
+        raise ConfigError(f"{where}: {name!r}: {objective!r} is not one of {', '.join(OBJECTIVES)}")
+    if not policies.weighs_cost(policy(chosen, where)):
+        raise ConfigError(f"{where}: {name!r}: an objective changes nothing with {chosen}")
+    return chosen, objective
 
 
 def make(name: str, window: int, seed: int = 0) -> Predictor:

@@ -9,12 +9,11 @@ from offboard.robot_client import policies, predictors
 from offboard.robot_client.policies import objectives
 from offboard.robot_client.policies.allowance import DUPLICATES
 from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.objectives import OBJECTIVES, S_PER_QUALITY
+from offboard.robot_client.policies.objectives import MEAN, OBJECTIVES, S_PER_QUALITY
 from offboard.robot_client.predictors.window import WINDOW
 from offboard.robot_client.settings import Settings
 
 DECISIONS, OBJECTIVE, LIMITS = "decisions", "objective", "limits"
-MEAN = OBJECTIVES[0]
 # The objectives that each setting belongs to; the first one cannot do without it.
 USED_BY = {
     "deadline_s": ("deadline",),

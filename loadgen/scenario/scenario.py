@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from offboard.common.variants import IN_GROUP
 from offboard.loadgen import rivals
 from offboard.loadgen.relay.link.link_settings import LinkFlags
 from offboard.loadgen.robot.config import CallConfig, DriveConfig, RobotConfig
-from offboard.loadgen.robot.decision_settings import MEAN, USED_BY
+from offboard.loadgen.robot.decision_settings import USED_BY
 from offboard.loadgen.robot.workload import ARRIVALS
 from offboard.loadgen.scenario.event_timeline import AT_TASK_MAX, Event
 from offboard.loadgen.scenario.outcome_figures import FIGURES
@@ -27,7 +27,7 @@ from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, relay_of
 from offboard.robot_client import policies
 from offboard.robot_client.policies import BOTH, objectives
 from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.objectives import OBJECTIVES, Objective
+from offboard.robot_client.policies.objectives import MEAN, OBJECTIVES, Objective
 from offboard.robot_client.sites.runner import ONBOARD
 
 ROBOTS_MAX = 64
@@ -164,7 +164,7 @@ class RobotPart:
     @property
     def decides_by(self) -> str:
         """The objective of the policy; mean for a policy that weighs no costs."""
-        policy, objective = split_objective(self.policy, "robot.policy")
+        policy, objective = rivals.split_objective(self.policy, "robot.policy")
         own = self.objective if policies.weighs_cost(rivals.policy(policy)) else MEAN
         return own if objective is None else objective
 
@@ -173,7 +173,7 @@ class RobotPart:
 
     def names(self) -> tuple[str, str | None]:
         """Policy and predictor, by the names that a robot knows."""
-        policy = rivals.policy(split_objective(self.policy, "robot.policy")[0], "robot.policy")
+        policy = rivals.policy(rivals.split_objective(self.policy, "robot.policy")[0], "robot.policy")
         if self.predictor is None:
             return policy, None
         return policy, rivals.predictor(self.predictor, "robot.predictor")
@@ -249,6 +249,17 @@ class Scenario:
             s_per_joule=robot.s_per_joule if name in SPENDING else None,
             s_per_megabyte=robot.s_per_megabyte if name in SPENDING else None,
         )
+
+    def decided_by(self) -> dict[str, Any]:
+        """The objective of the policy, with all that it may need; `summary.json` has it for a replay."""
+        robot = self.robot
+        return {
+            "objective": robot.decides_by,
+            "deadline_s": self.workload.deadline_s,
+            "s_per_joule": robot.s_per_joule,
+            "s_per_megabyte": robot.s_per_megabyte,
+            **asdict(robot.energy()),
+        }
 
     def costing(self) -> Costing:
         """The price of a task by the objective of the scenario, whatever the policy makes small."""
@@ -336,21 +347,6 @@ class Scenario:
             robot=robot,
             checks=checks,
         )
-
-
-def split_objective(name: str, where: str) -> tuple[str, str | None]:
-    """The policy and the objective of POLICY or POLICY+OBJECTIVE; None: that of the scenario.
-
-    ConfigError if the policy weighs no costs; `where` names the flag or the key.
-    """
-    policy, plus, objective = name.partition("+")
-    if not plus:
-        return policy, None
-    if objective not in OBJECTIVES:
-        raise ConfigError(f"{where}: {name!r}: {objective!r} is not one of {', '.join(OBJECTIVES)}")
-    if not policies.weighs_cost(rivals.policy(policy, where)):
-        raise ConfigError(f"{where}: {name!r}: an objective changes nothing with {policy}")
-    return policy, objective
 
 
 def check_servers(servers: Sequence[CloudPart]) -> None:

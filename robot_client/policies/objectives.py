@@ -98,7 +98,7 @@ def by_deadline(forecast: Forecast, deadline_s: float) -> Forecast:
     return forecast._replace(sites=sites)
 
 
-OBJECTIVES = ("mean", "p95", "deadline", "energy", "metered")
+OBJECTIVES = (MEAN := "mean", "p95", "deadline", "energy", "metered")
 
 
 def make(

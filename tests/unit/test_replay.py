@@ -252,6 +252,15 @@ def test_window_and_predictor_are_those_of_the_run(
     assert f"{own}, window 50, feedback" in caption()
 
 
+def test_an_objective_that_the_run_cannot_weigh_is_an_error(tmp_path: Path) -> None:
+    """A deadline is known only if the run had one, and a rule without costs has no objective."""
+    path = trace_of(tmp_path, *(("paper", "onboard", {"onboard": 0.1, "cloud": 0.2}, 0.1) for _ in range(40)))
+    with pytest.raises(ConfigError, match=r"--policies: 'default\+deadline': .* in the summary of the run"):
+        run_replay(path, ReplayConfig(policies=("default+deadline",)))
+    with pytest.raises(ConfigError, match="an objective changes nothing with paper"):
+        ReplayConfig(policies=("paper+p95",))
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -260,6 +269,17 @@ def test_window_and_predictor_are_those_of_the_run(
         ('{"window": 1}', r"summary\.json: window: 1 is not a whole number from 2 to"),
         ('{"window": "many"}', r"summary\.json: window: 'many' is not a whole number"),
         ('{"predictor": "crystal"}', r"summary\.json: predictor: .*crystal"),
+        ('{"decided_by": 3}', r"summary\.json: no summary of a run: 'int'"),
+        (
+            '{"decided_by": {"objective": "luck"}}',
+            r"decided_by: objective 'luck' is not one of",
+        ),
+        (
+            '{"decided_by": {"objective": "deadline"}}',
+            r"decided_by: objective 'deadline' needs",
+        ),
+        ('{"decided_by": {"luck": 1}}', r"summary\.json: decided_by: .*luck"),
+        ('{"decided_by": {"idle_w": -1}}', r"summary\.json: decided_by: .*idle-w"),
     ],
 )
 def test_a_wrong_summary_is_an_error(tmp_path: Path, text: str, expected: str) -> None:

@@ -1,5 +1,6 @@
 """Replay against the run, task by task: the policy of the run decides as it did there."""
 
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -44,6 +45,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
         trace = Trace(path)
         simulate(scenario, known[name, seed], trace=trace)
         trace.close()
+        path.with_name("summary.json").write_text(json.dumps({"decided_by": scenario.decided_by()}))
         return path
 
     return factory
@@ -62,6 +64,14 @@ def same_percent(path: Path, policy: str) -> float:
 def test_the_policy_of_the_run_decides_as_in_the_run(simulated: Simulated, name: str, policy: str) -> None:
     """At least 99 % of the decisions are equal: site, second site and when it starts."""
     assert same_percent(simulated(name, policy), policy) >= 99
+
+
+@pytest.mark.parametrize("name", ["deadline", "p95", "battery", "metered"])
+def test_the_objective_of_the_run_decides_as_in_the_run(simulated: Simulated, name: str) -> None:
+    """A replay weighs what the run weighed; with POLICY+OBJECTIVE, it decides otherwise."""
+    path = simulated(name, "default")
+    assert same_percent(path, "default") >= 99
+    assert same_percent(path, "default+mean") < same_percent(path, "default") - 3
 
 
 def test_another_policy_decides_otherwise(simulated: Simulated) -> None:
