@@ -1,6 +1,7 @@
 """The figures of the docs: every page shows what the files of `make figures` hold, and no other figure."""
 
 import json
+import os
 import platform
 import shlex
 import sys
@@ -9,10 +10,9 @@ from pathlib import Path
 
 import pytest
 
-import offboard
 from benchmarks.figures.__main__ import main
 from benchmarks.figures.markdown_tables import joined, notes_of, tables_of
-from benchmarks.figures.measured import OTHER_ROWS, Measured, measure, read_all, why_old
+from benchmarks.figures.measured import OTHER_ROWS, Measured, machine_of, measure, read_all, why_old
 from benchmarks.figures.page import doubled_titles, filled, pages, results
 from benchmarks.figures.step import FOLDER, ROOT, STEPS, Section, Step, Unit, read_sections, units_of
 from offboard.common.errors import DataError, OffloadError
@@ -33,10 +33,6 @@ SPEED = """\
 
 - calm: 1.25, at most 2: holds
 """
-needs_checkout = pytest.mark.skipif(
-    not Path(offboard.__file__).is_relative_to(ROOT),
-    reason="Python runs an installed offboard; figures are measured of this checkout",
-)
 MEASURED = Measured(
     commit="abc1234",
     date="2026-11-26",
@@ -52,6 +48,15 @@ MEASURED = Measured(
 def step(**changed: object) -> Step:
     about = {"section": "S", "name": "speed", "title": "Speed", "about": "How fast.", "minutes": 1}
     return Step(**({"run": ("python -m speed",)} | about | changed))  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def checkout() -> None:
+    """Skips where Python runs an installed offboard, as in the image: figures are measured of a checkout."""
+    try:
+        machine_of({**os.environ, "PATH": f"{Path(sys.prefix, 'bin')}:{os.environ['PATH']}"})
+    except OffloadError as error:
+        pytest.skip(str(error))
 
 
 def test_every_page_shows_what_the_files_hold() -> None:
@@ -249,7 +254,7 @@ def test_a_file_survives_writing_and_reading(tmp_path: Path) -> None:
         Measured.read(tmp_path / "broken.json")
 
 
-@needs_checkout
+@pytest.mark.usefixtures("checkout")
 def test_what_a_command_prints_is_kept_with_its_machine() -> None:
     """The output of all commands is, with the commands, the commit and the Python that ran them."""
     commands = ("python -c 'print(\"| a |\")'", "python -c 'print(2 + 2)'")
@@ -261,7 +266,7 @@ def test_what_a_command_prints_is_kept_with_its_machine() -> None:
     assert measured.seconds >= 0
 
 
-@needs_checkout
+@pytest.mark.usefixtures("checkout")
 def test_finished_runs_are_used_at_the_same_commit_only() -> None:
     """The folder of a step is emptied for another commit, for other commands, and if asked for."""
     code = (
@@ -286,7 +291,7 @@ def test_no_step_shares_its_folder() -> None:
     assert [one for unit in UNITS for one in unit.step.copies if not one.startswith("{out}/")] == []
 
 
-@needs_checkout
+@pytest.mark.usefixtures("checkout")
 @pytest.mark.parametrize(
     ("command", "said"),
     [
