@@ -175,7 +175,7 @@ def _dataset(argv: Sequence[str]) -> int:
     from offboard.loadgen.play.measure_dataset import DatasetConfig, run_dataset
 
     parser = _parser("dataset", "SCENARIO")
-    help = "TOML file, or a shipped scenario: paper, congested, registration"
+    help = "TOML file, or a shipped scenario: paper, congested, apriltags"
     parser.add_argument("scenario", metavar="SCENARIO", help=help)
     add_flags(parser, DatasetConfig, PREFIX)
     flags = parser.parse_args(argv)

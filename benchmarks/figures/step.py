@@ -23,7 +23,7 @@ STEPS = FOLDER / "steps.toml"
 PART = "{part}"  # in a command: the name of the part
 OUT = "{out}"  # in a command: the folder that belongs to the step or part
 WORK = Path("out/figures/work")
-DATASETS = ("paper", "congested", "registration")  # in the order of the page
+DATASETS = ("paper", "congested", "apriltags")  # in the order of the page
 SOAK = "soak"  # half an hour: `make chaos` plays it
 
 
