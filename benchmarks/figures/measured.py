@@ -32,7 +32,7 @@ BUILD_S = 3600.0
 OUTPUT_MAX = 1_000_000  # characters
 SAID_LINES = 3  # of a command that failed
 LOGS = Path("out/figures")
-OTHER_ROWS = "of rows that were measured again since"
+OTHER_FILES = "of rows or scenarios that have changed since"
 
 
 @dataclass(frozen=True)
@@ -106,11 +106,11 @@ def why_old(unit: Unit, measured: Measured | None, commit: str) -> str:
         return f"of commit {measured.commit}"
     if list(measured.commands) != unit.commands():
         return "of other commands"
-    return OTHER_ROWS if of_other_rows(unit, measured) else ""
+    return OTHER_FILES if of_other_files(unit, measured) else ""
 
 
-def of_other_rows(unit: Unit, measured: Measured) -> bool:
-    """Whether the rows that a step read have changed since."""
+def of_other_files(unit: Unit, measured: Measured) -> bool:
+    """Whether rows or scenarios that a step read have changed since."""
     try:
         now = {name: about["sha256"] for name, about in unit.reads(ROOT).items()}
     except OffloadError:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from benchmarks.figures.markdown_tables import MarkdownTable, blocks_of, first_table, joined, notes_of
-from benchmarks.figures.measured import OTHER_ROWS, Measured, of_other_rows
+from benchmarks.figures.measured import OTHER_FILES, Measured, of_other_files
 from benchmarks.figures.step import Section, Step, Unit, units_of
 from offboard.common.errors import DataError
 from offboard.loadgen.table.table_columns import WIDTH
@@ -120,8 +120,8 @@ def _commits(sections: Sequence[Section], files: Mapping[str, Measured]) -> Iter
     commit = max((one for _, one in there), key=lambda one: one.date).commit
     same, others = [], dict[str, list[Unit]]()
     for unit, one in there:
-        if of_other_rows(unit, one):
-            others.setdefault(OTHER_ROWS, []).append(unit)
+        if of_other_files(unit, one):
+            others.setdefault(OTHER_FILES, []).append(unit)
         elif one.commit != commit:
             others.setdefault(f"of commit {one.commit}", []).append(unit)
         else:
@@ -213,7 +213,11 @@ def _conditions(there: Mapping[Unit, Measured]) -> Iterator[str]:
 
 def _where(one: Measured) -> str:
     of = one.machine
-    rows = [f"rows of {Path(name).name} of commit {about['commit']}" for name, about in one.reads.items()]
+    rows = [
+        f"rows of {Path(name).name} of commit {about['commit']}"
+        for name, about in one.reads.items()
+        if "commit" in about
+    ]
     return (
         f"{one.commit}, {{}}; {of['cpu']}, {of['cores']} cores, {of['memory_gib']} GiB, "
         f"{of['kernel']}, Python {of['python']}{''.join(f'; {each}' for each in rows)}."

@@ -23,6 +23,7 @@ STEPS = FOLDER / "steps.toml"
 PART = "{part}"  # in a command: the name of the part
 OUT = "{out}"  # in a command: the folder that belongs to the step or part
 WORK = Path("out/figures/work")
+SCENARIOS = Path("loadgen/scenarios")
 DATASETS = ("paper", "congested", "apriltags")  # in the order of the page
 SOAK = "soak"  # half an hour: `make chaos` plays it
 
@@ -39,7 +40,8 @@ class Step:
     - `brackets`: ends of intervals are shown in brackets; `pivot`: the heading whose cells become the columns
       of the shown table, and the heading of the cells in it
     - `environment`, `ready`: where the commands are, and the files that make builds first
-    - `reads`: files of measured rows; a step is measured again if they change
+    - `reads`: files of measured rows, and `scenarios`: names or patterns of scenarios; a step is
+      measured again if one of them changes
     - `copies`: pictures that go from the folder of the run to the docs
     - `plain`: the output is no Markdown; `first_table`: the page shows only the first table of it
     """
@@ -58,6 +60,7 @@ class Step:
     ready: tuple[str, ...] = ()
     needs: str = ""
     reads: tuple[str, ...] = ()
+    scenarios: tuple[str, ...] = ()
     copies: Mapping[str, str] = field(default_factory=dict)
     plain: bool = False
     first_table: bool = False
@@ -95,19 +98,26 @@ class Unit:
         return {Path(self._named(a)): Path(self._named(b)) for a, b in self.step.copies.items()}
 
     def reads(self, root: Path) -> dict[str, dict[str, str]]:
-        """The digest of each file of rows, and the commit at which the rows were measured."""
-        found = {}
+        """The digest of each scenario and file of rows, and the commit at which the rows were measured."""
+        found = {name: {"sha256": _digest(root / name)} for name in self._scenarios(root)}
         for name in map(self._named, self.step.reads):
             path = root / name
             if not path.is_file():
                 raise OffloadError(f"{name} is missing: measure it first")
-            digest, about = hashlib.sha256(path.read_bytes()).hexdigest(), path.with_suffix(".json")
+            about = path.with_suffix(".json")
             try:
                 commit = json.loads(about.read_text()).get("commit")
             except (OSError, ValueError, AttributeError) as error:
                 raise DataError(f"{about}: does not tell how {path.name} was measured: {error}") from None
-            found[name] = {"sha256": digest, "commit": str(commit or "unknown")}
+            found[name] = {"sha256": _digest(path), "commit": str(commit or "unknown")}
         return found
+
+    def _scenarios(self, root: Path) -> Iterator[str]:
+        for pattern in map(self._named, self.step.scenarios):
+            paths = sorted((root / SCENARIOS).glob(f"{pattern}.toml"))
+            if not paths:
+                raise OffloadError(f"{STEPS}: {self.name}: there is no scenario {pattern}")
+            yield from (path.relative_to(root).as_posix() for path in paths)
 
     def _named(self, text: str) -> str:
         return text.replace(PART, self.part).replace(OUT, str(self.work))
@@ -158,6 +168,10 @@ def _step(section: str, table: Mapping[str, Any]) -> Step:
         values["parts"] = PARTS[parts]()
     values["about"] = values["about"].strip()
     return Step(section=section, **values)
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def checked_scenarios(*, applications: bool = False) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ NOT_CODE = (  # as patterns of git, from the root of the checkout
     "tests/r[!o]*",
     "*.md",
     "loadgen/datasets",
+    "loadgen/scenarios",  # a measurement keeps the digest of those that it needs
     "benchmarks/capacity.json",
     "benchmarks/figures",  # it runs the measurements, and writes the pages
     ".ci",

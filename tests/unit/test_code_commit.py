@@ -35,7 +35,15 @@ def commit(name: str, text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["docs/figures/a.json", "docs/page.md", "README.md", "tests/unit/test_a.py", "tests/ray/a.py"]
+    "name",
+    [
+        "docs/figures/a.json",
+        "docs/page.md",
+        "README.md",
+        "tests/unit/test_a.py",
+        "tests/ray/a.py",
+        "loadgen/scenarios/a.toml",
+    ],
 )
 def test_files_that_no_measurement_needs_do_not_change_it(checkout: Path, name: str) -> None:
     """Neither a commit of such a file, nor a change of it."""

@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks.figures.__main__ import main
 from benchmarks.figures.markdown_tables import joined, notes_of, tables_of
-from benchmarks.figures.measured import OTHER_ROWS, Measured, machine_of, measure, read_all, why_old
+from benchmarks.figures.measured import OTHER_FILES, Measured, machine_of, measure, read_all, why_old
 from benchmarks.figures.page import doubled_titles, filled, pages, results
 from benchmarks.figures.step import FOLDER, ROOT, STEPS, Section, Step, Unit, read_sections, units_of
 from offboard.common.errors import DataError, OffloadError
@@ -150,9 +150,9 @@ def test_the_page_names_tables_of_other_rows_than_those_of_the_checkout() -> Non
     now = replace(MEASURED, reads=unit.reads(ROOT), commands=unit.commands())
     before = replace(now, reads={"loadgen/datasets/paper.csv": {"sha256": "0", "commit": "def5678"}})
     assert why_old(unit, now, "abc1234") == ""
-    assert why_old(unit, before, "abc1234") == OTHER_ROWS
+    assert why_old(unit, before, "abc1234") == OTHER_FILES
     page = results([Section("S", "", (unit.step,))], {unit.name: before})
-    assert "Of rows that were measured again since:\n\n- [Table II on our own datasets]" in page
+    assert "Of rows or scenarios that have changed since:\n\n- [Table II on our own datasets]" in page
     assert "rows of paper.csv of commit def5678" in page
 
 
@@ -225,7 +225,29 @@ def test_rows_without_their_machine_are_one_line(tmp_path: Path, about: str | No
     unit = Unit(step(reads=(str(tmp_path / "rows.csv"),)))
     with pytest.raises(DataError, match=r"rows.json: does not tell how rows.csv was measured"):
         unit.reads(tmp_path)
-    assert why_old(unit, MEASURED, "abc1234") == OTHER_ROWS
+    assert why_old(unit, MEASURED, "abc1234") == OTHER_FILES
+
+
+def test_a_changed_scenario_makes_a_figure_old(tmp_path: Path) -> None:
+    """Scenarios are no code: only the steps that play one are measured again."""
+    path = tmp_path / "loadgen" / "scenarios" / "calm.toml"
+    path.parent.mkdir(parents=True)
+    path.write_text("seed = 1")
+    plays, unit = Unit(step(scenarios=("{part}",)), "calm"), Unit(step(scenarios=("c*",)))
+    before = plays.reads(tmp_path)
+    assert list(before) == ["loadgen/scenarios/calm.toml"]
+    assert unit.reads(tmp_path) == before
+    path.write_text("seed = 2")
+    assert plays.reads(tmp_path) != before
+    with pytest.raises(OffloadError, match="there is no scenario storm"):
+        Unit(step(scenarios=("{part}",)), "storm").reads(tmp_path)
+
+
+@pytest.mark.parametrize("unit", [next(step.units()) for one in SECTIONS for step in one.steps])
+def test_a_step_that_plays_scenarios_reads_them(unit: Unit) -> None:
+    """No step with `loadgen compare`, `checks` or `dataset` was forgotten."""
+    if any(command.split()[1] in ("compare", "checks", "dataset") for command in unit.commands()):
+        assert f"loadgen/scenarios/{unit.part}.toml" in unit.reads(ROOT)
 
 
 def test_a_step_whose_text_is_a_number_is_one_line(tmp_path: Path) -> None:
