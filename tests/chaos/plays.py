@@ -22,7 +22,7 @@ BROKEN = ["dead-robot", "lying-cloud"] if ALL else ["dead-robot"]  # broken part
 IN_CONTAINERS = SHORT if ALL else ["cloud-busy"]
 ON_LOOPBACK = SHORT if ALL else []  # WRONG and HELD already play some there
 # Short ones: a dead spot, stalls, load, a slow link, an objective, several servers.
-HELD = ["outage", "heavy-tail", "robot-busy", "bandwidth", "deadline", "edge-and-cloud"]
+HELD = ["outage", "heavy-tail", "robot-busy", "bandwidth", "deadline", "cloud-restart"]
 SOAK_TASKS = 400  # 20 seconds
 LEAK_TASKS = 600
 
