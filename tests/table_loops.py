@@ -134,8 +134,8 @@ def csv_of(rows: list[Line]) -> str:
 
 
 def rows_of(text: str) -> list[Line]:
-    _, *lines = csv.reader(io.StringIO(text))
-    return [(float(d), float(onboard), float(cloud)) for d, onboard, cloud in lines]
+    lines = csv.DictReader(io.StringIO(text))
+    return [(float(one["size"]), float(one["onboard_s"]), float(one["cloud_s"])) for one in lines]
 
 
 def lines_of(markdown: str) -> list[list[str]]:
