@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from offboard.loadgen.play.run_files import PICTURE, ROBOT_SEED_STEP, RobotFiles, link_file
+from offboard.loadgen.robot.decision_settings import USED_BY
 from offboard.loadgen.scenario.event_timeline import absent_at_first
-from offboard.loadgen.scenario.scenario import SPENDING, Scenario, Workload
+from offboard.loadgen.scenario.scenario import Scenario, Workload
 from offboard.loadgen.testbed.testbed import ROBOT, Setup, relay_of
 from offboard.robot_client.policies.objectives import MEAN
 
@@ -83,7 +84,7 @@ def _objective_flags(scenario: Scenario) -> Mapping[str, Any]:
     flags: dict[str, Any] = {"objective": name}
     if name == "deadline":
         return flags | {"deadline": costing.deadline_s}
-    if name in SPENDING:
+    if name in USED_BY["s_per_joule"]:
         weights = {"s_per_joule": robot.s_per_joule, "s_per_megabyte": robot.s_per_megabyte}
         watts = {"compute_watts": robot.compute_watts, "idle_watts": robot.idle_watts}
         flags |= {**weights, **watts, "radio_joules_byte": robot.radio_joules_byte}

@@ -37,7 +37,6 @@ from offboard.robot_client.settings import Settings
 ORACLE = "oracle"
 RECORDED = "as recorded"
 OWN = "each policy's own"
-OF_NO_RUN = DecidedBy()
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ class ReplayConfig(MeasuredTimesConfig):
         minimum=2,
         maximum=WINDOW_MAX,
     )
-    decided_by: DecidedBy = OF_NO_RUN
+    decided_by: DecidedBy = DecidedBy()
 
     def __post_init__(self) -> None:
         check(self)
@@ -181,19 +180,10 @@ def tables(path: Path, config: ReplayConfig) -> list[Table]:
     ]
 
 
-def replay(
-    tasks: Sequence[RecordedTask],
-    policy: str,
-    *,
-    predictor: str | None,
-    window: int,
-    feedback: str,
-    seed: int = 1,
-    decided_by: DecidedBy = OF_NO_RUN,
-) -> Replayed:
-    """Replay the policy with this name, POLICY or POLICY+OBJECTIVE; without a `predictor` it uses its own."""
-    chosen, memories = _made(policy, predictor=predictor, window=window, seed=seed, decided_by=decided_by)
-    return replay_policy(tasks, chosen, memories=memories, window=window, feedback=feedback)
+def replay(tasks: Sequence[RecordedTask], policy: str, config: ReplayConfig, *, feedback: str) -> Replayed:
+    """Replay the policy with this name, POLICY or POLICY+OBJECTIVE."""
+    chosen, memories = _made(policy, config)
+    return replay_policy(tasks, chosen, memories=memories, window=config.length, feedback=feedback)
 
 
 def replay_policy(
@@ -222,32 +212,26 @@ def _same_percent(run: Sequence[RecordedTask], policy: str, config: ReplayConfig
     """The share of the run's decisions that this policy makes too."""
 
     def robot(sites: Sequence[str]) -> VirtualRobot:
-        made = _made(
-            policy,
-            predictor=config.predictor,
-            window=config.length,
-            seed=config.seed,
-            decided_by=config.decided_by,
-        )
-        return VirtualRobot(*made, tells_work=_tell_work(run), sites=sites)
+        return VirtualRobot(*_made(policy, config), tells_work=_tell_work(run), sites=sites)
 
     return same_decisions.same_percent(same_decisions.compare(run, robot))
 
 
-def _made(
-    policy: str, *, predictor: str | None, window: int, seed: int, decided_by: DecidedBy
-) -> tuple[Policy, Memories]:
-    """The policy with this name, and what it knows of its tasks at first: nothing."""
+def _made(policy: str, config: ReplayConfig) -> tuple[Policy, Memories]:
+    """The policy with this name, and what it knows of its tasks at first: nothing.
+
+    Without a predictor in the settings, it has its own.
+    """
     policy, objective = rivals.split_objective(policy, "policy")
     name = rivals.policy(policy)
     settings = Settings(
-        predictor=None if predictor is None else rivals.predictor(predictor),
-        window=window,
-        objective=decided_by.make(objective) if policies.weighs_cost(name) else Mean(),
-        energy=decided_by.energy,
-        seed=seed,
+        predictor=None if config.predictor is None else rivals.predictor(config.predictor),
+        window=config.length,
+        objective=config.decided_by.make(objective) if policies.weighs_cost(name) else Mean(),
+        energy=config.decided_by.energy,
+        seed=config.seed,
     )
-    return policies.make(name, seed), settings.make_memories(name)
+    return policies.make(name, config.seed), settings.make_memories(name)
 
 
 def _tell_work(tasks: Sequence[RecordedTask]) -> bool:
@@ -317,18 +301,7 @@ def _lines(
         yield replace(line, note=f"cannot be replayed: {both}")
         return
     scored = rows.since(config.length)
-    if policy == ORACLE:
-        played = best(scored)
-    else:
-        played = replay(
-            tasks,
-            policy,
-            predictor=config.predictor,
-            window=config.length,
-            feedback=feedback,
-            seed=config.seed,
-            decided_by=config.decided_by,
-        )
+    played = best(scored) if policy == ORACLE else replay(tasks, policy, config, feedback=feedback)
     sent = Scored(scored.onboard_s, scored.cloud_s, played.to_cloud)
     yield replace(line, scored=len(scored), **table_two_figures.plain(_figures(sent, played)))
     if config.bootstrap:

@@ -106,15 +106,7 @@ class Findings:
         settings = self.settings
         tasks = measured_tasks(read_recorded(self._source, settings.kind))
         return {
-            policy: replay.replay(
-                tasks,
-                policy,
-                predictor=settings.predictor,
-                window=settings.length,
-                feedback=settings.feedback,
-                seed=settings.seed,
-                decided_by=settings.decided_by,
-            )
+            policy: replay.replay(tasks, policy, settings, feedback=settings.feedback)
             for policy in settings.policies
         }
 

@@ -32,7 +32,6 @@ from offboard.robot_client.sites.runner import ONBOARD
 
 ROBOTS_MAX = 64
 SERVERS_MAX = 16
-SPENDING = ("energy", "metered")  # objectives that weigh joules and megabytes
 
 
 @dataclass(frozen=True)
@@ -246,8 +245,8 @@ class Scenario:
         return objectives.make(
             name,
             deadline_s=deadline_s,
-            s_per_joule=robot.s_per_joule if name in SPENDING else None,
-            s_per_megabyte=robot.s_per_megabyte if name in SPENDING else None,
+            s_per_joule=robot.s_per_joule,
+            s_per_megabyte=robot.s_per_megabyte,
         )
 
     def decided_by(self) -> dict[str, Any]:

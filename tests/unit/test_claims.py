@@ -5,7 +5,6 @@ import re
 import sys
 import time
 from collections.abc import Callable
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +21,6 @@ from offboard.loadgen.claims.several_inputs import _filled, read_inputs
 from offboard.loadgen.table.measured_rows import Rows
 from offboard.loadgen.table.table_formats import UNDEFINED
 from tests.table_loops import THOUSAND, csv_of, lines_of
-
-pytestmark = pytest.mark.skipif(find_spec("scipy") is None, reason="needs the extra 'learned'")
 
 ROWS = THOUSAND[:300]
 QUICK = ("least-squares", "huber")

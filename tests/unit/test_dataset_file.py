@@ -10,7 +10,7 @@ from offboard.common.errors import DataError
 from offboard.loadgen.export.export import ExportConfig, run_export
 from offboard.loadgen.replay.dataset_file import COLUMNS, measured_tasks, read_dataset, write_dataset
 from offboard.loadgen.replay.recorded_tasks import RecordedTask, read_tasks
-from offboard.loadgen.replay.replay import replay
+from offboard.loadgen.replay.replay import ReplayConfig, replay
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.simulation.model.simulated_tasks import find_tasks
 from offboard.loadgen.simulation.simulated_run import simulate
@@ -143,7 +143,7 @@ def test_a_dataset_is_replayed_as_its_trace(trace: Path, tmp_path: Path, policy:
     """The same policy makes the same decisions of both, so every task takes equally long."""
     assert run_export(trace, ExportConfig(csv=tmp_path / "d.csv")) == 0
     found = [
-        replay(tasks, policy, predictor=None, window=WINDOW, feedback=feedback)
+        replay(tasks, policy, ReplayConfig(window=WINDOW), feedback=feedback)
         for tasks in (measured_tasks(read_tasks(trace, None)), read_dataset(tmp_path / "d.csv"))
     ]
     assert len(found[0].spent_s) == len(read(trace)) - WINDOW > 100
@@ -158,7 +158,7 @@ def test_the_columns_change_what_a_policy_decides(trace: Path, tmp_path: Path) -
     assert all(task.work is not None for task in tasks)
     bare = of_rows(read(tmp_path / "d.csv"))
     whole_s, bare_s = (
-        replay(given, "greedy", predictor=None, window=WINDOW, feedback="chosen").spent_s.mean()
+        replay(given, "greedy", ReplayConfig(window=WINDOW), feedback="chosen").spent_s.mean()
         for given in (tasks, bare)
     )
     assert whole_s < bare_s

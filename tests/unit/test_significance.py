@@ -1,20 +1,16 @@
 """Claim 1: the p-value of Pearson's r, and which windows are significant."""
 
-from importlib.util import find_spec
-
 import numpy as np
 import pytest
+from scipy import stats
 
 from offboard.loadgen.claims.claims_settings import ClaimsConfig
 from offboard.loadgen.claims.significance import P_MAX, p_value, significance, smallest_significant_r
 from offboard.loadgen.table.measured_rows import Rows
 
-pytestmark = pytest.mark.skipif(find_spec("scipy") is None, reason="needs the extra 'learned'")
-
 
 def test_known_p_values() -> None:
     """That of scipy's own test of r; three rows: p is an arctangent; two rows say nothing."""
-    stats = pytest.importorskip("scipy.stats")
     size, seconds = np.random.default_rng(5).normal(size=(2, 40))
     tested = stats.pearsonr(size, seconds)
     assert p_value(tested.statistic, 40) == pytest.approx(tested.pvalue, rel=1e-9)

@@ -105,7 +105,7 @@ def test_a_task_may_not_tell_its_work(caplog: pytest.LogCaptureFixture) -> None:
         RecordedTask(1.0, {site: Execution(site, 0.1, work) for site in (ONBOARD, CLOUD)})
         for work in (5.0, None) * 10
     ]
-    found = replay(tasks, "greedy", predictor=None, window=4, feedback="chosen")
+    found = replay(tasks, "greedy", ReplayConfig(window=4), feedback="chosen")
     assert len(found.spent_s) == 16
     assert caplog.text == ""
 
@@ -143,8 +143,6 @@ def test_probes_and_hedges_change_the_figures(tmp_path: Path) -> None:
 def test_a_second_run_never_answers_later_than_the_first() -> None:
     """With hedges, no task of this dataset takes longer than on the site that it was sent to."""
     rows = stalls()
-    found = replay(
-        of_rows(rows), "hedge:greedy", predictor=None, window=20, feedback="chosen", seed=1
-    ).spent_s
+    found = replay(of_rows(rows), "hedge:greedy", ReplayConfig(window=20), feedback="chosen").spent_s
     assert (found <= np.maximum(rows.onboard_s, rows.cloud_s)[20:] + 1e-9).all()
     assert found.max() < 1.0
