@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -104,6 +105,15 @@ def test_nothing_is_kept_if_the_code_changes_meanwhile(checkout: Path) -> None:
     assert (checkout / "docs" / "a.svg").exists()
 
 
+@pytest.fixture
+def heard() -> Iterator[None]:
+    """A hang-up is not ignored, as it is when the tests run under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.usefixtures("heard")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_the_command_under_way(checkout: Path, number: signal.Signals) -> None:
     """No process of it is left, and the exit code is 130. Until then, a second call is refused."""
