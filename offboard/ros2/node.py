@@ -6,7 +6,7 @@ It replaces nav2's `planner_server`: same action, same topics, same parameters. 
 
 import contextlib
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -185,6 +185,21 @@ class _Placed:
     orientation: Any
 
 
+@contextlib.contextmanager
+def until_shutdown() -> Iterator[None]:
+    """The end of ROS, by a signal or a shutdown, ends this block without an error.
+
+    rclpy shuts its context down in another thread. If that thread is between two steps of `spin`, rclpy
+    raises an RCLError (a RuntimeError) instead of ExternalShutdownException (ros2cli#854).
+    """
+    try:
+        with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
+            yield
+    except RuntimeError:
+        if rclpy.ok():
+            raise
+
+
 def serve(offload: Offloader, facts: Diagnostics, arguments: Sequence[str]) -> None:
     """Run the node until it is interrupted. `arguments` are those for ROS."""
     rclpy.init(args=list(arguments))
@@ -196,7 +211,7 @@ def serve(offload: Offloader, facts: Diagnostics, arguments: Sequence[str]) -> N
         try:
             served = PlannerNode(node, executor, topics, parameters)
             executor.add_node(served.node)
-            with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
+            with until_shutdown():
                 executor.spin()
         finally:
             topics.close()

@@ -1,17 +1,16 @@
 """A perception node as a user writes it: image in, detection out, and the work of the callback offloaded."""
 
-import contextlib
 import sys
 
 import rclpy
 from geometry_msgs.msg import PointStamped
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image
 
 from offboard import Offloader
 from offboard.ros2 import image_array
+from offboard.ros2.node import until_shutdown
 from tests.ros2.spots import brightest_spot
 
 
@@ -33,5 +32,5 @@ class Detector(Node):
 
 
 rclpy.init()
-with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
+with until_shutdown():
     rclpy.spin(Detector(sys.argv[1]))
