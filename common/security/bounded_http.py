@@ -9,25 +9,26 @@ from typing import Any
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-REQUEST_S = 10.0  # to send a request and to receive its answer
+REQUEST_S = 10.0  # to begin a request; then, to send the rest of it and to receive its answer
 CONNECTIONS_MAX = 256  # open at the same time
 
 
 class BoundedHttp(H11Protocol):
     """uvicorn's HTTP protocol, hardened against clients that send and read very slowly (Slowloris).
 
-    It closes a connection on which no request was answered for REQUEST_S. Beyond CONNECTIONS_MAX it closes
-    the connection that has been silent for the longest time.
+    It closes a connection that is silent for REQUEST_S, and one whose request has no answer within REQUEST_S
+    from its first byte. Beyond CONNECTIONS_MAX it closes the connection with the oldest request.
     """
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self._limit: asyncio.TimerHandle | None = None
         self._since = 0.0
+        self._silent = True  # no byte of the next request has come
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
-        self._await_request()
+        self._limit_time()
         if len(self.connections) > CONNECTIONS_MAX:
             self._most_silent().end()
 
@@ -36,8 +37,15 @@ class BoundedHttp(H11Protocol):
             self._limit.cancel()
         super().connection_lost(exc)
 
+    def data_received(self, data: bytes) -> None:
+        if self._silent:
+            self._silent = False
+            self._limit_time()
+        super().data_received(data)
+
     def on_response_complete(self) -> None:
-        self._await_request()
+        self._silent = True
+        self._limit_time()
         super().on_response_complete()
 
     def send_400_response(self, msg: str) -> None:
@@ -53,7 +61,7 @@ class BoundedHttp(H11Protocol):
         self.connections.discard(self)
         self.transport.abort()
 
-    def _await_request(self) -> None:
+    def _limit_time(self) -> None:
         self._since = self.loop.time()
         if self._limit is not None:
             self._limit.cancel()

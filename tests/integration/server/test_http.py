@@ -1,7 +1,11 @@
 """The HTTP side of the server, and addresses that are in use."""
 
+import socket
 import threading
+import time
+from contextlib import closing
 from dataclasses import replace
+from http.client import HTTPResponse
 
 import httpx
 import numpy as np
@@ -12,6 +16,7 @@ from offboard.cloud_server.metrics import Metrics, Status
 from offboard.cloud_server.server import Limits, Server
 from offboard.common import VERSION
 from offboard.common.errors import ConfigError
+from offboard.common.security import bounded_http
 from tests.integration.server.peers import WAIT_S, Join, Serve
 
 pytestmark = pytest.mark.integration
@@ -65,3 +70,34 @@ def test_a_port_in_use_is_a_config_error(serve: Serve) -> None:
     with pytest.raises(ConfigError, match=f"--http: 127.0.0.1:{port} cannot be bound: Address"):
         HttpServer(create_app(running.server.status, running.metrics.registry, {}), ("127.0.0.1", port))
     first.close()
+
+
+def status_of(connection: socket.socket) -> int:
+    """The status of the next answer, which is read to its end."""
+    answer = HTTPResponse(connection)
+    answer.begin()
+    answer.read()
+    return answer.status
+
+
+def test_a_request_has_its_full_time_on_a_connection_that_was_silent(
+    serve: Serve, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The limit counts from its first byte, not from the start of the connection or from the last answer."""
+    monkeypatch.setattr(bounded_http, "REQUEST_S", 4.0)
+    running = serve()
+    app = create_app(running.server.status, running.metrics.registry, {})
+    with closing(HttpServer(app, ("127.0.0.1", 0))) as web:
+        web.start()
+        port = int(web.address.rpartition(":")[2])
+        new, used = (socket.create_connection(("127.0.0.1", port), timeout=WAIT_S) for _ in range(2))
+        with new, used:
+            used.sendall(b"GET /health HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            assert status_of(used) == 200
+            time.sleep(2.5)
+            for one in (new, used):
+                one.sendall(b"GET /health HTTP/1.1\r\n")
+            time.sleep(2.5)
+            for one in (new, used):
+                one.sendall(b"Host: localhost\r\n\r\n")
+                assert status_of(one) == 200
