@@ -26,17 +26,17 @@ from offboard.robot_client.execution.choice import check_where, decided, pinned,
 from offboard.robot_client.execution.crossing_check import CrossingCheck
 from offboard.robot_client.execution.race import answer_of
 from offboard.robot_client.learning.forecaster import Forecaster
-from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.learner import Learner, PendingTask
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.learning.runs_in_flight import Flights
 from offboard.robot_client.learning.savings import Savings
 from offboard.robot_client.lifetime import Lifetime
-from offboard.robot_client.policies import BOTH, Decision, Forecast, Policy
+from offboard.robot_client.policies import BOTH, Forecast, Policy
 from offboard.robot_client.policies.allowance import Allowance
+from offboard.robot_client.policies.deadline import by_deadline
+from offboard.robot_client.policies.decision import pairs
 from offboard.robot_client.policies.expectation import Expectation, expectations, missed
 from offboard.robot_client.policies.forecast import finishes_of
-from offboard.robot_client.policies.objectives import by_deadline
 from offboard.robot_client.policies.observe import Observe
 from offboard.robot_client.records.recording import Recording, record_of, tell
 from offboard.robot_client.records.trace import Record
@@ -78,7 +78,7 @@ class Offloader:
         sites = self._sites = runners if isinstance(runners, PresentSites) else PresentSites(runners)
         if BOTH in sites:
             raise ConfigError(f"a site cannot be named {BOTH!r}: where={BOTH!r} means all sites")
-        self._policy, self._memories = policy, memories
+        self._policy, self._memories, self._pairs = policy, memories, pairs(policy)
         self._observes = isinstance(policy, Observe)
         self._allowance = allowance or Allowance()
         self._timeout_s = checked_timeout(timeout_s)
@@ -248,7 +248,10 @@ class Offloader:
             memory, now_s = self._memories.of(kind, runners), self._clock.now_s()
             sites = present_sites(runners, absent)
             forecast = self._forecaster.forecast(memory, task, sites, timeout_s=self._timeout_s, now_s=now_s)
-        return expectations(forecast, absent, deadline_s)
+            if deadline_s is not None:
+                slowest_s = memory.slowest_onboard_s(task.size) if self._pairs else None
+                forecast = by_deadline(forecast, deadline_s, slowest_s=slowest_s)
+        return expectations(forecast, absent)
 
     def savings(self) -> dict[str, Savings | None]:
         """With `observe`: what offloading would have saved, by name of the task; None while it is unknown."""
@@ -289,10 +292,15 @@ class Offloader:
         """The answer to one task; DeadlineMissed if there is none after `deadline_s`."""
         pending = self._begin(task, where, budget_s, deadline_s=deadline_s)
         until_s = pending.started_s + deadline_s
+        answered = pending.answered = Future()
         call = self._life.call_beside(partial(self._finish, pending))
-        self._clock.wait([call], max(0.0, until_s - self._clock.now_s()))
-        if call.done() and self._clock.now_s() <= until_s:
-            return call.result()[0]
+        self._clock.wait([answered, call], max(0.0, until_s - self._clock.now_s()))
+        if call.done() and not answered.done():
+            call.result()  # the error that kept it from an answer
+        if answered.done():
+            answer, answered_s = answered.result()
+            if answered_s <= until_s:
+                return answer
         self._life.leave(call)
         raise missed(task.kind.name, deadline_s, pending.forecast, pending.absent)
 
@@ -321,9 +329,19 @@ class Offloader:
             )
             if self._sites.changing:
                 self._sites.count_task(finishes_of(forecast), started_s)
-            if deadline_s is not None:
-                forecast = by_deadline(forecast, deadline_s)
-            decision = self._decide(memory, forecast, where, absent=absent, placed=placed)
+            within_s = self._memories.deadline_s if deadline_s is None else deadline_s
+            if within_s is not None:
+                paired = self._pairs and where is None and placed is None
+                slowest_s = memory.slowest_onboard_s(task.size) if paired else None
+                forecast = by_deadline(forecast, within_s, slowest_s=slowest_s)
+            if where is not None:
+                check_where(where, task.kind, runners, changing=self._sites.changing)
+                decision = pinned(where, forecast)
+            else:
+                known, policy = memory.observations, placed or self._policy
+                decision = decided(policy, forecast, task.kind, absent=absent, known=known)
+                if placed is None and decision.site != memory.last_site:
+                    memory.move_to(decision.site, decision.reason)
             amount = memory.amount(task.size)
         return PendingTask(
             task=task,
@@ -342,31 +360,13 @@ class Offloader:
             deadline_s=deadline_s,
         )
 
-    def _decide(
-        self,
-        memory: KindMemory,
-        forecast: Forecast,
-        where: str | None,
-        *,
-        absent: Mapping[str, str],
-        placed: Placed | None,
-    ) -> Decision:
-        if where is not None:
-            check_where(where, memory.kind, self._sites, changing=self._sites.changing)
-            return pinned(where, forecast)
-        decision = decided(
-            placed or self._policy, forecast, memory.kind, absent=absent, known=memory.observations
-        )
-        if placed is None and decision.site != memory.last_site:
-            memory.move_to(decision.site, decision.reason)
-        return decision
-
     def _finish(self, pending: PendingTask) -> tuple[Execution, Record]:
         """Execute, learn, record."""
         return self._end(pending, self._runs.execute(pending))
 
     def _end(self, pending: PendingTask, executions: tuple[Execution, ...]) -> tuple[Execution, Record]:
         task, answer = pending.task, answer_of(executions, pending.task.kind)
+        answered_s = self._clock.now_s()
         with self._lock:
             self._runs.learn(pending, executions)
             if not self._life.closed and self._memories.due(self._clock.now_s()):
@@ -378,6 +378,8 @@ class Offloader:
         record = self.last = record_of(
             pending, executions, answer, ended_s=ended_s, late=late, regret=regret, savings=saved
         )
+        if pending.answered is not None:  # the caller does not wait for observers
+            pending.answered.set_result((answer, answered_s))
         tell(self._observers, record)
         if len(executions) > 1:
             self._crossing.hear(task.kind, executions)

@@ -14,7 +14,7 @@ from offboard.robot_client.execution.race import Plan, Race, result_of
 from offboard.robot_client.learning.learner import Learner, PendingTask
 from offboard.robot_client.learning.runs_in_flight import Flights
 from offboard.robot_client.lifetime import Lifetime
-from offboard.robot_client.policies import PINNED
+from offboard.robot_client.policies import PINNED, Hedge
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.records.trace import Late
 from offboard.robot_client.sites.clock import Clock
@@ -73,6 +73,9 @@ class TaskRuns:
         )
         hurried = pending.deadline_s is not None
         plan = plan_of(decision, pending.forecast, pending.call, hurried=hurried)
+        if plan.latest is not None:  # it counts from the beginning of the call
+            left_s = plan.latest.after_s - (self._clock.now_s() - pending.started_s)
+            plan.latest = Hedge(plan.latest.site, left_s)
         if decision.both and decision.policy != PINNED:  # not if the caller measures all sites
             self._take_duplicates(len(plan.first) - 1)
         return race, plan
@@ -107,7 +110,13 @@ class TaskRuns:
         outlook = pending.forecast.sites.get(site)
         predicted_s = (outlook.predicted_s if outlook else None) or 0.0
         with self._lock:
-            self._flights.begin(site, pending.task.id, predicted_s=predicted_s, now_s=self._clock.now_s())
+            self._flights.begin(
+                site,
+                pending.task.id,
+                kind=pending.task.kind.name,
+                predicted_s=predicted_s,
+                now_s=self._clock.now_s(),
+            )
             self._begun_onboard += site == ONBOARD
 
     def _take_duplicates(self, count: int) -> None:

@@ -141,9 +141,16 @@ def _decision(fields: Mapping[str, Any], sites: Collection[str]) -> Decision:
     if fields["second"] is not None:
         after_s = _number(fields["second_after_s"])
         second = Hedge(fields["second"], after_s) if after_s > 0 else Probe(fields["second"])
-    spared = tuple(fields.get("spared", ()))
+    latest_s = fields.get("latest_s")
     return Decision(
-        fields["site"], "as in the run", fields["policy"], both=fields["both"], second=second, spared=spared
+        fields["site"],
+        "as in the run",
+        fields["policy"],
+        both=fields["both"],
+        second=second,
+        spared=tuple(fields.get("spared", ())),
+        waits=fields.get("waits", fields["both"]),
+        latest=None if latest_s is None else Hedge(ONBOARD, _number(latest_s)),
     )
 
 

@@ -22,12 +22,12 @@ from offboard.robot_client.execution import batch
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.policies import ALONE, PINNED, Decision, Forecast, Hedge, Policy, observe
 from offboard.robot_client.policies.allowance import Allowance
-from offboard.robot_client.policies.objectives import by_deadline
+from offboard.robot_client.policies.decision import pairs
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 NOT_BY_A_RULE = (PINNED, ALONE, batch.NAME, observe.NAME)  # who else decides where a task runs
-ON_BOTH = Decision(ONBOARD, "all sites learn", PINNED, both=True)
+ON_BOTH = Decision(ONBOARD, "all sites learn", PINNED, both=True, waits=True)
 
 
 class Played(NamedTuple):
@@ -114,7 +114,8 @@ class VirtualRobot:
             self._offload(self._function, recorded.size, number, timeout_s=recorded.timeout_s)
 
     def _begin(self, number: int, recorded: RecordedTask, *, instead: Decision | None, ask: bool) -> None:
-        self._chooser.begin(recorded.deadline_s, instead=instead, ask=ask)
+        self._chooser.begin(instead=instead, ask=ask)
+        self._offload.deadline_s = recorded.deadline_s
         for site in self._sites:
             site.begin(number, recorded)
 
@@ -130,6 +131,10 @@ class VirtualRobot:
                 begins_s[second.site] = after_s
         if len(begins_s) > 1:
             self._allowance.duplicate()
+        if decision.latest is not None and decision.latest.after_s < min(
+            begins_s.get(ONBOARD, math.inf), taken_s[site]
+        ):
+            begins_s[ONBOARD] = decision.latest.after_s
         ends_s = {one: began_s + taken_s[one] for one, began_s in begins_s.items()}
         first = min(ends_s, key=ends_s.__getitem__)
         return Played(first == CLOUD, len(begins_s) > 1, ends_s[first])
@@ -149,17 +154,17 @@ class _Chooser:
 
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
-        self.begin(None, instead=ON_BOTH, ask=False)
+        self.pairs = pairs(policy)
+        self.begin(instead=ON_BOTH, ask=False)
 
-    def begin(self, deadline_s: float | None, *, instead: Decision | None, ask: bool) -> None:
+    def begin(self, *, instead: Decision | None, ask: bool) -> None:
         """The next task may be decided `instead` of the policy, which is then asked only with `ask`."""
-        self._deadline_s, self._instead, self._ask = deadline_s, instead, ask
+        self._instead, self._ask = instead, ask
         self.decided: Decision | None = None
 
     def decide(self, forecast: Forecast) -> Decision:
         if self._ask or self._instead is None:
-            by = forecast if self._deadline_s is None else by_deadline(forecast, self._deadline_s)
-            self.decided = self._policy.decide(by)
+            self.decided = self._policy.decide(forecast)
         decision = self._instead or self.decided
         assert decision is not None
         return decision

@@ -33,7 +33,7 @@ def pinned(where: str, forecast: Forecast) -> Decision:
     if where == BOTH:
         both = len(forecast.sites) > 1
         why = "measured on both" if both else "only onboard was there"
-        return Decision(ONBOARD, why, PINNED, both=both)
+        return Decision(ONBOARD, why, PINNED, both=both, waits=both)
     sites = sites_at(where, forecast.sites)
     if not sites:
         return Decision(ONBOARD, f"pinned to {where}, which cannot take it", PINNED)
@@ -66,18 +66,16 @@ def plan_of(
 ) -> Plan:
     """How the race carries out a decision; `call` may name one more site while the task runs.
 
-    `hurried`: the call has a deadline. It gets the first answer, even if the policy measures all sites.
+    `hurried`: the call has a deadline. It gets the first answer, even if the policy waits for all sites.
     """
-    if decision.both:
-        first = tuple(site for site in forecast.sites if site not in decision.spared)
-        waits = decision.policy == PINNED or not hurried
-        return Plan(first, decision.second, all=waits, keep=True, call=call)
-    second = decision.second
+    second, first = decision.second, (decision.site,)
     if isinstance(second, Probe) and not second.answers:  # that run starts after the answer
         second = None
-    plan = Plan((decision.site,), second, call=call)
-    if isinstance(second, Probe):
+    plan = Plan(first, second, latest=decision.latest, call=call)
+    if decision.both:
+        plan.first = tuple(site for site in forecast.sites if site not in decision.spared)
+        plan.all, plan.keep = decision.waits and (decision.policy == PINNED or not hurried), True
+    if decision.both or isinstance(second, Probe):
         # A hedge waits for nothing: it starts because the chosen site is late by more than this.
-        sites = forecast.sites
-        plan.patience_s = sites[second.site].quality.lost_s - sites[decision.site].quality.lost_s
+        plan.lost_s = {site: one.quality.lost_s for site, one in forecast.sites.items()}
     return plan

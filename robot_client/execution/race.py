@@ -5,7 +5,7 @@ The sites are chosen in `policies`; what comes of the runs is learnt in `learnin
 
 from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import CancelledError, Future
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 from offboard.common.errors import CloudError, Overtaken, SiteClosed, TaskError
@@ -24,18 +24,21 @@ class Plan:
     """When the sites of one task start.
 
     `first`: the sites that start at once. `second`: a second run.
+    `latest`: a run that starts then, allowed or not, if no answer has come; from the start of the race.
     `all`: wait for every run, not for the first answer.
     `keep`: runs that lose the race go on to their end, so that their whole time is learnt.
     `call`: a future that may name one more site while the task runs; that site then starts too.
-    `patience_s`: how long the answer of a second site waits for the better one of the first site.
+    `lost_s`: what the quality that each site loses is worth. The first answer waits for a better one that is
+    under way, at most for the difference.
     """
 
     first: tuple[str, ...]
     second: Probe | Hedge | None = None
+    latest: Hedge | None = None
     all: bool = False
     keep: bool = False
     call: "Future[str] | None" = None
-    patience_s: float = 0.0
+    lost_s: Mapping[str, float] = field(default_factory=dict)
 
 
 class Race:
@@ -87,11 +90,9 @@ class Race:
         if plan.all:
             yield from self._wait_for_all()
         else:
-            if plan.second is not None:
-                yield from self._start_second(plan.second)
-            yield from self._wait_for_answer(plan.call)
-            if plan.patience_s > 0:
-                yield from self._wait_for_better(plan)
+            answered = yield from self._wait_for_answer(plan)
+            if answered is not None and plan.lost_s.get(answered):
+                yield from self._wait_for_better(plan.lost_s, answered)
         executions = {site: result_of(site, run) for site, (run, _) in self._runs.items() if run.done()}
         if ONBOARD not in self._runs and all(
             _may_fall_back(one, self._task.kind) for one in executions.values()
@@ -111,40 +112,50 @@ class Race:
         began_s = self._clock.now_s()
         self._runs[site] = self._runners[site].submit(task, self._timeout_s), began_s
 
-    def _start_second(self, second: Probe | Hedge) -> Generator[Wait, None, None]:
-        late: list[str] = []
-        if isinstance(second, Hedge):
-            late, runs = list(self._runs), [run for run, _ in self._runs.values()]
-            if not any(run.done() for run in runs):
-                yield runs, second.after_s
-            if any(run.done() for run in runs):
-                return
-        if self._allowed():
-            self._start(second.site)
-        for first in late:  # after the start: the robot itself may be late because its CPU is busy
-            self._runners[first].hurry()
-
-    def _wait_for_answer(self, call: "Future[str] | None") -> Generator[Wait, None, None]:
+    def _wait_for_answer(self, plan: Plan) -> Generator[Wait, None, str | None]:
+        """Start the later runs when they are due; the site of the first answer, None if all runs failed."""
+        began_s, call = self._clock.now_s(), plan.call
+        later = [one for one in (plan.second, plan.latest) if one is not None]
+        later.sort(key=_due_s, reverse=True)  # the next one is the last
+        while later and _due_s(later[-1]) <= 0:
+            self._start_later(later.pop(), plan)
         while True:
             pending: list[Future[Any]] = []
             for site, (run, _) in self._runs.items():
                 if not run.done():
                     pending.append(run)
                 elif _is_answer(result_of(site, run)):
-                    return
+                    return site
             if not pending:
-                return
-            if call is not None and call.done():
+                return None
+            wait_s = _due_s(later[-1]) + began_s - self._clock.now_s() if later else None
+            if wait_s is not None and wait_s <= 0:
+                self._start_later(later.pop(), plan)
+            elif call is not None and call.done():
                 self._answer_call(call.result())
                 call = None
             else:
-                yield pending if call is None else [*pending, call], None
+                yield pending if call is None else [*pending, call], wait_s
 
-    def _wait_for_better(self, plan: Plan) -> Generator[Wait, None, None]:
-        """Wait on for the first site, if the second one has answered before it."""
-        run, _ = self._runs[plan.first[0]]
-        if not run.done():
-            yield [run], plan.patience_s
+    def _start_later(self, later: Probe | Hedge, plan: Plan) -> None:
+        late = [site for site, (run, _) in self._runs.items() if not run.done()]
+        if later.site in self._runs:
+            return
+        if later is plan.latest or self._allowed():
+            self._start(later.site)
+        if isinstance(later, Hedge):
+            for site in late:  # after the start: the robot itself may be late because its CPU is busy
+                self._runners[site].hurry()
+
+    def _wait_for_better(self, lost_s: Mapping[str, float], answered: str) -> Generator[Wait, None, None]:
+        """Wait on for a better answer, at most as long as it is worth."""
+        better = [
+            (run, lost_s[answered] - lost_s[site])
+            for site, (run, _) in self._runs.items()
+            if not run.done() and lost_s[site] < lost_s[answered]
+        ]
+        if better:
+            yield [run for run, _ in better], max(worth_s for _, worth_s in better)
 
     def _answer_call(self, site: str) -> None:
         if site not in self._runs and site in self._runners and self._allowed():
@@ -162,6 +173,11 @@ class Race:
         failure = Overtaken("another site answered first")
         setup_s = run.setup_s() if isinstance(run, OnboardAnswer) else 0.0
         return Execution(site, self._clock.now_s() - began_s - setup_s, failure=failure, censored=True)
+
+
+def _due_s(later: Probe | Hedge) -> float:
+    """When a later run starts, in seconds after the start of the race."""
+    return later.after_s if isinstance(later, Hedge) else 0.0
 
 
 def answer_of(executions: tuple[Execution, ...], kind: Kind) -> Execution:

@@ -8,7 +8,7 @@ import operator
 from bisect import bisect_left, insort
 from collections import deque
 
-from offboard.robot_client.policies.forecast import ERRORS_MIN, PredictionErrors, unit_s
+from offboard.robot_client.policies.forecast import ERRORS_MIN, PredictionErrors, unit_s, widened_s
 from offboard.robot_client.predictors.line import RATE, RunningMean
 
 COVERAGE = 0.9  # share of the times that an interval should hold
@@ -62,17 +62,23 @@ class Conformal:
             self._stopped.append((self._usual_s.count, score))
             self._errors = None
 
-    def interval(self, predicted_s: float, spread_s: float | None) -> tuple[float, float] | None:
-        """Lower and upper end in seconds; None while too few errors are known and there is no spread."""
+    def interval(
+        self, predicted_s: float, spread_s: float | None, error_s: float = 0.0
+    ) -> tuple[float, float] | None:
+        """Lower and upper end in seconds; None while too few errors are known and there is no spread.
+
+        `error_s`: the standard error of this prediction. Past errors do not hold the error of a prediction
+        for a size far from all sizes that were learned.
+        """
         if len(self._sorted) < ERRORS_MIN:
             if spread_s is None:
                 return None
-            half_s = self.errors.half_90_s(predicted_s, spread_s)
+            half_s = self.errors.half_90_s(predicted_s, spread_s, error_s)
             return max(0.0, predicted_s - half_s), predicted_s + half_s
         unit, (low, high) = unit_s(predicted_s, self._usual_s.value), self._ends or self._interval()
-        low_s = predicted_s + unit * low if low < 0 else predicted_s
-        high_s = predicted_s + unit * high if high > 0 else predicted_s
-        return (low_s if low_s > 0 else 0.0), (high_s if high_s > 0 else 0.0)
+        low_s = predicted_s - widened_s(unit * max(0.0, -low), error_s)
+        high_s = predicted_s + widened_s(unit * max(0.0, high), error_s)
+        return max(0.0, low_s), high_s
 
     def _adapt(self, *, missed: bool) -> None:
         outside = self._outside + RATE * (1 - COVERAGE - missed)  # below 0: wider than all errors seen

@@ -32,6 +32,7 @@ class Forecaster:
                 amount,
                 self._behind(runner, in_flight, now_s) if known.measured else UNMEASURED,
                 in_flight=in_flight,
+                under_way=in_flight > 0 and self._flights.has(site, task.kind.name),
                 timeout_s=timeout_s,
                 sending=sending,
                 # Most tasks have nothing to make smaller, so that is asked first.
@@ -53,6 +54,7 @@ class Forecaster:
                 amount,
                 _apart_from(runner, count) if known.measured else UNMEASURED,
                 in_flight=count,
+                under_way=count > 0,
                 timeout_s=timeout_s,
                 sending=sending,
                 packing=memory.packing.plan(sending, known.link_s) if packs or sending.large else None,
@@ -62,7 +64,7 @@ class Forecaster:
     def _with_allowance(self, memory: KindMemory, size: Size, outlooks: Mapping[str, Outlook]) -> Forecast:
         allowance = self._allowance
         duplicates = allowance.duplicates if memory.kind.duplicate else 0.0
-        forecast = Forecast(size, outlooks, last_site=memory.last_site, duplicates=duplicates)
+        forecast = Forecast(size, outlooks, memory.last_site, duplicates)
         if not allowance.capped:
             return forecast
         return forecast._replace(bytes_left=allowance.bytes_left, joules_left=allowance.joules_left)

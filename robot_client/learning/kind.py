@@ -104,6 +104,10 @@ class KindMemory:
         """What the predictors are asked for: the expected work of this size, or the size itself."""
         return size if self._work is None else self._work.predict(first_number(size))
 
+    def slowest_onboard_s(self, size: Size) -> float | None:
+        """The longest of the last times onboard of no larger tasks; None if the kind never runs twice."""
+        return self.site(ONBOARD).slowest_s(self.amount(size)) if self.kind.duplicate else None
+
     def work_of(self, execution: Execution) -> float | None:
         """The work of a task, by the result of this execution; None if the result does not say."""
         if self._work is None or not execution.ok:

@@ -25,6 +25,7 @@ class PendingTask:
     `runners`: those of the sites that were present then. `absent`: why some are not in the forecast.
     `amount`: what the predictors were asked for.
     `started_s`: by the clock of the offloader. `call`: may name one more site while the task runs.
+    `answered`: gets the answer and when it came, for a caller that waits until a deadline.
     `work`: what a result told. `ended`: the runs that a probe is compared by.
     """
 
@@ -42,6 +43,7 @@ class PendingTask:
     absent: Mapping[str, str]
     call: "Future[str] | None" = None
     deadline_s: float | None = None
+    answered: "Future[tuple[Execution, float]] | None" = None
     work: float | None = None
     ended: dict[str, Execution] = field(default_factory=dict)
 

@@ -25,6 +25,7 @@ class Memories:
     `objective`: what the policy makes small (None: the mean time).
     `energy`: what tasks take from the battery.
     `s_per_quality`: what the whole quality of an answer is worth, in seconds, for tasks with variants.
+    `deadline_s`: of every task, by the objective `deadline`; None for other objectives.
     `store`: the file in which the memories outlive the process (None: they do not).
     """
 
@@ -46,6 +47,7 @@ class Memories:
         self._energy = energy or Energy()
         # The objective `deadline` weighs quality against the chance to miss it, not against seconds.
         self._s_per_quality = 0.0 if isinstance(objective, Deadline) else s_per_quality
+        self.deadline_s = objective.deadline_s if isinstance(objective, Deadline) else None
         self._store = store
         self._kinds: dict[str, KindMemory] = {}
 

@@ -10,6 +10,7 @@ OVERDUE = 0.5  # of its time so far: an overdue run should still need this long
 
 @dataclass(slots=True)
 class _Flight:
+    kind: str
     began_s: float
     predicted_s: float
 
@@ -24,9 +25,9 @@ class Flights:
     def __init__(self) -> None:
         self._flights: dict[str, dict[int, _Flight]] = {}  # of the sites that have any
 
-    def begin(self, site: str, task: int, *, predicted_s: float, now_s: float) -> None:
+    def begin(self, site: str, task: int, *, kind: str, predicted_s: float, now_s: float) -> None:
         """A run of the task with this id starts."""
-        self._flights.setdefault(site, {})[task] = _Flight(now_s, predicted_s)
+        self._flights.setdefault(site, {})[task] = _Flight(kind, now_s, predicted_s)
 
     def end(self, site: str, task: int) -> None:
         """The run has ended. Safe to call twice."""
@@ -42,6 +43,10 @@ class Flights:
 
     def count(self, site: str) -> int:
         return len(self._flights.get(site, ()))
+
+    def has(self, site: str, kind: str) -> bool:
+        """Whether a task of this kind runs there."""
+        return any(one.kind == kind for one in self._flights.get(site, {}).values())
 
     def left_s(self, site: str, now_s: float) -> float:
         """How long the runs on this site should still take, one after the other."""

@@ -3,13 +3,15 @@
 What all sites of a kind share is in `kind`; how times are predicted is in `predictors`.
 """
 
+import itertools
+import math
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from offboard.common.errors import CannotCross, Overtaken, SiteClosed, TaskError
 from offboard.common.tasks import Size, first_number
-from offboard.robot_client.learning.conformal import Conformal
+from offboard.robot_client.learning.conformal import ERRORS_MAX, Conformal
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.forecast import Outlook, Packing, Quality
 from offboard.robot_client.policies.objectives import Expected, Objective
@@ -91,6 +93,7 @@ class SiteMemory:
         condition: Condition,
         *,
         in_flight: int,
+        under_way: bool = False,
         timeout_s: float,
         sending: Sending,
         packing: Packing | None = None,
@@ -108,6 +111,7 @@ class SiteMemory:
                 age=self.age,
                 failures=self._failures,
                 in_flight=in_flight,
+                under_way=under_way,
                 condition=condition,
                 quality=self._quality,
                 packing=packing,
@@ -118,17 +122,27 @@ class SiteMemory:
             seconds += packing.seconds
         if condition.silent:
             seconds = max(seconds, timeout_s)
-        low_s, high_s = self._conformal.interval(seconds, found.spread_s) or (None, None)
+        spread_s, error_s = found.spread_s, found.error_s or 0.0
+        low_s, high_s = self._conformal.interval(seconds, spread_s, error_s) or (None, None)
         energy, errors, quality = self._energy, self._conformal.errors, self._quality
         onboard_s = self._cpu_s.value or seconds
         joules = energy.onboard_j(onboard_s) if self._site == ONBOARD else energy.remote_j(seconds, moved)
-        cost = self._objective.cost(Expected(seconds, found.spread_s, joules, quality, bytes=moved), errors)
+        expected = Expected(seconds, spread_s, joules, quality, bytes=moved, error_s=error_s)
+        cost = self._objective.cost(expected, errors)
         # All fields in their order: with keywords, it takes three times as long.
         return Outlook._make((
-            seconds, found.spread_s, predictor.full, self.age, self._failures, len(predictor),
+            seconds, spread_s, predictor.full, self.age, self._failures, len(predictor),
             low_s, high_s, found.error_s, cost, in_flight, moved, joules, condition,
-            errors, quality, packing, sending,
+            errors, quality, packing, sending, under_way, None,
         ))  # fmt: skip
+
+    def slowest_s(self, amount: Size | None) -> float:
+        """The longest of the last times here, of tasks that were not larger than this amount."""
+        most = math.inf if amount is None else first_number(amount)
+        last = itertools.islice(reversed(self.observations), ERRORS_MAX)
+        return max(
+            (one.seconds + one.waited_s for one in last if first_number(one.amount) <= most), default=0.0
+        )
 
     @property
     def link_s(self) -> float | None:

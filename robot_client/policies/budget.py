@@ -6,7 +6,7 @@
 import math
 from collections.abc import Collection
 
-from offboard.robot_client.policies.decision import Decision, Policy, decide_among
+from offboard.robot_client.policies.decision import Decision, Policy, decide_among, pairs
 from offboard.robot_client.policies.forecast import Forecast
 from offboard.robot_client.sites.runner import ONBOARD
 
@@ -19,6 +19,7 @@ class WithBudget:
 
     def __init__(self, inner: Policy) -> None:
         self._inner = inner
+        self.pairs = pairs(inner)
 
     def decide(self, forecast: Forecast) -> Decision:
         fit = [site for site in forecast.sites if _fits(forecast, {site})] or [ONBOARD]
@@ -27,7 +28,9 @@ class WithBudget:
             why = f"{decision.reason}; the caps allow one site only"
             return decision._replace(both=False, spared=(), why=why)
         if decision.second is not None and not _fits(forecast, {decision.site, decision.second.site}):
-            return decision._replace(second=None)
+            decision = decision._replace(second=None)
+        if decision.latest is not None and not _fits(forecast, {decision.site, decision.latest.site}):
+            decision = decision._replace(latest=None)
         return decision
 
 

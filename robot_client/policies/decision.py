@@ -40,6 +40,10 @@ class Hedge:
 class Decision(NamedTuple):
     """Run the task on `site`; with `both`, on all sites except those in `spared`, in parallel.
 
+    The first good answer is used, and the other runs go on; with `waits`, the caller gets its answer when all
+    runs have ended.
+    `latest`: a run that starts at the latest then, if no answer has come, outside of the allowance: a call
+    with a deadline must not wait for a remote site alone.
     `why` is the reason for people, or a function that makes it: few reasons are ever read.
     `policy` names who decided: the rule, or the whole policy once it is `Named`. `second` is a second run on
     another site. `advised` is where the policy would send a task that `Observe` runs onboard.
@@ -52,6 +56,8 @@ class Decision(NamedTuple):
     second: Probe | Hedge | None = None
     spared: tuple[str, ...] = ()
     advised: str | None = None
+    waits: bool = False
+    latest: Hedge | None = None
 
     @property
     def measured(self) -> str | None:
@@ -79,12 +85,25 @@ class Named:
     def __init__(self, policy: Policy, name: str) -> None:
         self._policy = policy
         self._name = name
+        self.pairs = pairs(policy)
 
     def decide(self, forecast: Forecast) -> Decision:
         found = self._policy.decide(forecast)
         return Decision(  # `_replace` is slower
-            found.site, found.why, self._name, both=found.both, second=found.second, spared=found.spared
+            found.site,
+            found.why,
+            self._name,
+            both=found.both,
+            second=found.second,
+            spared=found.spared,
+            waits=found.waits,
+            latest=found.latest,
         )
+
+
+def pairs(policy: Policy) -> bool:
+    """Whether this policy starts onboard in time for a deadline while a remote site runs the task."""
+    return bool(getattr(policy, "pairs", False))
 
 
 def decide_among(sites: Collection[str], forecast: Forecast, policy: Policy) -> Decision:

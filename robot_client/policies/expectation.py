@@ -15,7 +15,8 @@ class Expectation:
     """What a call should take on one site; None: unknown.
 
     `seconds`: the expected time. `interval`: its 90 % interval, in seconds.
-    `in_time`: the probability that the site answers within the deadline, if one was given.
+    `in_time`: the probability that a call that is sent there is answered within the deadline, if one was
+    given. If the policy then also starts the task onboard in time, it is that of both sites together.
     `absent`: why the site cannot take the task now; None if it can.
     """
 
@@ -36,30 +37,25 @@ class Expectation:
         return text if self.in_time is None else f"{text}, in time with {self.in_time:.0%}"
 
 
-def expectations(
-    forecast: Forecast, absent: Mapping[str, str], deadline_s: float | None
-) -> dict[str, Expectation]:
+def expectations(forecast: Forecast, absent: Mapping[str, str]) -> dict[str, Expectation]:
     """The expectation of each site; `absent` says why sites are not in the forecast."""
-    found = {site: _expectation(one, deadline_s) for site, one in forecast.sites.items()}
+    found = {site: _expectation(one) for site, one in forecast.sites.items()}
     return found | {site: Expectation(absent=why) for site, why in absent.items()}
 
 
 def missed(task: str, deadline_s: float, forecast: Forecast, absent: Mapping[str, str]) -> DeadlineMissed:
     """The error of a call without an answer in time, with what was expected when the call began."""
-    expected = expectations(forecast, absent, deadline_s)
+    expected = expectations(forecast, absent)
     shown = "; ".join(f"{site} {one}" for site, one in expected.items())
     return DeadlineMissed(f"task {task}: no answer within {deadline_s:g} s; expected: {shown}", expected)
 
 
-def _expectation(outlook: Outlook, deadline_s: float | None) -> Expectation:
+def _expectation(outlook: Outlook) -> Expectation:
     seconds, low_s, high_s = outlook.predicted_s, outlook.low_s, outlook.high_s
     if seconds is None:
         return Expectation()
-    missed_share = None
-    if deadline_s is not None:
-        missed_share = outlook.errors.share_above(max(0.0, seconds), deadline_s, outlook.spread_s)
     return Expectation(
         seconds=seconds,
         interval=None if low_s is None or high_s is None else (low_s, high_s),
-        in_time=None if missed_share is None else 1.0 - missed_share,
+        in_time=outlook.in_time,
     )

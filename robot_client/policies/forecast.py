@@ -33,7 +33,7 @@ class PredictionErrors:
     usual_s: float = 0.0
     stopped: tuple[float, ...] = ()
 
-    def overdue(self, predicted_s: float, worth_s: float) -> float | None:
+    def overdue(self, predicted_s: float, worth_s: float, error_s: float = 0.0) -> float | None:
         """How old, in seconds, a running task is when it should still need more than `worth_s`."""
         scores, count = self.scores, len(self.scores)
         if count < ERRORS_MIN:
@@ -46,32 +46,60 @@ class PredictionErrors:
             latest, longer = self._late
             if unit * longer > worth_s:
                 score = latest
-        return max(0.0, predicted_s + unit * score)
+        return max(0.0, predicted_s + widened_s(unit * score, error_s))
 
-    def share_above(self, predicted_s: float, limit_s: float, spread_s: float | None = None) -> float | None:
+    def share_above(
+        self, predicted_s: float, limit_s: float, spread_s: float | None = None, error_s: float = 0.0
+    ) -> float | None:
         """The share of tasks with this prediction that should take longer than `limit_s`."""
         count = len(self.scores)
         if count < ERRORS_MIN:
             if not spread_s:
                 return None
-            t = (limit_s - predicted_s) / self._scale_s(predicted_s, spread_s)
+            scale_s = math.hypot(self._scale_s(predicted_s, spread_s), error_s)
+            t = (limit_s - predicted_s) / scale_s
             return 0.5 * math.erfc(normal_of_student(t, count + 1) / math.sqrt(2.0))
-        score = (limit_s - predicted_s) / unit_s(predicted_s, self.usual_s)
+        unit, margin_s = unit_s(predicted_s, self.usual_s), limit_s - predicted_s
+        if error_s > 0.0:  # each past error may come with any error of this prediction
+            of = error_s * math.sqrt(2.0)
+            above = math.fsum([0.5 * math.erfc((margin_s - unit * score) / of) for score in self.scores])
+        else:
+            above = count - bisect_left(self.scores, margin_s / unit)
         # Never 0 or 1: a limit that no error has reached yet may still be missed.
-        above = count - bisect_left(self.scores, score) + len(self.stopped)  # they might never have ended
-        return (above + 0.5) / (count + len(self.stopped) + 1)
+        above += len(self.stopped)  # they might never have ended
+        return (above + self._unseen(margin_s / unit)) / (count + len(self.stopped) + 1)
 
-    def half_90_s(self, predicted_s: float, spread_s: float) -> float:
+    @property
+    def few(self) -> bool:
+        return len(self.scores) < ERRORS_MIN
+
+    def worst_s(self, predicted_s: float, error_s: float) -> float:
+        """The time of a task with this prediction if it is as late as the latest one."""
+        largest = max(0.0, self.scores[-1], *self.stopped[-1:])
+        return predicted_s + widened_s(unit_s(predicted_s, self.usual_s) * largest, error_s)
+
+    def _unseen(self, score: float) -> float:
+        """How many further errors to expect above this score, if none was seen there.
+
+        Half an error up to the size of the largest one, and beyond it less, with the square of the distance:
+        so fast falls at least every tail that has a variance (Chebyshev's inequality).
+        """
+        largest = max(self.scores[-1], -self.scores[0])
+        return 0.5 * (largest / score) ** 2 if score > largest else 0.5
+
+    def half_90_s(self, predicted_s: float, spread_s: float, error_s: float = 0.0) -> float:
         """Half of the width of a 90 % interval while few errors are known."""
-        return student_90(len(self.scores) + 1) * self._scale_s(predicted_s, spread_s)
+        scale_s = math.hypot(self._scale_s(predicted_s, spread_s), error_s)
+        return student_90(len(self.scores) + 1) * scale_s
 
-    def below(self, predicted_s: float, share: float) -> float | None:
+    def below(self, predicted_s: float, share: float, error_s: float = 0.0) -> float | None:
         """The time in seconds that this share of tasks with this prediction should stay below."""
         if len(self.scores) < ERRORS_MIN:
             return None
         scores = sorted(self.scores + self.stopped) if self.stopped else self.scores
         rank = min(len(scores), math.ceil(share * (len(scores) + 1))) - 1
-        return max(0.0, predicted_s + unit_s(predicted_s, self.usual_s) * scores[rank])
+        beyond_s = unit_s(predicted_s, self.usual_s) * scores[rank]
+        return max(0.0, predicted_s + widened_s(beyond_s, error_s))
 
     def _scale_s(self, predicted_s: float, spread_s: float) -> float:
         """The root mean square of the errors and the spread."""
@@ -128,11 +156,12 @@ class Outlook(NamedTuple):
     `full`: the warm-up of the predictor is over. `observations`: how many the prediction rests on.
     `age`: tasks of this kind since the site last ran one. `failures`: failed runs in a row.
     `cost`: what the objective makes of the outlook; less is better.
-    `in_flight`: tasks of any kind that run there now.
+    `in_flight`: tasks of any kind that run there now. `under_way`: one of this kind is among them.
     `bytes`, `joules`: what running the task there should take.
     `condition`: what was measured of the site. `errors`: how wrong its past predictions were.
     `quality`: of the variant that the site runs; WHOLE for a task without variants.
     `sending`: what a run there would send, and `packing`: what of it should be made smaller; None: nothing.
+    `in_time`: the probability that a call sent there is answered by its deadline; None: it has none.
 
     Build it with keywords. It is a named tuple because every task needs one for each site, and a frozen
     dataclass takes twice as long to build.
@@ -156,6 +185,8 @@ class Outlook(NamedTuple):
     quality: Quality = WHOLE
     packing: Packing | None = None
     sending: Sending = NOTHING
+    under_way: bool = False
+    in_time: float | None = None
 
     @property
     def given_up(self) -> bool:
@@ -166,7 +197,7 @@ class Outlook(NamedTuple):
         """How old, in seconds, a running task is when it should still need more than `worth_s`."""
         if self.predicted_s is None:
             return None
-        after_s = self.errors.overdue(self.predicted_s, worth_s)
+        after_s = self.errors.overdue(self.predicted_s, worth_s, self.error_s or 0.0)
         if after_s is not None:
             return after_s
         return None if self.spread_s is None else self.predicted_s + SPREADS_90 * self.spread_s
@@ -178,6 +209,9 @@ class Forecast(NamedTuple):
     Onboard is always among `sites`, unless a wrapper leaves it out for the policy that it wraps.
     `last_site`: where the last task of this kind was sent. `duplicates`: second runs that may start now.
     `bytes_left`, `joules_left`: what the caps leave.
+    `deadline_s`: of this call, or of the objective. `latest_s`: when onboard must start at the latest if a
+    remote site has not answered, in seconds from the start; None: the task runs on one site only, or there is
+    no deadline, or onboard would be too late anyway.
 
     Build it with keywords. It is a named tuple for the same reason as `Outlook`.
     """
@@ -188,6 +222,8 @@ class Forecast(NamedTuple):
     duplicates: float = math.inf
     bytes_left: float = math.inf
     joules_left: float = math.inf
+    deadline_s: float | None = None
+    latest_s: float | None = None
 
     def only(self, sites: Collection[str]) -> "Forecast":
         """The same forecast with these sites only."""
@@ -209,6 +245,11 @@ def normal_of_student(t: float, freedom: int) -> float:
 def unit_s(predicted_s: float, usual_s: float) -> float:
     """The unit of the errors: a part of the noise grows with the task, and a part does not."""
     return 0.5 * ((predicted_s if predicted_s > 0 else 0.0) + usual_s) or 1.0
+
+
+def widened_s(beyond_s: float, error_s: float) -> float:
+    """A distance from the prediction, moved up by what the prediction itself may be wrong by."""
+    return beyond_s - abs(beyond_s) + math.hypot(beyond_s, SPREADS_90 * error_s)
 
 
 def cheapest(costs: Mapping[str, float]) -> str:

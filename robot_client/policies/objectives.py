@@ -7,7 +7,13 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from offboard.common.errors import ConfigError
-from offboard.robot_client.policies.forecast import SPREADS_90, WHOLE, Forecast, PredictionErrors, Quality
+from offboard.robot_client.policies.forecast import (
+    SPREADS_90,
+    WHOLE,
+    PredictionErrors,
+    Quality,
+    widened_s,
+)
 
 S_PER_QUALITY = 1.0  # seconds that the whole quality is worth
 
@@ -16,6 +22,7 @@ class Expected(NamedTuple):
     """What running a task on one site should take, and how good its answer is.
 
     `spread_s` is None while it is unknown. `bytes` are sent and received.
+    `error_s`: the standard error of `seconds`, 0 if it is unknown.
     """
 
     seconds: float
@@ -23,6 +30,7 @@ class Expected(NamedTuple):
     joules: float
     quality: Quality = WHOLE
     bytes: float = 0.0
+    error_s: float = 0.0
 
 
 @runtime_checkable
@@ -46,9 +54,9 @@ class Tail:
     SHARE = 0.95  # of the times; the others may take longer
 
     def cost(self, expected: Expected, errors: PredictionErrors) -> float:
-        below_s = errors.below(expected.seconds, self.SHARE)
+        below_s = errors.below(expected.seconds, self.SHARE, expected.error_s)
         if below_s is None:
-            below_s = expected.seconds + SPREADS_90 * (expected.spread_s or 0.0)
+            below_s = expected.seconds + widened_s(SPREADS_90 * (expected.spread_s or 0.0), expected.error_s)
         return below_s + expected.quality.lost_s
 
 
@@ -62,12 +70,18 @@ class Deadline:
     deadline_s: float
 
     def cost(self, expected: Expected, errors: PredictionErrors) -> float:
+        worth = expected.quality.value * (1.0 - self.missed(expected, errors))
+        return 1.0 - worth + self.slowness(expected)
+
+    def missed(self, expected: Expected, errors: PredictionErrors) -> float:
+        """The probability that a site alone misses the deadline."""
         expected_s = max(0.0, expected.seconds)
-        missed = errors.share_above(expected_s, self.deadline_s, expected.spread_s)
-        if missed is None:
-            missed = float(expected_s > self.deadline_s)
-        missed += (1.0 - expected.quality.value) * (1.0 - missed)
-        return missed + 1e-3 * expected_s / (expected_s + self.deadline_s)
+        missed = errors.share_above(expected_s, self.deadline_s, expected.spread_s, expected.error_s)
+        return float(expected_s > self.deadline_s) if missed is None else missed
+
+    def slowness(self, expected: Expected) -> float:
+        """What makes the faster one of two sites with equal probabilities cheaper."""
+        return 1e-3 * max(0.0, expected.seconds) / (max(0.0, expected.seconds) + self.deadline_s)
 
 
 @dataclass(frozen=True)
@@ -80,22 +94,6 @@ class TimeAndSpending:
     def cost(self, expected: Expected, errors: PredictionErrors) -> float:  # noqa: ARG002
         spent_s = self.s_a_joule * expected.joules + self.s_a_megabyte * 1e-6 * expected.bytes
         return expected.seconds + spent_s + expected.quality.lost_s
-
-
-def by_deadline(forecast: Forecast, deadline_s: float) -> Forecast:
-    """The same forecast for a call with a deadline, against which quality is weighed instead of seconds.
-
-    A site whose time is unknown is tried, unless a task is there already: that one may take long.
-    """
-    objective, sites = Deadline(deadline_s), {}
-    for site, one in forecast.sites.items():
-        quality = one.quality if one.quality is WHOLE else Quality(one.quality.value)
-        cost = 1.0 if one.in_flight else None
-        if one.predicted_s is not None:
-            expected = Expected(one.predicted_s, one.spread_s, one.joules, quality)
-            cost = objective.cost(expected, one.errors)
-        sites[site] = one._replace(cost=cost, quality=quality)
-    return forecast._replace(sites=sites)
 
 
 OBJECTIVES = (MEAN := "mean", "p95", "deadline", "energy", "metered")

@@ -18,7 +18,8 @@ class Paper:
         if cold:
             # Algorithm 1, warm-up branch: both sites, until both queues are full.
             reason = f"warm-up: the window of {' and '.join(sorted(cold))} is not full"
-            return Decision(home(forecast), reason, "paper", both=len(forecast.sites) > 1)
+            both = len(forecast.sites) > 1
+            return Decision(home(forecast), reason, "paper", both=both, waits=both)
         predicted = {site: outlook.predicted_s or 0.0 for site, outlook in forecast.sites.items()}
         # Eq. 1: the cloud only where it is strictly faster; a tie stays onboard.
         site = cheapest(predicted)

@@ -4,7 +4,7 @@
 """
 
 from offboard.common.variants import group_of
-from offboard.robot_client.policies.decision import Decision, Policy, Probe
+from offboard.robot_client.policies.decision import Decision, Policy, Probe, pairs
 from offboard.robot_client.policies.forecast import Forecast
 
 PROBE_EVERY = 20  # tasks that a site has not run
@@ -20,6 +20,7 @@ class WithProbes:
 
     def __init__(self, inner: Policy) -> None:
         self._inner = inner
+        self.pairs = pairs(inner)
 
     def decide(self, forecast: Forecast) -> Decision:
         decision = self._inner.decide(forecast)

@@ -16,6 +16,7 @@ class LeastSquares:
 
     m = sum((d - mean d)(t - mean t)) / sum((d - mean d)^2); c = mean t - m mean d; p = m d + c.
     If all sizes are equal, the slope is 0 and p = mean t. Sizes of several numbers get a plane.
+    The standard error of p is that of the fitted line: s sqrt(1 / N + (d - mean d)^2 / sum((d - mean d)^2)).
     """
 
     def __init__(self, window: int, seed: int = 0) -> None:  # noqa: ARG002 - nothing is random
@@ -44,6 +45,10 @@ class LeastSquares:
         if not len(self.window):
             return None
         of = self.window.moments()
-        slope = of.sdt / of.sdd if of.sdd > 0 else 0.0
-        spread = math.sqrt(max(0.0, of.stt - slope * of.sdt) / (of.count - 2)) if of.count > 2 else None
-        return Prediction(of.mean_seconds + slope * of.deviation(size), spread)
+        slope, away = of.sdt / of.sdd if of.sdd > 0 else 0.0, of.deviation(size)
+        seconds = of.mean_seconds + slope * away
+        if of.count <= 2:
+            return Prediction(seconds, None)
+        spread_s = math.sqrt(max(0.0, of.stt - slope * of.sdt) / (of.count - 2))
+        leverage = 1.0 / of.count + (away * away / of.sdd if of.sdd > 0 else 0.0)
+        return Prediction(seconds, spread_s, spread_s * math.sqrt(leverage))

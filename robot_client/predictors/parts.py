@@ -11,6 +11,7 @@ from offboard.robot_client.predictors.base import WARM_UP, Prediction, check_obs
 from offboard.robot_client.predictors.line import Line, RunningMean
 from offboard.robot_client.sites.runner import UNMEASURED, Condition
 
+LEAST = 0.25  # of its standard error: no run is predicted to be shorter, so that it is never a certain 0
 FIRST_BYTES_S = 12.5e6  # bytes a second of a link, until its first answers tell: 100 Mbit/s
 
 
@@ -62,14 +63,15 @@ class Parts:
         """The time of a task that moves this many bytes; None before the first run."""
         if not self._run.count:
             return None
-        run_s = self._run_s(size, condition)
+        run_s, error_s = self._run_s(size, condition)
         seconds, spread_s = run_s * (1.0 + self._run.tail), self._run.deviation * run_s
         if not self.remote:
-            return Prediction(seconds, spread_s)
-        rtt_s = condition.round_trip_s or 0.0
-        network_s = rtt_s + self._network.at(moved / self._bytes if self._bytes else 0.0)
+            return Prediction(seconds, spread_s, error_s)
+        x = moved / self._bytes if self._bytes else 0.0
+        network_s = (condition.round_trip_s or 0.0) + self._network.at(x)
         seconds += network_s * (1.0 + self._network.tail) + condition.queue * self._usual_run.value
-        return Prediction(seconds, math.hypot(spread_s, self._network.deviation * network_s))
+        spread_s = math.hypot(spread_s, self._network.deviation * network_s)
+        return Prediction(seconds, spread_s, math.hypot(error_s, self._network.error(x)))
 
     def learn(
         self,
@@ -101,18 +103,20 @@ class Parts:
             self._learn_run(size, seconds, condition)
             return
         rtt_s = condition.round_trip_s or 0.0
-        expected_s = self._run_s(size, condition) + condition.queue * self._usual_run.value
+        expected_s = self._run_s(size, condition)[0] + condition.queue * self._usual_run.value
         self._learn_network(moved, max(0.0, seconds - expected_s - rtt_s), rtt_s, bound=False)
 
-    def _run_s(self, size: float, condition: Condition) -> float:
+    def _run_s(self, size: float, condition: Condition) -> tuple[float, float]:
+        """The seconds of a run, and their standard error, which alone is known where the line is below 0."""
         x, load = size / self._amount if self._amount else 0.0, self._load(condition)
-        if load <= LOADED:
-            seconds = self._run.at(x)
-        elif self._loaded.count:
-            seconds = self._loaded.at(x)
-        else:
-            seconds = self._run.at(x) * (1.0 + load)
-        return seconds / condition.capacity
+        line, capacity = self._run, condition.capacity
+        if load > LOADED:
+            if self._loaded.count:
+                line = self._loaded
+            else:
+                capacity /= 1.0 + load
+        error_s = line.error(x)
+        return max(line.at(x), LEAST * error_s) / capacity, error_s / capacity
 
     def _load(self, condition: Condition) -> float:
         return condition.server_load if self.remote else condition.load

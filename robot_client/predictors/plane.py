@@ -55,7 +55,10 @@ class Plane:
 
 
 class _Fit(NamedTuple):
-    """A fitted plane. `span` is the range of each number, and infinite if it is constant."""
+    """A fitted plane. `span` is the range of each number, and infinite if it is constant.
+
+    `inverse`: the pseudo-inverse of the fitted rows, from which the standard error of a prediction follows.
+    """
 
     lowest: "Array"
     span: "Array"
@@ -63,10 +66,15 @@ class _Fit(NamedTuple):
     slopes: "Array"
     intercept: float
     spread_s: float | None
+    inverse: "Array"
 
     def at(self, numbers: Numbers) -> Prediction:
         z = (numbers - self.lowest) / self.span - self.mean
-        return Prediction(self.intercept + float(z @ self.slopes), self.spread_s)
+        seconds = self.intercept + float(z @ self.slopes)
+        if self.spread_s is None:
+            return Prediction(seconds, None)
+        weights = self.inverse[0] + z @ self.inverse[1:]  # of the learned times in this prediction
+        return Prediction(seconds, self.spread_s, self.spread_s * math.sqrt(float(weights @ weights)))
 
 
 def _fit(rows: list[Numbers], times_s: list[float]) -> _Fit:
@@ -84,5 +92,11 @@ def _fit(rows: list[Numbers], times_s: list[float]) -> _Fit:
     rest = seconds - known @ found
     spread_s = math.sqrt(float(rest @ rest) / free) if free > 0 else None
     return _Fit(
-        lowest=lowest, span=span, mean=mean, slopes=found[1:], intercept=float(found[0]), spread_s=spread_s
+        lowest=lowest,
+        span=span,
+        mean=mean,
+        slopes=found[1:],
+        intercept=float(found[0]),
+        spread_s=spread_s,
+        inverse=np.linalg.pinv(known),
     )

@@ -214,6 +214,8 @@ def _decision(decision: Decision) -> dict[str, Any]:
         "second": None if second is None else second.site,
         "second_after_s": second.after_s if isinstance(second, Hedge) else 0.0,
         "spared": decision.spared,
+        "waits": decision.waits,
+        "latest_s": None if decision.latest is None else decision.latest.after_s,
         "advised": decision.advised,
     }
 

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -18,9 +18,7 @@ from offboard.robot_client import policies, predictors
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.lifetime import ASYNC_CALLS_MAX
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.predictors.base import WARM_UP
 from offboard.robot_client.records.trace import Record
-from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.fakes import ScriptedRunner
 
@@ -156,35 +154,6 @@ def test_a_deadline_prefers_the_site_that_misses_it_least() -> None:
     print({site: one.in_time for site, one in chances.items()})
     assert chances[CLOUD].in_time == pytest.approx(0.8, abs=0.1)
     assert chances[ONBOARD].in_time == pytest.approx(1.0, abs=0.03)
-
-
-class SlowRunner(ScriptedRunner):
-    """Takes tasks, and answers them when the test says so."""
-
-    def __init__(self) -> None:
-        super().__init__(CLOUD, lambda one: Execution(CLOUD, 5.0, one.args[0]))
-        self.futures: list[Future[Execution]] = []
-
-    def submit(self, task: Task, budget_s: float) -> "Future[Execution]":  # noqa: ARG002
-        self.tasks.append(task)
-        self.futures.append(Future())
-        return self.futures[-1]
-
-    def answer_all(self) -> None:
-        for one, future in zip(self.tasks, self.futures, strict=True):
-            future.set_result(self.script(one))
-
-
-def test_a_warm_up_holds_no_answer_back() -> None:
-    """The first answer counts. A slow site is not asked alone while it has not told its time."""
-    memories = Memories(lambda: predictors.make(predictors.LEAST_SQUARES, 50))
-    cloud = SlowRunner()
-    with Offloader([cloud, OnboardRunner()], policy=policies.make("greedy"), memories=memories) as made:
-        for number in range(2, 12):
-            assert made(deadline_echo, number, deadline_s=WAIT_S) == number
-        assert len(cloud.tasks) == WARM_UP
-        cloud.answer_all()
-        assert made.expect(deadline_echo, 5)[CLOUD].seconds == pytest.approx(5.0)
 
 
 STUCK = """

@@ -6,16 +6,8 @@ from offboard.common.errors import ConfigError
 from offboard.robot_client.learning.conformal import Conformal
 from offboard.robot_client.policies import objectives
 from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.forecast import (
-    NO_ERRORS,
-    Forecast,
-    Outlook,
-    PredictionErrors,
-    Quality,
-)
-from offboard.robot_client.policies.objectives import Deadline, Expected, by_deadline
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD
-from tests.outlooks import known
+from offboard.robot_client.policies.forecast import NO_ERRORS, PredictionErrors
+from offboard.robot_client.policies.objectives import Expected
 
 
 def expected(seconds: float, spread_s: float | None = None, joules: float = 0.0) -> Expected:
@@ -53,20 +45,6 @@ def test_a_steady_site_wins_by_its_tail() -> None:
     steady, wild = (expected(1.2), erring(*[0.0] * 50)), (expected(1.0), erring(*[-0.1, 1.0] * 25))
     assert cost("p95", *steady) < cost("p95", *wild)
     assert cost("mean", *steady) > cost("mean", *wild)
-
-
-def test_a_deadline_of_one_call_replaces_all_costs() -> None:
-    """Quality is worth no seconds then; of the sites whose time is unknown, a free one is tried."""
-    sites = {
-        ONBOARD: known(0.1, quality=Quality(0.5, 0.4), cost=9.0),
-        CLOUD: Outlook(in_flight=1),
-        "edge": Outlook(),
-    }
-    found = by_deadline(Forecast(size=1.0, sites=sites), 0.5).sites
-    whole = Expected(0.1, sites[ONBOARD].spread_s, 0.0, Quality(0.5))
-    assert found[ONBOARD].cost == Deadline(0.5).cost(whole, NO_ERRORS)
-    assert found[ONBOARD].quality == Quality(0.5, 0.0)
-    assert (found[CLOUD].cost, found["edge"].cost) == (1.0, None)
 
 
 def test_deadline_is_the_probability_to_miss_it() -> None:

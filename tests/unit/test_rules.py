@@ -65,7 +65,7 @@ def test_all_sites_run_the_first_tasks(rule: str) -> None:
         decision = decide(rule, {ONBOARD: known(0.1), CLOUD: known(0.2, observations=count, full=False)})
         assert decision.both == both, (count, decision)
     assert "cloud" in decide(rule, {ONBOARD: known(0.1), CLOUD: UNKNOWN}).reason
-    under_way = UNKNOWN._replace(in_flight=1)
+    under_way = UNKNOWN._replace(in_flight=1, under_way=True)
     assert not decide(rule, {ONBOARD: known(0.1), CLOUD: under_way}).both
 
 

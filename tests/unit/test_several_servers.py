@@ -22,7 +22,7 @@ HEAD = """name = "two"
 [workload]
 task = "offboard.loadgen.scenario.hash_tasks:hash_rounds"
 sizes = ["uniform:100000:200000"]
-tasks = 60
+tasks = 100
 [robot]
 cpus = 0.1
 [link]
@@ -134,7 +134,7 @@ def test_a_server_that_an_event_starts_is_absent_before(read: Callable[..., Scen
     assert started_at_first(scenario) == ("cloud", "wan", "wan-edge")
     run = simulated(scenario)
     assert shares(run, 0, 20)[1] == 0
-    assert shares(run, 45, 60)[1] >= 60
+    assert shares(run, 75, 100)[1] >= 60
 
 
 def test_the_shares_of_the_sites_are_told_in_equal_parts_of_the_run() -> None:

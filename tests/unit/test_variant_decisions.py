@@ -116,7 +116,7 @@ def test_the_answer_of_a_probe_waits_as_long_as_it_is_worth(
         allowed=lambda: True,
         late=lambda *_: None,
     )
-    executions = race.run(Plan((CLOUD,), Probe(ONBOARD), patience_s=0.5))
+    executions = race.run(Plan((CLOUD,), Probe(ONBOARD), lost_s={ONBOARD: 0.5, CLOUD: 0.0}))
     assert answer_of(executions, kind_of(sort_out)).site == used
     assert clock.now_s() == pytest.approx(waited_s)
 
@@ -128,20 +128,21 @@ def forecast(**lost_s: float) -> Forecast:
 
 
 @pytest.mark.parametrize(
-    ("second", "onboard_s", "cloud_s", "patience_s"),
+    ("second", "both", "waits"),
     [
-        (Probe(ONBOARD), 0.5, 0.2, 0.3),
-        (Probe(ONBOARD), 0.2, 0.5, -0.3),
-        (Hedge(ONBOARD, 0.1), 0.5, 0.0, 0.0),
-        (None, 0.5, 0.0, 0.0),
+        (Probe(ONBOARD), False, True),
+        (None, True, True),  # a warm-up
+        (Hedge(ONBOARD, 0.1), False, False),
+        (None, False, False),
     ],
 )
-def test_only_a_probe_waits_for_the_better_answer(
-    second: Probe | Hedge | None, onboard_s: float, cloud_s: float, patience_s: float
+def test_only_a_probe_and_a_warm_up_wait_for_the_better_answer(
+    second: Probe | Hedge | None, both: bool, waits: bool
 ) -> None:
     """A hedge starts because the better answer is late by more than it is worth."""
-    plan = plan_of(Decision(CLOUD, "", "", second=second), forecast(onboard=onboard_s, cloud=cloud_s), None)
-    assert plan.patience_s == pytest.approx(patience_s)
+    decision = Decision(CLOUD, "", "", second=second, both=both)
+    plan = plan_of(decision, forecast(onboard=0.5, cloud=0.2), None)
+    assert plan.lost_s == ({ONBOARD: 0.5, CLOUD: 0.2} if waits else {})
 
 
 def late_errors() -> PredictionErrors:
