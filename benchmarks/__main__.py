@@ -15,6 +15,8 @@ TABLES = (
     "lower_bounds",
     "same_decisions",
     "calls",
+    "first_calls",
+    "deadlines",
     "server_load",
     "hundred_robots",
     "attacks",

@@ -46,3 +46,9 @@ def run_shortly(number: int) -> int:
 def over_a_bad_link(number: int) -> int:
     time.sleep(RUN_SERVER_S)
     return number
+
+
+@task("sleep_alike", size=lambda number: 1.0)  # noqa: ARG005 - all are equal
+def sleep_alike(number: int) -> int:
+    time.sleep(SLEEP_SERVER_S)
+    return number

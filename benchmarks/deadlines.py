@@ -1,17 +1,13 @@
 """Counts missed deadlines, and says why each was missed: a server that stalls, and a link that stalls.
 
-    python -m benchmarks.deadlines --calls 1000
-
 A call is missed for one of three causes: onboard was not started, it was started too late, or it ran longer
 than any of its last 100 runs.
 """
 
-import argparse
-import sys
 import tempfile
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,6 +21,7 @@ from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.runner import ONBOARD
 
 CONNECT_S = 30.0
+CALLS = 1000  # of each program
 ENDED_S = 10.0  # for the records of the last calls
 LAST = 100  # runs onboard that a late one is compared with
 SLOWER, TOO_LATE, NOT_STARTED = "onboard ran longer than before", "onboard started too late", "no onboard run"
@@ -124,18 +121,9 @@ def table(counted: Mapping[str, Counted]) -> Table:
     return Table("Calls with a deadline", columns, rows, requirements)
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.deadlines", description=__doc__)
-    parser.add_argument("--calls", type=int, default=1000, help="of each program (%(default)s)")
-    flags = parser.parse_args()
+def tables() -> Iterator[Table]:
     counted = {}
     for program in PROGRAMS:
         with tempfile.TemporaryDirectory() as folder:
-            counted[program.name] = play(program, flags.calls, Path(folder))
-    measured = table(counted)
-    print(measured)
-    return int(not all(one.holds for one in measured.requirements))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+            counted[program.name] = play(program, CALLS, Path(folder))
+    yield table(counted)
