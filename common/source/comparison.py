@@ -49,12 +49,12 @@ def versions(software: str) -> str:
     return f", or is only hashed in another way: Offboard {there} there, {VERSION} here"
 
 
-def other_sources(kinds: Mapping[str, str], there: Mapping[str, str]) -> list[str]:
-    """The tasks that both sides have, and whose source has another hash on the other side."""
+def other_sources(here: Mapping[str, str], there: Mapping[str, str]) -> list[str]:
+    """The tasks that both sides have, and whose source has another hash there, or cannot be read."""
     return [
         name
         for name, known in there.items()
-        if name in kinds and known[:HASH_LENGTH] != kinds[name][:HASH_LENGTH]
+        if name in here and not here[name][:HASH_LENGTH] == known[:HASH_LENGTH] != ""
     ]
 
 

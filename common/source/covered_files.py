@@ -41,7 +41,7 @@ class CoveredFiles:
     def begin(self, *, needed: bool = True) -> None:
         """Begin to read in a thread, once. ConfigError if a file that is `needed` cannot be opened."""
         with self._lock:
-            if self._reader is not None or self.lacking:
+            if self._reader is not None or (self.lacking and not needed):
                 return
             try:
                 for path in self.paths:
@@ -51,6 +51,7 @@ class CoveredFiles:
                     raise
                 self.lacking = True
                 return
+            self.lacking = False
             self._reader = threading.Thread(target=self._read, name=f"covers-{self._task}", daemon=True)
             try:
                 self._reader.start()
