@@ -2,13 +2,17 @@
 
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+import zmq
 
-from tests.curves import ROOT, Served, clean_environ
+from offboard.common import VERSION
+from offboard.common.wire import messages as wire
+from tests.curves import ROOT, Served, clean_environ, until
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(90)]
 
@@ -33,6 +37,7 @@ with Offloader.connect(sys.argv[1]) as offload:
     print(offload(twice, 3), offload.last.used)
 """
 MODEL = "model.bin"
+HASHED = f"or is only hashed in another way: Offboard 0.1.0 there, {VERSION} here"
 
 Sides = Callable[..., Served]
 
@@ -139,3 +144,41 @@ def test_a_missing_file_is_one_line(sides: Sides, tmp_path: Path) -> None:
         assert (done.returncode, done.stdout) == (2, "")
         assert done.stderr.count("\n") == 1
         assert said in done.stderr
+
+
+def test_a_robot_names_the_older_version_of_a_server(tmp_path: Path) -> None:
+    """An Offboard 0.1.0 hashed the same text in another way; wire version 1 still carries its `hello`."""
+    for name, text in (("mytask.py", TASK.format(covers="()")), ("robot.py", ROBOT)):
+        (tmp_path / name).write_text(text)
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as router:
+        router.linger = 0
+        port = router.bind_to_random_port("tcp://127.0.0.1")
+
+        def answer() -> None:
+            robot, *_ = router.recv_multipart()
+            router.send_multipart([robot, *wire.pack(wire.Hello({"twice": "a" * 64}, "0.1.0", 2**20))])
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        done = ran(tmp_path, "robot.py", f"tcp://127.0.0.1:{port}")
+        thread.join()
+    why = f"cloud: the source of task twice differs on the server, {HASHED}"
+    assert done.stdout.splitlines() == [why, "6 onboard"]
+    assert done.stderr.count(HASHED) == 1
+
+
+def test_a_server_names_the_older_version_of_a_robot(sides: Sides) -> None:
+    """It answers the `hello` as before, and logs once why the tasks of such robots stay onboard."""
+    served = sides("()")
+    hello = wire.pack(wire.Hello({"twice": "a" * 64}, "0.1.0", 2**20))
+    with zmq.Context() as context, context.socket(zmq.DEALER) as robot:
+        robot.linger = 0
+        robot.connect(served.endpoint)
+        for _ in range(2):
+            robot.send_multipart(hello)
+            answer = wire.unpack([bytes(frame) for frame in robot.recv_multipart()])
+            assert isinstance(answer, wire.Hello)
+            assert len(answer.tasks["twice"]) == 64
+    said = f"a robot keeps twice onboard: the source differs, {HASHED}"
+    until(lambda: served.logged(said))
+    assert served.logged("a robot keeps ") == 1

@@ -371,3 +371,19 @@ def test_another_version_of_offboard_is_named(made: Made, software: str) -> None
     assert both in str(caught.value)
     assert "; remedy: install the same version of Offboard and of " in str(caught.value)
     assert difference(kind, CLOUD, hashes(), software) is None
+
+
+def test_the_example_of_the_docs_covers_its_helper_and_its_file(tmp_path: Path, made: Made) -> None:
+    """`docs/own_task.md` shows a task of which no helper is left out."""
+    assert made
+    text = (Path(__file__).parents[2] / "docs/own_task.md").read_text()
+    example = text.split("```python\n# mygrader.py\n")[1].split("```")[0]
+    (tmp_path / "mygrader.py").write_text(example)
+    (tmp_path / "weights.txt").write_text("3")
+    importlib.invalidate_caches()
+    grader = importlib.import_module("mygrader")
+    kind = kind_in_use(grader.grade)
+    read_files_of_robot(kind)
+    assert len(kind.fingerprint) == 128
+    assert uncovered([kind]) == []
+    assert grader.grade(grader.load_weights(), [1.0, 2.0]) == 18.0
