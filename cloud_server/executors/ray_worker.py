@@ -180,7 +180,7 @@ class RayWorker:
             versions = f"{said.host} runs Offboard {said.version}, this server {VERSION}"
             failure = ConfigError(f"the Ray node {versions}; install the same version on all nodes")
         elif differing := [name for name, one in said.hashes if tasks.hashes().get(name) != one]:
-            others = f"{said.host} has another source of the task {differing[0]}, or of a file that it covers"
+            others = f"{said.host} has another source of the task {differing[0]}"
             failure = ConfigError(f"the Ray node {others}; install the same version of it on all nodes")
         if failure is not None:
             self.lose("start", f"did not start: {failure}", failure)
