@@ -33,7 +33,7 @@ def here() -> dict[str, str]:
 @pytest.mark.usefixtures("here")
 def test_both_versions_are_named_once(caplog: pytest.LogCaptureFixture) -> None:
     """A robot of version 0.1.0 cannot say it by itself: it blames the source of the task."""
-    hello = Hello({"heard_of": "f" * 64, "only_there": "a"}, "0.1.0", 1)
+    hello = Hello({"heard_of": "f" * 64, "not_known_here": "a"}, "0.1.0", 1)
     both = f"or is only hashed in another way: Offboard 0.1.0 there, {VERSION} here"
     remedy = "install the same version of Offboard, and of the tasks, on both sides"
     line = f"a robot keeps heard_of onboard: the source differs, {both}; remedy: {remedy}"
