@@ -117,13 +117,18 @@ def abandon(drain_s: float) -> NoReturn:
 
 
 def load_tasks(modules: Sequence[str]) -> tuple[str, ...]:
-    """Import the modules of the user's tasks, and of the empty task that `robot-client check` runs."""
+    """Import the modules of the user's tasks, and of the empty task that `robot-client check` runs.
+
+    The files that the tasks cover are read.
+    """
+    from offboard.common.source.reading import read_files_of_server
     from offboard.common.tasks import kinds, load_modules
 
     load_modules(modules)
     if not kinds():
         raise ConfigError(f"--tasks: {','.join(modules)} registers no task")
     load_modules([EMPTY_TASK_MODULE])
+    read_files_of_server()
     return (*modules, EMPTY_TASK_MODULE)
 
 

@@ -104,7 +104,7 @@ def create_app(
     @app.get("/tasks", summary="The tasks that this server runs")
     async def known_tasks() -> list[dict[str, Any]]:
         return [
-            {"name": one.name, "source_hash": one.source_hash, "duplicate": one.duplicate}
+            {"name": one.name, "source_hash": one.fingerprint, "duplicate": one.duplicate}
             for kind in tasks.kinds()
             for one in kind.on_servers()
         ]

@@ -18,6 +18,7 @@ from offboard.cloud_server.executors.executor import Executor
 from offboard.cloud_server.executors.task_run import Outcome
 from offboard.cloud_server.fair_queue import Work
 from offboard.cloud_server.metrics import Metrics, RobotUse, Status
+from offboard.cloud_server.other_versions import OtherVersions
 from offboard.cloud_server.rate_limit import CUT_OFF_S, RateLimit, Verdict
 from offboard.cloud_server.reader_threads import ReaderThreads
 from offboard.cloud_server.robot_socket import ReplySender, bind_router
@@ -104,6 +105,7 @@ class Server:
         self._rate_limit = RateLimit(limits.robot_bytes_per_s, message_max)
         self._blobs = BlobStore(limits.blob_bytes_max)
         self._channel = Channel(self._socket)
+        self._other_versions = OtherVersions()
         self._sender = ReplySender(self._channel, metrics, message_max, self._access.knows)
         self._load = LoadWatch(Load(SELF, own_s=executor.used_s), SERVER_EVERY_S)
         self._scheduler = Scheduler(
@@ -270,6 +272,7 @@ class Server:
             case Ping(id):
                 self._sender.send(peer, Pong(id, self._scheduler.waiting, *self._latest_load()))
             case Hello():
+                self._other_versions.hear(message)
                 # Robots repeat their hello until it is answered, and send no task before that.
                 if self._scheduler.ready and not self._scheduler.draining:
                     self._sender.send(peer, self._hello())

@@ -1,17 +1,13 @@
-"""The functions that a task is made of: which ones are allowed, what a caller gives them, their source.
+"""The functions that a task is made of: which ones are allowed, and what a caller gives them.
 
-`tasks` registers them.
+`tasks` registers them; what counts as their source is in `source`.
 """
 
 import inspect
-import textwrap
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from offboard.common.dataclass_types import field_names
 from offboard.common.errors import ConfigError
-
-Packing = tuple[Callable[..., Any] | None, Callable[..., Any] | None]  # pack and unpack
 
 OPTIONS = ("deadline_s", "function", "observe", "timeout_s", "where")  # of a call, in this version or others
 
@@ -90,48 +86,3 @@ def without_state(signature: inspect.Signature, setup: object) -> inspect.Signat
 
 def name_of(function: object) -> str:
     return getattr(function, "__qualname__", None) or repr(function)
-
-
-def source_hash(
-    function: Callable[..., Any],
-    setup: Callable[[], Any] | None,
-    types: Iterable[type],
-    packing: Packing,
-) -> str:
-    """SHA-256 of the source of a function, its setup, its dataclasses with their fields, and its packing.
-
-    An empty text, which matches nothing, if the function has no source.
-    """
-    if not _source(function):
-        return ""
-    return _hash([_source(function), _source(setup), *_sources(types, packing)])
-
-
-def contract_hash(signature: inspect.Signature, types: Iterable[type], packing: Packing) -> str:
-    """SHA-256 of what all variants of a task have in common: what a caller gives, dataclasses, and packing.
-
-    Defaults do not count: the robot fills them in.
-    """
-    given = [f"{one.kind.name} {one.name}" for one in signature.parameters.values()]
-    return _hash(["variants", *given, *_sources(types, packing)])
-
-
-def _sources(types: Iterable[type], packing: Packing) -> list[str]:
-    parts = [part for one in types for part in (_source(one), *sorted(field_names(one)))]
-    return parts + [_source(one) for one in packing if one is not None]
-
-
-def _hash(parts: Iterable[str]) -> str:
-    import hashlib  # it loads OpenSSL, which --help does not need
-
-    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
-
-
-def _source(of: Any) -> str:
-    try:
-        # Code of exec and of `python -c` has this file name. Python 3.13 keeps the source of -c under it.
-        if inspect.getfile(inspect.unwrap(of)) == "<string>":
-            return ""
-        return textwrap.dedent(inspect.getsource(of))
-    except (OSError, TypeError):
-        return ""

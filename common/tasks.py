@@ -14,15 +14,15 @@ from typing import Any, TypeVar
 
 from offboard.common.dataclass_types import check_types
 from offboard.common.errors import BadValue, ConfigError, UnknownTask, describe, is_interrupt
+from offboard.common.source.covers import Covers, covers_by_site, covers_of
+from offboard.common.source.source_hash import contract_hash, source_hash
 from offboard.common.task_functions import (
     check_first_parameter,
     check_ordinary,
     check_packing,
     check_parameters,
     check_variant,
-    contract_hash,
     name_of,
-    source_hash,
     without_state,
 )
 from offboard.common.variants import AT, CLOUD, ONBOARD, Variant, elsewhere, group_of, variants_of
@@ -49,6 +49,7 @@ class Kind:
 
     `variants` holds a kind for each site, if sites run different functions, with the `quality` of its answers
     from 0 to 1. `source_hash` then covers what they have in common: parameters, dataclasses, pack and unpack.
+    `covers` says what else counts as source; the contents of its files are no part of `source_hash`.
     `policy_server`: a policy server may answer too.
     """
 
@@ -67,6 +68,7 @@ class Kind:
     pack: Callable[..., Any] | None = None
     unpack: Callable[[Any], Any] | None = None
     policy_server: bool = False
+    covers: Covers = field(default_factory=Covers, compare=False)
     _counts: list[int] = field(default_factory=list, compare=False, repr=False)  # the first one holds for all
 
     def bind(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:
@@ -99,6 +101,15 @@ class Kind:
         if not self.variants:
             return (self,)
         return tuple(one for site, one in self.variants.items() if site != ONBOARD and one.present)
+
+    @property
+    def fingerprint(self) -> str:
+        """What a `hello` says: the hash of the source, and then that of the covered files, once it is known.
+
+        It is empty, and matches nothing, if the source cannot be read.
+        """
+        files = self.covers.files
+        return self.source_hash + files.digest if self.source_hash and files is not None else self.source_hash
 
     @property
     def present(self) -> bool:
@@ -184,11 +195,15 @@ def task(
     pack: Callable[..., Any] | None = None,
     unpack: Callable[[Any], Any] | None = None,
     policy_server: bool = False,
+    version: str | int = "",
+    covers: Sequence[Any] | Mapping[str, Sequence[Any]] = (),
 ) -> Callable[[F], F]:
     """Register a function as a kind of task. It can still be called as an ordinary function.
 
     Robot and server load the same module. If the source of the function, of its setup, of its pack or unpack
     or of its dataclasses differs between them, the task stays onboard.
+    `covers`: functions, classes and paths of files that count too, relative to the file of the function; with
+    variants it may be a dictionary by site. `version`: a text or whole number that counts too.
     If `size` returns several numbers, the predictor `least-squares` uses all of them, and every other one
     uses the first; `parts` predicts from the work instead if the kind tells it (by the first number too).
 
@@ -206,14 +221,17 @@ def task(
     def register(function: F) -> F:
         found = variants_of(name, function, variants=variants, quality=quality, setup=setup)
         own: Any = found[CLOUD].setup if found else setup
+        by_site = covers_by_site(name, function, covers=covers, sites=found)
+        shared = () if isinstance(covers, Mapping) else covers
         kind = _checked(
             Kind(
                 name, function, size, duplicate,
                 types=tuple(types), warm=warm, work=work, setup=own,
                 pack=pack, unpack=unpack, policy_server=policy_server,
+                covers=covers_of(name, function, version=version, covers=shared),
             )
         )  # fmt: skip
-        _add(_with_variants(kind, found) if found else kind)
+        _add(_with_variants(kind, found, by_site) if found else kind)
         return function
 
     return register
@@ -253,7 +271,7 @@ def is_kind(name: str) -> bool:
 
 def hashes() -> dict[str, str]:
     """What a `hello` says: the hash of each task, and of each variant that servers run."""
-    return {one.name: one.source_hash for kind in kinds() for one in (kind, *kind.on_servers())}
+    return {one.name: one.fingerprint for kind in kinds() for one in (kind, *kind.on_servers())}
 
 
 def kinds() -> tuple[Kind, ...]:
@@ -289,7 +307,8 @@ def _checked(kind: Kind) -> Kind:
     if kind.policy_server and (count != 1 or kind.pack is not None):
         needs = "a function of one argument, the observation, and no pack="
         raise ConfigError(f"task {name}: policy_server=True needs {needs}")
-    own_hash = source_hash(function, setup, kind.types, (kind.pack, kind.unpack))
+    packing = (kind.pack, kind.unpack)
+    own_hash = source_hash(function, setup, kind.types, packing, covers=kind.covers)
     return replace(kind, positional=count, source_hash=own_hash)
 
 
@@ -306,12 +325,12 @@ def _add(kind: Kind) -> None:
     _on_servers.update((one.name, one) for one in kind.on_servers())
 
 
-def _with_variants(kind: Kind, found: Mapping[str, Variant]) -> Kind:
+def _with_variants(kind: Kind, found: Mapping[str, Variant], by_site: Mapping[str, Covers]) -> Kind:
     """The kind with a kind for each site, named TASK@SITE."""
     name, given = kind.name, kind.signature()
     if kind.work is not None:
         raise ConfigError(f"task {name}: work= cannot be used with variants=, which may do different work")
-    made = {}
+    packing, made = (kind.pack, kind.unpack), {}
     for site, one in found.items():
         function: Callable[..., Any] = elsewhere
         own_hash = ""
@@ -319,16 +338,15 @@ def _with_variants(kind: Kind, found: Mapping[str, Variant]) -> Kind:
             function = one.function
             check_ordinary(name, variant=function, setup=one.setup)
             check_variant(name, site, function, setup=one.setup, given=given)
-            own_hash = source_hash(function, one.setup, kind.types, (kind.pack, kind.unpack))
+            own_hash = source_hash(function, one.setup, kind.types, packing, covers=by_site[site])
         made[site] = replace(
             kind, name=f"{name}{AT}{site}", function=function, setup=one.setup, source_hash=own_hash,
-            quality=one.quality,
+            quality=one.quality, covers=by_site[site],
         )  # fmt: skip
         if len(made[site].name) > NAME_LENGTH_MAX:
             raise ConfigError(f"task {name}: {made[site].name!r} has over {NAME_LENGTH_MAX} characters")
-    return replace(
-        kind, source_hash=contract_hash(given, kind.types, (kind.pack, kind.unpack)), variants=made
-    )
+    shared = contract_hash(given, kind.types, packing, covers=kind.covers)
+    return replace(kind, source_hash=shared, variants=made)
 
 
 def _meant(name: str) -> str:

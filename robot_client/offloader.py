@@ -18,7 +18,8 @@ from typing import Any, Self, TypeVar, cast
 
 from offboard.common.errors import ConfigError
 from offboard.common.live.robot_live import RobotLive
-from offboard.common.tasks import Task, kind_of
+from offboard.common.source.reading import kind_in_use
+from offboard.common.tasks import Task
 from offboard.robot_client import policies
 from offboard.robot_client.discovery.present_sites import PresentSites
 from offboard.robot_client.execution.batch import Batch, Placed, arguments
@@ -173,7 +174,7 @@ class Offloader:
         if self._life.forked:
             self._life.refuse_in_fork()
         budget_s = self._timeout_s if timeout_s is None else checked_timeout(timeout_s)
-        kind = kind_of(function)
+        kind = kind_in_use(function)
         args = kind.bind(args, kwargs)
         task = new_task(kind, args)
         if deadline_s is None:
@@ -200,7 +201,7 @@ class Offloader:
         """
         self._life.refuse_in_fork()
         budget_s = self._timeout_s if timeout_s is None else checked_timeout(timeout_s)
-        kind = kind_of(function)
+        kind = kind_in_use(function)
         tasks = [new_task(kind, args) for args in arguments(kind, items)]
         runners = self._sites.now
         if self._observes:
@@ -240,7 +241,7 @@ class Offloader:
         self._life.refuse_in_fork()
         if deadline_s is not None:
             checked_timeout(deadline_s, "deadline_s")
-        kind = kind_of(function)
+        kind = kind_in_use(function)
         args = kind.bind(args, kwargs)
         task, runners = new_task(kind, args), self._sites.now
         absent = absent_sites(runners, kind)
@@ -266,7 +267,7 @@ class Offloader:
         once if waiting changes nothing, as for a server that has other source.
         """
         self._life.refuse_in_fork()
-        return wait_for_sites(self._sites, kind_of(function), timeout_s)
+        return wait_for_sites(self._sites, kind_in_use(function), timeout_s)
 
     def show_on(self, live: RobotLive[Record]) -> None:
         """Show these sites and this allowance on a live page, next to the records that it gets."""

@@ -21,6 +21,7 @@ from offboard.common.host.cgroup import SELF
 from offboard.common.host.cpu_time import process_s
 from offboard.common.host.load import SERVER_EVERY_S, Load
 from offboard.common.host.load_watch import LoadWatch
+from offboard.common.source.reading import read_files_of_server
 from offboard.common.task_states import TaskStates
 from offboard.common.wire.blobs import StoredBlob
 
@@ -84,6 +85,7 @@ class RayActor:
         sys.path += [one for one in setup.path if one not in sys.path and Path(one).exists()]
         try:
             tasks.load_modules(setup.modules)
+            read_files_of_server()
             warm_kinds(self._states)
         except TaskFailed as failure:
             return Started(str(failure), failure.traceback, of_task=True)

@@ -183,7 +183,8 @@ class Check:
 
     def _compare_tasks(self) -> str:
         assert self._server is not None
-        return compare(self._kinds, self._server.tasks, chosen=self._chosen)
+        server = self._server
+        return compare(self._kinds, server.tasks, chosen=self._chosen, software=server.software)
 
     def _ping(self) -> str:
         assert self._session is not None

@@ -3,20 +3,27 @@
 import contextlib
 from collections.abc import Mapping, Sequence
 
+from offboard.common import VERSION as SOFTWARE
 from offboard.common.empty_task import EMPTY
 from offboard.common.errors import ConfigError
+from offboard.common.source.comparison import difference, other_sources, versions
+from offboard.common.source.reading import read_files_of_robot
+from offboard.common.source.uncovered import not_compared
 from offboard.common.tasks import Kind, kinds, load_modules
 from offboard.common.variants import AT
 from offboard.robot_client.check.outcome import StepFailed
-from offboard.robot_client.sites.absence import difference
 from offboard.robot_client.sites.runner import CLOUD
 
+COMPARED = "functions, setups, packing, dataclasses and what covers= names"
 HASH_SHOWN = 8  # characters of a source hash
 PLANNER = "offboard.common.planning.planner"
 
 
 def load_kinds(modules: Sequence[str]) -> tuple[Kind, ...]:
-    """The tasks of these modules; without modules those of the planner, if it is installed."""
+    """The tasks of these modules; without modules those of the planner, if it is installed.
+
+    The files that they cover are read.
+    """
     if not modules:
         with contextlib.suppress(ConfigError):  # the extra `planning` is not installed
             return _registered_by([PLANNER])
@@ -24,13 +31,18 @@ def load_kinds(modules: Sequence[str]) -> tuple[Kind, ...]:
     found = _registered_by(modules)
     if not found:
         raise ConfigError(f"--tasks: {','.join(modules)} registers no task")
+    for kind in found:
+        read_files_of_robot(kind)
     return found
 
 
-def compare(tasks: Sequence[Kind], there: Mapping[str, str], *, chosen: bool) -> str:
+def compare(
+    tasks: Sequence[Kind], there: Mapping[str, str], *, chosen: bool, software: str = SOFTWARE
+) -> str:
     """What is the same on both sides; `there` holds the source hash of each task of the server.
 
-    A missing task is a failure only if the user has `chosen` the tasks to compare.
+    `software`: the version of Offboard there. A missing task is a failure only if the user has `chosen` the
+    tasks to compare.
     """
     known = ", ".join(sorted(name for name in there if name != EMPTY and AT not in name)) or "none"
     for kind in tasks:
@@ -42,16 +54,18 @@ def compare(tasks: Sequence[Kind], there: Mapping[str, str], *, chosen: bool) ->
                 f"the server has no task {kind.name}; it has {known}",
                 f"start the server with --tasks {module}",
             )
-        remedy = f"install the same version of {module} on both sides, and restart the server"
-        if kind.variants and (why := difference(kind, CLOUD, there)) is not None:
-            raise StepFailed(why, remedy)
-        if not kind.variants and not kind.source_hash == there[kind.name] != "":
+        why = difference(kind, CLOUD, there, software)
+        if why is None:
+            continue
+        if not kind.variants and other_sources({kind.name: kind.source_hash}, there):
             hashes = f"{_short(kind.source_hash)} here, {_short(there[kind.name])} on the server"
-            raise StepFailed(f"{kind.name} differs: its source is {hashes}", remedy)
+            why = f"{kind.name} differs: its source is {hashes}{versions(software)}"
+        what = module if software == SOFTWARE else f"Offboard and of {module}"
+        raise StepFailed(why, f"install the same version of {what} on both sides, and restart the server")
     if not tasks:
         return "none to compare; name modules with --tasks"
     names = ", ".join(kind.name for kind in tasks)
-    return f"functions, setups, packing and dataclasses are the same on both sides: {names}"
+    return f"{COMPARED} are the same on both sides: {names}; not compared: {not_compared(tasks)}"
 
 
 def _registered_by(modules: Sequence[str]) -> tuple[Kind, ...]:

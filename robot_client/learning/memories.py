@@ -5,6 +5,7 @@ What is known of one kind is in `kind`; the file that memories are saved to is i
 
 from collections.abc import Callable, Collection
 
+from offboard.common.source.reading import is_reading
 from offboard.common.tasks import Kind
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.memory_file import KeptKind
@@ -64,7 +65,7 @@ class Memories:
                 measured=self._measured,
                 s_per_quality=self._s_per_quality,
             )
-        if self._store is not None:
+        if self._store is not None and not is_reading(kind):
             self._store.recall(found, sites)
         return found
 

@@ -63,7 +63,7 @@ class Store:
             return
         for name in [name for name in kept.sites if name in sites]:
             site = kept.sites.pop(name)
-            if not site.source == kind.at(name).source_hash != "":
+            if not site.source == kind.at(name).fingerprint != "":
                 text = "memory %s: %s on %s starts cold: the source of its variant has changed or is not here"
                 log.info(text, self.path, kind.name, name)
             elif observations := _as_learnt(self._believed(site), kept.per, memory.per_work):
@@ -72,7 +72,7 @@ class Store:
 
     def _begin(self, memory: KindMemory, kept: KeptKind) -> None:
         kind = memory.kind
-        if not kind.source_hash or kept.source != kind.source_hash:
+        if not kind.fingerprint or kept.source != kind.fingerprint:
             log.info("memory %s: task %s starts cold because its source has changed", self.path, kind.name)
             return
         if not _fits(kept, kind.size_count):
@@ -98,11 +98,11 @@ class Store:
             sites = dict(self._away[name].sites) if name in self._away else {}
             for site, learnt in memory.sites.items():
                 if learnt.observations:
-                    source = memory.kind.at(site).source_hash
+                    source = memory.kind.at(site).fingerprint
                     sites[site] = KeptSite(now, source, tuple(learnt.observations))
             per = PER_WORK if memory.per_work else PER_SIZE
-            live[name] = KeptKind(memory.kind.source_hash, per, tuple(memory.worked), sites)
-        return self._kept | live
+            live[name] = KeptKind(memory.kind.fingerprint, per, tuple(memory.worked), sites)
+        return live | self._kept  # a kind whose covered files are still being read is not recalled yet
 
     def save_soon(self, kinds: Mapping[str, KeptKind]) -> None:
         """Write the file in a thread."""

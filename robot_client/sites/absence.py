@@ -54,31 +54,6 @@ class CrossingPauses:
         return f"{why}; next try in {left_s:.0f} s"
 
 
-def difference(kind: Kind, site: str, there: Mapping[str, str]) -> str | None:
-    """Why the server of this site cannot take a kind; `there` has the hashes of its `hello`. None if it can.
-
-    If one side does not have the function of a variant, only what all variants have in common is compared.
-    """
-    name = kind.name
-    if there.get(name) == kind.source_hash != "":
-        variant = kind.at(site)
-        if variant is kind:
-            return None
-        known = there.get(variant.name)
-        if known is None:
-            return f"the server does not have {variant.name}, a variant of task {name}"
-        if known == variant.source_hash != "" or not variant.present:
-            return None
-        return f"the source of {variant.name}, a variant of task {name}, differs on the server"
-    if name not in there:
-        return f"the server has no task {name}"
-    if not kind.variants:
-        return f"the source of task {name} differs on the server"
-    if not any(one.name in there for one in kind.variants.values()):
-        return f"task {name} has no variants on the server"
-    return f"the parameters, dataclasses or packing of task {name} differ on the server"
-
-
 def absent_sites(runners: Mapping[str, Runner], kind: Kind) -> Absent:
     """The sites that cannot take this kind now."""
     return Absent({site: why for site, runner in runners.items() if (why := runner.unavailable(kind))})

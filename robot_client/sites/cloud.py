@@ -27,11 +27,13 @@ from offboard.common.errors import (
     describe,
 )
 from offboard.common.security.keys import RobotKeys
+from offboard.common.source.comparison import difference
+from offboard.common.source.reading import is_reading
 from offboard.common.tasks import Kind, Task, hashes
 from offboard.common.wire import messages as wire
 from offboard.common.wire.compression import compressions
 from offboard.common.wire.payload import payload_bytes
-from offboard.robot_client.sites.absence import CrossingPauses, difference
+from offboard.robot_client.sites.absence import CrossingPauses
 from offboard.robot_client.sites.background import Background
 from offboard.robot_client.sites.blob_uploads import BlobUploads
 from offboard.robot_client.sites.cloud_socket import MESSAGE_BYTES_MAX, CloudSocket, SocketEvent
@@ -80,6 +82,7 @@ class CloudRunner:
         self._heartbeat = Heartbeat(heartbeat_s, seed, background)
         self._heartbeat_wanted = False  # by `hurry`
         self._remote: dict[str, str] = {}  # source hashes at the server, by kind and variant
+        self._remote_software = SOFTWARE
         self._message_bytes_max = MESSAGE_BYTES_MAX  # what the server takes, once it has said so
         self._compressions = set(compressions() if compress else ())
         self._compresses = False  # whether the server takes what one of them makes
@@ -111,9 +114,11 @@ class CloudRunner:
         absent = self._connection.why_absent
         if absent is not None:
             return absent
-        why = difference(kind, self.site, self._remote)
+        why = difference(kind, self.site, self._remote, self._remote_software)
         if why is None:
             return self._pauses.why_absent(kind.name)
+        if is_reading(kind):
+            return why
         if kind.name not in self._warned:
             self._warned.add(kind.name)
             text = "%s: %s: this task stays onboard; remedy: install the same version there, and restart it"
@@ -324,7 +329,8 @@ class CloudRunner:
 
     def _take(self, message: wire.Message, received_s: float, bytes_in: int) -> None:
         if isinstance(message, wire.Hello):
-            self._remote, self._message_bytes_max = message.tasks, message.message_bytes_max
+            self._remote, self._remote_software = message.tasks, message.software
+            self._message_bytes_max = message.message_bytes_max
             self._compresses = not self._compressions.isdisjoint(message.compressions)
             if self._connection.hello_answered(received_s):
                 self._heartbeat.start(received_s)

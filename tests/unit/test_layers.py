@@ -24,6 +24,7 @@ FOLDERS: dict[str, set[str]] = {
     "common/wire": {"common"},
     "common/planning": {"common"},
     "common/security": {"common"},
+    "common/source": {"common", "common/security"},
     "common/host": set(),
     "common/live": {"common", "common/security"},
     "robot_client/sites": set(),

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from offboard.common.errors import BadValue, ProtocolError
+from offboard.common.source.source_hash import HASH_LENGTH
+from offboard.common.tasks import KINDS_MAX
 from offboard.common.tracebacks import TRACEBACK_LENGTH_MAX
 from offboard.common.wire import messages as wire
 from offboard.common.wire.messages import Blob, Cancel, Hello, Ping, Pong, Reply, Request
@@ -234,3 +236,10 @@ def test_a_message_that_is_too_large_is_not_packed() -> None:
     """The limits hold for sent messages too."""
     with pytest.raises(BadValue):
         wire.pack(Hello({f"task_{n:05}": "h" * 64 for n in range(1000)}, "1", 1))
+
+
+def test_the_largest_hello_fits_into_a_header() -> None:
+    """As many tasks as a process may have, with names and hashes of full length, files included."""
+    names = [f"{number:064}" for number in range(KINDS_MAX)]
+    hello = Hello(dict.fromkeys(names, "f" * 2 * HASH_LENGTH), "0.1.0", 4096)
+    assert wire.unpack(wire.pack(hello)) == hello
