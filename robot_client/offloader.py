@@ -318,16 +318,13 @@ class Offloader:
         runners = self._sites.now
         if len(runners) > 1:
             self._crossing.check_arguments(task)
-        started_at, started_s = datetime.now(UTC), self._clock.now_s()
-        number = next(self._numbers)
+        started_at, started_s, number = datetime.now(UTC), self._clock.now_s(), next(self._numbers)
         absent = absent_sites(runners, task.kind)
         with self._lock:
             self._allowance.begin(started_s)
             memory = self._memories.of(task.kind, runners)
             sites = present_sites(runners, absent)
-            forecast = self._forecaster.forecast(
-                memory, task, sites, timeout_s=budget_s, now_s=self._clock.now_s()
-            )
+            forecast = self._forecaster.forecast(memory, task, sites, timeout_s=budget_s, now_s=started_s)
             if self._sites.changing:
                 self._sites.count_task(finishes_of(forecast), started_s)
             within_s = self._memories.deadline_s if deadline_s is None else deadline_s
