@@ -135,7 +135,7 @@ def test_a_better_answer_is_worth_its_quality() -> None:
     """The cloud is 0.2 s slower, and its better answers count as 0.5 s: each task would be sent."""
     robot = Robot()
     robot.sites[ONBOARD].takes, robot.sites[CLOUD].takes = 1.0, 1.2
-    for _ in range(60):
+    for _ in range(200):
         robot.offload(observed_graded, 1.0)
     found = robot.offload.savings()["observed_graded"]
     assert found is not None
