@@ -39,7 +39,9 @@ def test_a_run_without_plotly_goes_on(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr("offboard.common.live.live_files.find_spec", lambda _: None)
     said: list[str] = []
     with watching(tmp_path, said.append, page=Page.OPENED):
-        assert said == ["no live page: the page /live needs the extra 'live': pip install 'offboard[live]'"]
+        assert said == [
+            "no live page: the page /live needs the extra 'live': run pip install '.[live]' in a checkout of Offboard"
+        ]
 
 
 def test_watching_ends_with_ctrl_c(tmp_path: Path) -> None:

@@ -85,7 +85,10 @@ def test_a_missing_library_is_one_short_line(
     named = {"task": "tests.frames:brightness", "inputs": "tests.frames:frames"}
     with pytest.raises(ConfigError) as caught:
         make_calls(CallConfig(**named | {missing: "needy_module:f"}))  # type: ignore[arg-type]
-    assert str(caught.value) == "tags needs the extra 'apriltags': pip install 'offboard[apriltags]'"
+    assert (
+        str(caught.value)
+        == "tags needs the extra 'apriltags': run pip install '.[apriltags]' in a checkout of Offboard"
+    )
 
 
 def test_exactly_as_many_inputs_as_tasks_are_enough() -> None:

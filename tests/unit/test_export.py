@@ -151,7 +151,10 @@ def test_a_missing_library_names_the_extra(tmp_path: Path, library: str) -> None
     command = [sys.executable, "-c", code, "export", str(tmp_path), "--mcap", str(tmp_path / "a.mcap")]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60)
     assert done.returncode == 2
-    assert done.stderr == "loadgen export: --mcap needs the extra 'mcap': pip install 'offboard[mcap]'\n"
+    assert (
+        done.stderr
+        == "loadgen export: --mcap needs the extra 'mcap': run pip install '.[mcap]' in a checkout of Offboard\n"
+    )
     assert not (tmp_path / "a.mcap").exists()
 
 

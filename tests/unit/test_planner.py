@@ -258,7 +258,10 @@ def test_without_numba_planning_names_the_extra() -> None:
         "except MissingExtra as error: print(error)\n"
     )
     ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert ran.stdout.strip() == "planning needs the extra 'planning': pip install 'offboard[planning]'"
+    assert (
+        ran.stdout.strip()
+        == "planning needs the extra 'planning': run pip install '.[planning]' in a checkout of Offboard"
+    )
 
 
 def test_scan_hits_are_in_cells() -> None:

@@ -60,7 +60,7 @@ def test_anything_else_is_refused(endpoint: str) -> None:
 
 def test_connect_asks_for_the_setting() -> None:
     """Nothing is opened before the endpoints are checked."""
-    pytest.importorskip("websockets", reason="needs the extra 'openpi': pip install 'offboard[openpi]'")
+    pytest.importorskip("websockets", reason="needs the extra 'openpi': pip install '.[openpi]'")
     with pytest.raises(
         ConfigError, match=r"^gpu: 'ws://192.0.2.1:8000' is not encrypted.*Settings\(insecure"
     ):
@@ -92,5 +92,5 @@ def test_without_its_library_one_line_names_the_extra() -> None:
     )
     done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True, cwd=ROOT, timeout=30)
     assert done.stdout == (
-        "a policy server (ws:// or wss://) needs the extra 'openpi': pip install 'offboard[openpi]'\n"
+        "a policy server (ws:// or wss://) needs the extra 'openpi': run pip install '.[openpi]' in a checkout of Offboard\n"
     ), done.stderr

@@ -209,7 +209,7 @@ def test_without_matplotlib_the_extra_is_named(tmp_path: Path) -> None:
 
     done = run(str(write_rows(tmp_path, THOUSAND[:4])))
     assert done.stderr == (
-        "loadgen report: loadgen report needs the extra 'report': pip install 'offboard[report]'\n"
+        "loadgen report: loadgen report needs the extra 'report': run pip install '.[report]' in a checkout of Offboard\n"
     )
     assert done.returncode == 2
     assert run("--help").returncode == 0

@@ -36,7 +36,7 @@ def test_without_cyclonedds_one_line_names_the_extra() -> None:
     )
     assert done.returncode == 2
     assert done.stderr == (
-        "robot-client ros2: a bridge without ROS needs the extra 'dds': pip install 'offboard[dds]'\n"
+        "robot-client ros2: a bridge without ROS needs the extra 'dds': run pip install '.[dds]' in a checkout of Offboard\n"
     )
 
 
