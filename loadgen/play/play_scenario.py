@@ -225,6 +225,11 @@ def _findings(outcome: Outcome) -> Iterator[str]:
         share = f"{rounded(percent, 2)} % of the mean time of a task"
         yield f"overhead of Offboard itself: {duration(overhead_ms / 1e3)} per task (median), {share}"
     yield from _by_quality(outcome)
+    wrong = [one for one in outcome.answered if one.wrong is not None]
+    if wrong:
+        first = wrong[0]
+        said = f"{len(wrong)} answers are wrong; the first is that of task {first.i} from {first.used}"
+        yield f"warning: {said}: {first.wrong}"
     unverified = [one for one in outcome.answered if one.unverified is not None]
     if unverified:
         first = unverified[0]

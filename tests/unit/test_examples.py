@@ -15,6 +15,7 @@ import pytest
 from offboard import MissingExtra
 from offboard.common.tasks import Kind, kinds
 from offboard.common.wire.values import decode, encode
+from tests.extras import needs
 
 ROOT = Path(__file__).parents[2]
 CALLS = 2
@@ -125,9 +126,7 @@ def program(name: str, *words: str, absent: str = "") -> "subprocess.CompletedPr
 def test_a_program_without_its_library_says_what_to_install(name: str) -> None:
     """It ends with one line and exit code 2; so does the measurement of this example."""
     extra, library, _ = APPLICATIONS[name]
-    said = (
-        f"examples.{name} needs the extra '{extra}': run pip install '.[{extra}]' in a checkout of Offboard\n"
-    )
+    said = f"{needs(f'examples.{name}', extra)}\n"
     done = program(name, "tcp://127.0.0.1:5555", absent=library)
     assert (done.returncode, done.stdout, done.stderr) == (2, "", said)
     done = program("measure", name, absent=library)

@@ -10,6 +10,7 @@ from offboard import Offloader, Settings
 from offboard.common.errors import ConfigError
 from offboard.common.tasks import task
 from offboard.robot_client.openpi.endpoint import check_policy_server, check_site, is_readable
+from tests.extras import needs
 
 ROOT = Path(__file__).parents[2]
 ALLOWED = [
@@ -91,6 +92,4 @@ def test_without_its_library_one_line_names_the_extra() -> None:
         "    print(error)\n"
     )
     done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True, cwd=ROOT, timeout=30)
-    assert done.stdout == (
-        "a policy server (ws:// or wss://) needs the extra 'openpi': run pip install '.[openpi]' in a checkout of Offboard\n"
-    ), done.stderr
+    assert done.stdout == (f"{needs('a policy server (ws:// or wss://)', 'openpi')}\n"), done.stderr
