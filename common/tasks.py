@@ -204,7 +204,9 @@ def task(
     check_types(name, types)
 
     def register(function: F) -> F:
-        found = variants_of(name, function, variants=variants, quality=quality, setup=setup)
+        found = variants_of(
+            name, function, variants=variants, quality=quality, setup=setup, policy_server=policy_server
+        )
         own: Any = found[CLOUD].setup if found else setup
         kind = _checked(
             Kind(

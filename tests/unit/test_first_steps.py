@@ -13,7 +13,7 @@ from tests.extras import needs
 
 ROOT = Path(__file__).parents[2]
 INSTALL = re.compile(r"pip install[^\n`]*?'([^'\n]*)\[([a-z0-9,-]+)\]'")
-PAGES = sorted(path for path in (ROOT / "docs").glob("*.md")) + [ROOT / "README.md"]
+PAGES = [*sorted((ROOT / "docs").glob("*.md")), ROOT / "README.md"]
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="no make; remedy: apt-get install make")
@@ -39,4 +39,4 @@ def test_each_install_command_of_a_page_is_for_a_checkout(page: Path) -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     for what, names in INSTALL.findall(page.read_text()):
         assert what != "offboard", f"pip install 'offboard[{names}]'"
-        assert what != "." or set(names.split(",")) - {"NAME"} <= extras.keys()
+        assert what != "." or {*names.split(",")} <= extras.keys()
