@@ -225,15 +225,11 @@ def _findings(outcome: Outcome) -> Iterator[str]:
         share = f"{rounded(percent, 2)} % of the mean time of a task"
         yield f"overhead of Offboard itself: {duration(overhead_ms / 1e3)} per task (median), {share}"
     yield from _by_quality(outcome)
-    wrong = [one for one in outcome.answered if one.wrong is not None]
-    if wrong:
-        first = wrong[0]
-        said = f"{len(wrong)} answers are wrong; the first is that of task {first.i} from {first.used}"
-        yield f"warning: {said}: {first.wrong}"
-    unverified = [one for one in outcome.answered if one.unverified is not None]
-    if unverified:
-        first = unverified[0]
-        yield f"warning: {len(unverified)} answers are not verified; task {first.i}: {first.unverified}"
+    for field, said in (("wrong", "are wrong"), ("unverified", "are not verified")):
+        found = [one for one in outcome.answered if getattr(one, field) is not None]
+        if found:
+            first = f"the first is that of task {found[0].i} from {found[0].used}"
+            yield f"warning: {len(found)} answers {said}; {first}: {getattr(found[0], field)}"
 
 
 def _by_quality(outcome: Outcome) -> Iterator[str]:
