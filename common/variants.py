@@ -55,7 +55,7 @@ def variants_of(
     A site without a function of its own runs the decorated `function`.
     """
     try:
-        return _variants_of(task, function, variants, quality, setup)
+        return _variants_of(task, function, variants=variants, quality=quality, setup=setup)
     except ConfigError as error:
         if not policy_server:
             raise
@@ -63,7 +63,7 @@ def variants_of(
 
 
 def _variants_of(
-    task: str, function: Callable[..., Any], variants: object, quality: object, setup: object
+    task: str, function: Callable[..., Any], *, variants: object, quality: object, setup: object
 ) -> dict[str, Variant]:
     if variants is None and quality is None:
         if isinstance(setup, Mapping):

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from offboard.common.wording import rounded
+from offboard.common.text.wording import rounded
 from offboard.loadgen.table.confidence_intervals import Blocks, Picks
 from offboard.loadgen.table.measured_rows import Column
 from offboard.loadgen.table.table_formats import UNDEFINED, Heading

@@ -9,7 +9,7 @@ from dataclasses import make_dataclass
 from typing import Any
 
 from offboard.common.errors import ConfigError
-from offboard.common.wording import rounded
+from offboard.common.text.wording import rounded
 from offboard.loadgen.compare.compare import rotated
 from offboard.loadgen.compare.compare_settings import SIMULATION, RunsConfig, split_strategy
 from offboard.loadgen.compare.resume import play_once

@@ -8,7 +8,7 @@ from operator import itemgetter
 from typing import Any
 
 from offboard.common.planning.planner import Pose
-from offboard.common.wording import duration
+from offboard.common.text.wording import duration
 from offboard.loadgen.export.mcap_file import McapFile
 from offboard.loadgen.export.recording import Asked, Decided, Recording, plan_of
 from offboard.ros2.converters import (

@@ -14,7 +14,7 @@ from typing import Any
 
 from offboard.common import VERSION
 from offboard.common.errors import OffloadError
-from offboard.common.wording import duration, rounded
+from offboard.common.text.wording import duration, rounded
 from offboard.loadgen.play.answer_verification import verified
 from offboard.loadgen.play.part_setups import setups
 from offboard.loadgen.play.player import Player, started_at_first

@@ -10,8 +10,8 @@ from typing import Any
 
 from offboard.common.config import check, from_table, setting
 from offboard.common.errors import ConfigError, DataError
+from offboard.common.text.wording import rounded
 from offboard.common.toml_file import line_of, unknown
-from offboard.common.wording import rounded
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.outcome_figures import FIGURES, SHARE, site_percent
 

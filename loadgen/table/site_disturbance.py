@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from offboard.common.errors import DataError
-from offboard.common.wording import duration
+from offboard.common.text.wording import duration
 from offboard.loadgen.robot_files import read_trace
 from offboard.loadgen.table.confidence_intervals import Blocks
 from offboard.loadgen.table.measured_rows import SHOWN_MAX, VALUE_MAX

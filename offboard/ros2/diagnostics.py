@@ -6,7 +6,7 @@
 import threading
 from collections import Counter, deque
 
-from offboard.common.wording import duration
+from offboard.common.text.wording import duration
 from offboard.robot_client.policies import Outlook
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.runner import ONBOARD

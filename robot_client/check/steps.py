@@ -12,8 +12,8 @@ from offboard.common.empty_task import EMPTY
 from offboard.common.security.exposure import on_loopback
 from offboard.common.security.keys import ROBOT, SERVER, robot_keys
 from offboard.common.tasks import hashes
+from offboard.common.text.wording import duration
 from offboard.common.wire import messages as wire
-from offboard.common.wording import duration
 from offboard.robot_client.check.network import Address, Listener, connect, identify, reason, resolve
 from offboard.robot_client.check.outcome import FAIL, OK, SKIP, Line, StepFailed
 from offboard.robot_client.check.session import ConnectionLost, Session

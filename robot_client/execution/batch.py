@@ -10,7 +10,7 @@ from typing import Any
 
 from offboard.common.errors import Overtaken, TaskError
 from offboard.common.tasks import Kind, Task, first_number
-from offboard.common.wording import duration
+from offboard.common.text.wording import duration
 from offboard.robot_client.execution.call_threads import CallThreads
 from offboard.robot_client.execution.placement import (
     BUDGET_SHARE,

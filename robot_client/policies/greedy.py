@@ -6,8 +6,8 @@ The costs come from `objectives`.
 from functools import partial
 
 from offboard.common.tasks import show_size
+from offboard.common.text.wording import duration, with_interval
 from offboard.common.variants import group_of
-from offboard.common.wording import duration, with_interval
 from offboard.robot_client.policies.decision import Decision
 from offboard.robot_client.policies.forecast import WHOLE, Forecast, Outlook, cheapest, costs_of, home
 from offboard.robot_client.predictors.base import WARM_UP

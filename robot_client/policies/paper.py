@@ -6,7 +6,7 @@ The windows and the least squares that it was published with are in `predictors`
 from collections.abc import Mapping
 from functools import partial
 
-from offboard.common.wording import duration
+from offboard.common.text.wording import duration
 from offboard.robot_client.policies.decision import Decision
 from offboard.robot_client.policies.forecast import Forecast, cheapest, home
 

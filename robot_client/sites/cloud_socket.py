@@ -22,13 +22,8 @@ from offboard.common.errors import ConfigError
 from offboard.common.security.exposure import on_loopback
 from offboard.common.security.keys import RobotKeys
 from offboard.common.wire.channel import Channel, make_context, readable
-from offboard.robot_client.sites.connection import (
-    BROKEN_HANDSHAKE,
-    NO_HANDSHAKE,
-    ONE_WITH_KEYS,
-    UNKNOWN_ROBOT,
-    HandshakeFailure,
-)
+from offboard.robot_client.sites import connection
+from offboard.robot_client.sites.connection import HandshakeFailure
 
 MESSAGE_BYTES_MAX = 256 * 1024 * 1024
 SEND_QUEUE_MAX = 1000  # messages
@@ -119,16 +114,16 @@ class SocketEvent(Enum):
 _EVENTS: dict[int, SocketEvent | HandshakeFailure] = {
     zmq.EVENT_HANDSHAKE_SUCCEEDED: SocketEvent.HANDSHAKE_SUCCEEDED,
     zmq.EVENT_DISCONNECTED: SocketEvent.DISCONNECTED,
-    zmq.EVENT_HANDSHAKE_FAILED_AUTH: HandshakeFailure(UNKNOWN_ROBOT, final=True),
-    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: HandshakeFailure(NO_HANDSHAKE, final=True),
-    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: HandshakeFailure(NO_HANDSHAKE, final=False),
+    zmq.EVENT_HANDSHAKE_FAILED_AUTH: HandshakeFailure(connection.UNKNOWN_ROBOT, final=True),
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: HandshakeFailure(connection.NO_HANDSHAKE, final=True),
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: HandshakeFailure(connection.NO_HANDSHAKE, final=False),
 }
 _WITHOUT_KEYS: dict[int, SocketEvent | HandshakeFailure] = {
-    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: HandshakeFailure(BROKEN_HANDSHAKE, final=True),
-    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: HandshakeFailure(BROKEN_HANDSHAKE, final=False),
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: HandshakeFailure(connection.BROKEN_HANDSHAKE, final=True),
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: HandshakeFailure(connection.BROKEN_HANDSHAKE, final=False),
 }
 _MISMATCH = zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
-_ONE_WITH_KEYS = HandshakeFailure(ONE_WITH_KEYS, final=True)
+_ONE_WITH_KEYS = HandshakeFailure(connection.ONE_WITH_KEYS, final=True)
 
 
 def _dealer(context: "zmq.Context[Any]", endpoint: str, keys: RobotKeys | None) -> "zmq.Socket[bytes]":

@@ -8,8 +8,8 @@ import math
 from dataclasses import dataclass
 from enum import Enum, auto
 
+from offboard.common.text.wording import duration
 from offboard.common.token_bucket import Bucket
-from offboard.common.wording import duration
 from offboard.robot_client.sites.runner import Lasting
 
 HELLO_EVERY_S = 1.0  # until it is answered

@@ -48,9 +48,7 @@ def test_the_example_of_the_page_runs(tmp_path: Path) -> None:
     assert submitted == in_time
     assert submitted.startswith("{'class': ")
     assert re.fullmatch(rf"task detect: no answer within 0.001 s; expected: cloud {said}; .* [\d.]+", missed)
-    assert re.match(
-        r"detect (None|-?[\d.]+ m?s per task \[.* tasks would be sent, \d+ were measured)", saved
-    )
+    assert re.match(r"detect (None|-?[\d.]+ m?s per task \[.* tasks would be sent, \d+ were measured)", saved)
 
 
 def test_a_call_misses_its_deadline_in_an_outage_and_is_answered_onboard_later(

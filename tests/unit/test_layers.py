@@ -25,6 +25,7 @@ FOLDERS: dict[str, set[str]] = {
     "common/planning": {"common"},
     "common/security": {"common"},
     "common/host": set(),
+    "common/text": set(),
     "common/live": {"common", "common/security"},
     "robot_client/sites": set(),
     "robot_client/openpi": {"robot_client/sites"},
