@@ -18,6 +18,7 @@ COPY common common
 COPY robot_client robot_client
 COPY cloud_server cloud_server
 COPY loadgen loadgen
+COPY maps maps
 RUN pip wheel --quiet --no-deps --wheel-dir /wheels .
 # All images get the same file times: containers share the cache of the compiled planner, and numba compares file times.
 RUN printf '%s\n' '#!/bin/sh' 'set -e' 'pip install --quiet --no-cache-dir --no-deps /wheels/*.whl' \

@@ -123,12 +123,14 @@ clean: ## remove everything that the targets made, except out/
 	rm -rf $(VENV) $(CACHE) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
 $(BENCH_READY): requirements/bench.txt pyproject.toml
+	@echo "installing into $(VENV), once; this takes about a minute"
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --require-hashes -r requirements/bench.txt
 	$(BIN)/python -m pip install --quiet --no-deps --editable .
 	touch $@
 
 $(DEV_READY): requirements/dev.txt pyproject.toml
+	@echo "installing into $(VENV), once; this takes a few minutes"
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --require-hashes -r requirements/dev.txt
 	$(BIN)/python -m pip install --quiet --no-deps --editable .

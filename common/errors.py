@@ -39,7 +39,9 @@ class MissingExtra(ConfigError):
     """An optional library is missing. The message names the extra to install."""
 
     def __init__(self, what: str, extra: str) -> None:
-        super().__init__(f"{what} needs the extra '{extra}': pip install 'offboard[{extra}]'")
+        super().__init__(
+            f"{what} needs the extra '{extra}': run pip install '.[{extra}]' in a checkout of Offboard"
+        )
 
 
 class DataError(OffloadError):

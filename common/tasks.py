@@ -219,7 +219,9 @@ def task(
     check_types(name, types)
 
     def register(function: F) -> F:
-        found = variants_of(name, function, variants=variants, quality=quality, setup=setup)
+        found = variants_of(
+            name, function, variants=variants, quality=quality, setup=setup, policy_server=policy_server
+        )
         own: Any = found[CLOUD].setup if found else setup
         by_site = covers_by_site(name, function, covers=covers, sites=found)
         shared = () if isinstance(covers, Mapping) else covers

@@ -15,6 +15,11 @@ CLOUD = "cloud"  # it stands for each server that has no variant of its own
 AT = "@"  # between the task and the site in the name of a variant
 IN_GROUP = "/"  # between the group of a site and its own name: planners/10.0.0.7
 SITE_LENGTH_MAX = 32
+# It runs its own model, and no function of the robot; the decorated function runs onboard.
+QUALITY_OF_POLICY_SERVER = (
+    'for a policy server write variants={"cloud": None}, quality={"onboard": 0.7, "cloud": 1.0} with your '
+    'numbers; "cloud" stands for each server'
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,12 +42,29 @@ def elsewhere(*_: object) -> NoReturn:
 
 
 def variants_of(
-    task: str, function: Callable[..., Any], *, variants: object, quality: object, setup: object
+    task: str,
+    function: Callable[..., Any],
+    *,
+    variants: object,
+    quality: object,
+    setup: object,
+    policy_server: bool,
 ) -> dict[str, Variant]:
     """The variant of each site by name, empty if the task has none; ConfigError if they do not fit together.
 
     A site without a function of its own runs the decorated `function`.
     """
+    try:
+        return _variants_of(task, function, variants=variants, quality=quality, setup=setup)
+    except ConfigError as error:
+        if not policy_server:
+            raise
+        raise ConfigError(f"{error}; {QUALITY_OF_POLICY_SERVER}") from None
+
+
+def _variants_of(
+    task: str, function: Callable[..., Any], *, variants: object, quality: object, setup: object
+) -> dict[str, Variant]:
     if variants is None and quality is None:
         if isinstance(setup, Mapping):
             raise ConfigError(f"task {task}: setup= by site needs variants=")

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from offboard.common.text.wording import rounded
 from offboard.loadgen.table.confidence_intervals import Blocks, Picks
 from offboard.loadgen.table.measured_rows import Column
 from offboard.loadgen.table.table_formats import UNDEFINED, Heading
@@ -16,6 +17,7 @@ from offboard.loadgen.table.table_formats import UNDEFINED, Heading
 YES, NO, UNCLEAR = "yes", "no", "unclear"
 BLOCKS_MIN = 5  # in a resample; resamples of fewer blocks hardly differ from each other
 DIGITS, INTERVAL_DIGITS = 4, 3  # of the figures in Markdown and LaTeX
+ROUNDING = 1e-9  # a bound this near to a limit is at the limit: sums of a thousand rows are not exact
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,9 +50,9 @@ class Claimed:
         low, high = (value, value) if figure.exact else (figure.low, figure.high)
         if low is None or high is None:
             return UNCLEAR
-        if self.low < low and high < self.high:
+        if self.low + ROUNDING < low and high < self.high - ROUNDING:
             return YES
-        return NO if high <= self.low or self.high <= low else UNCLEAR
+        return NO if high <= self.low + ROUNDING or self.high - ROUNDING <= low else UNCLEAR
 
 
 POSITIVE = Claimed(low=0.0)
@@ -85,7 +87,8 @@ class Claim:
     def interval(self) -> str:
         if self.low is None or self.high is None:
             return UNDEFINED
-        return f"{self.low:.{INTERVAL_DIGITS}g} to {self.high:.{INTERVAL_DIGITS}g}"
+        low, high = (0.0 if abs(one) < ROUNDING else one for one in (self.low, self.high))
+        return f"{rounded(low, INTERVAL_DIGITS)} to {rounded(high, INTERVAL_DIGITS)}"
 
 
 HEADINGS = {

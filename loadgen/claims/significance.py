@@ -67,7 +67,7 @@ def _special() -> ModuleType:
     try:
         return import_module("scipy.special")
     except ImportError as error:
-        raise MissingExtra("loadgen claims", "learned") from error
+        raise MissingExtra("the p-value of r", "learned") from error
 
 
 def _all_rows(rows: Rows, config: ClaimsConfig, site: str) -> Iterator[Claim]:
@@ -81,8 +81,13 @@ def _all_rows(rows: Rows, config: ClaimsConfig, site: str) -> Iterator[Claim]:
         lambda picks: confidence_intervals.mean_r(rows.size[picks], seconds[picks], count),
     )
     yield claim(CLAIM, f"{site}: r, all rows", r, theirs=_their_r(FULL_WINDOW, site), claimed=POSITIVE)
-    p = Figure(p_value(float(found[0]), count), exact=True)
-    yield claim(CLAIM, f"{site}: p of r, all rows", p, theirs=f"< {P_MAX}", claimed=Claimed(high=P_MAX))
+    words = f"{site}: p of r, all rows"
+    try:
+        p = Figure(p_value(float(found[0]), count), exact=True)
+    except MissingExtra as missing:
+        yield unknown(CLAIM, words, str(missing))
+    else:
+        yield claim(CLAIM, words, p, theirs=f"< {P_MAX}", claimed=Claimed(high=P_MAX))
 
 
 def _windows(rows: Rows, config: ClaimsConfig, site: str, length: int) -> Claim:
@@ -93,7 +98,10 @@ def _windows(rows: Rows, config: ClaimsConfig, site: str, length: int) -> Claim:
     found = window_r(rows.size, getattr(rows, f"{site}_s"), length)
     if not len(found):
         return unknown(CLAIM, words, "too few different rows")
-    significant = np.where(found >= smallest_significant_r(length), 100.0, 0.0)
+    try:
+        significant = np.where(found >= smallest_significant_r(length), 100.0, 0.0)
+    except MissingExtra as missing:
+        return unknown(CLAIM, words, str(missing))
     share = mean_of(config.blocks(len(found), overlap=length), significant)
     their_r = _their_r(str(length), site)
     theirs = None if their_r is None else f"p {p_value(their_r, length):.1g}"

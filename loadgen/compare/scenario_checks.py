@@ -9,13 +9,14 @@ from dataclasses import make_dataclass
 from typing import Any
 
 from offboard.common.errors import ConfigError
+from offboard.common.text.wording import rounded
 from offboard.loadgen.compare.compare import rotated
 from offboard.loadgen.compare.compare_settings import SIMULATION, RunsConfig, split_strategy
 from offboard.loadgen.compare.resume import play_once
 from offboard.loadgen.progress import progress
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.outcome_figures import FIGURES
-from offboard.loadgen.scenario.pass_fail_check import Check, Verdict
+from offboard.loadgen.scenario.pass_fail_check import DIGITS, Check, Verdict
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import check_calls, find_scenario, read_scenario
 from offboard.loadgen.simulation.simulated_testbed import check_simulated
@@ -66,7 +67,7 @@ def _judged(scenario: Scenario, config: RunsConfig) -> list[Check]:
 
 
 def _value(verdict: Verdict) -> str:
-    return UNDEFINED if verdict.value is None else f"{verdict.value:.4g}"
+    return UNDEFINED if verdict.value is None else rounded(verdict.value, DIGITS)
 
 
 def _verdict(verdicts: Sequence[Verdict]) -> str:

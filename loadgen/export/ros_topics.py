@@ -8,6 +8,7 @@ from operator import itemgetter
 from typing import Any
 
 from offboard.common.planning.planner import Pose
+from offboard.common.text.wording import duration
 from offboard.loadgen.export.mcap_file import McapFile
 from offboard.loadgen.export.recording import Asked, Decided, Recording, plan_of
 from offboard.ros2.converters import (
@@ -80,7 +81,7 @@ def diagnostics(library: Library, decided: Decided, stamp_ns: int) -> Any:
         "diagnostic_msgs/msg/DiagnosticStatus",
         level=library.byte(WARN if used is None else OK),
         name="offboard",
-        message=f"{used or 'no site'}: {decided.waited_ms:.1f} ms",
+        message=f"{used or 'no site'}: {duration(decided.waited_ms / 1e3)}",
         hardware_id="",
         values=[make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in values.items()],
     )

@@ -26,6 +26,10 @@ from offboard.loadgen.scenario.scenario import Workload
 from offboard.robot_client.sites.runner import ONBOARD
 
 COST_SHARE = 1e-6  # largest relative difference of two sums of the same steps
+NEEDS_SAME = (
+    "the task packs its arguments for servers: if packing loses detail, right answers may differ, and the "
+    "module of the task needs a function same(a, b) that compares them (docs/own_task.md, Send less)"
+)
 
 
 def verified(answered: Sequence[Answered], workload: Workload, seed: int) -> list[Answered]:
@@ -67,7 +71,10 @@ class _Repeated:
             return one
         if isinstance(self._work, Calls) and self._work.same is not None:
             return _compared(one, self._work, described)
-        return replace(one, wrong=f"{one.answer}, but {described} was expected")
+        wrong = f"{one.answer}, but {described} was expected"
+        if kind.pack is not None and (one.used or ONBOARD) != ONBOARD:
+            wrong += f"; {NEEDS_SAME}"
+        return replace(one, wrong=wrong)
 
     def _run(self, i: int, kind: Kind) -> tuple[tuple[Any, ...], Any]:
         """The request of task `i` and its right answer by this kind."""

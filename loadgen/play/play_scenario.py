@@ -14,6 +14,7 @@ from typing import Any
 
 from offboard.common import VERSION
 from offboard.common.errors import OffloadError
+from offboard.common.text.wording import duration, rounded
 from offboard.loadgen.play.answer_verification import verified
 from offboard.loadgen.play.part_setups import setups
 from offboard.loadgen.play.player import Player, started_at_first
@@ -221,13 +222,14 @@ def _findings(outcome: Outcome) -> Iterator[str]:
     """What people should know about a run even without a check."""
     overhead_ms, percent = (FIGURES[name].compute(outcome) for name in ("overhead_ms", "overhead_percent"))
     if overhead_ms is not None and percent is not None:
-        share = f"{percent:.2g} % of the mean time of a task"
-        yield f"overhead of Offboard itself: {overhead_ms:.2f} ms per task (median), {share}"
+        share = f"{rounded(percent, 2)} % of the mean time of a task"
+        yield f"overhead of Offboard itself: {duration(overhead_ms / 1e3)} per task (median), {share}"
     yield from _by_quality(outcome)
-    unverified = [one for one in outcome.answered if one.unverified is not None]
-    if unverified:
-        first = unverified[0]
-        yield f"warning: {len(unverified)} answers are not verified; task {first.i}: {first.unverified}"
+    for field, said in (("wrong", "are wrong"), ("unverified", "are not verified")):
+        found = [one for one in outcome.answered if getattr(one, field) is not None]
+        if found:
+            first = f"the first is that of task {found[0].i} from {found[0].used}"
+            yield f"warning: {len(found)} answers {said}; {first}: {getattr(found[0], field)}"
 
 
 def _by_quality(outcome: Outcome) -> Iterator[str]:
@@ -235,7 +237,8 @@ def _by_quality(outcome: Outcome) -> Iterator[str]:
     for site in sorted({one.used for one in outcome.answered if one.used and one.quality is not None}):
         part = replace(outcome, answered=[one for one in outcome.answered if one.used == site])
         quality, mean_ms = FIGURES["quality"].compute(part), FIGURES["mean_ms"].compute(part)
-        yield f"{site}: {len(part.answered)} answers of quality {quality:g} after {mean_ms:.3g} ms (mean)"
+        mean = duration((mean_ms or 0.0) / 1e3)
+        yield f"{site}: {len(part.answered)} answers of quality {quality:g} after {mean} (mean)"
 
 
 def _say(text: str) -> None:

@@ -8,6 +8,7 @@ from array import array
 from collections.abc import Sequence
 
 from offboard.common.tasks import show_size
+from offboard.common.text.wording import duration
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.runner import ONBOARD
 
@@ -72,23 +73,23 @@ class Summary:
         return ", ".join(f"{site} {len(self._waited[site]) / chosen:.0%}" for site in sorted(self._waited))
 
     def _times(self) -> str:
-        waited = [1e3 * seconds for times in self._waited.values() for seconds in times]
-        mean = statistics.fmean(waited)
+        waited = [seconds for times in self._waited.values() for seconds in times]
+        mean = duration(statistics.fmean(waited))
         twice = f"; {self._seconds} also ran on the second site" if self._seconds else ""
-        return f"mean {mean:.1f} ms, P95 {_p95(waited):.1f} ms; {self._fallbacks} fell back {ONBOARD}{twice}"
+        return f"mean {mean}, P95 {duration(_p95(waited))}; {self._fallbacks} fell back {ONBOARD}{twice}"
 
     def _lateness(self) -> str:
         late = sum(late_s > LATE_S for late_s in self._late)
         return (
-            f"started over {LATE_S * 1e3:g} ms after they were due: {late} of {len(self._late)} tasks; "
-            f"P95 of the delay: {_p95(self._late) * 1e3:.1f} ms"
+            f"started over {duration(LATE_S)} after they were due: {late} of {len(self._late)} tasks; "
+            f"P95 of the delay: {duration(_p95(self._late))}"
         )
 
 
 def describe(record: Record) -> str:
     """One decision in one line."""
     took = ", ".join(
-        f"{one.site} {one.seconds * 1e3:.1f} ms" if one.ok else f"{one.site} {one.error}"
+        f"{one.site} {duration(one.seconds)}" if one.ok else f"{one.site} {one.error}"
         for one in record.executions
     )
     return f"size {show_size(record.size, '.2f')} -> {took} ({record.decision.reason})"
@@ -102,8 +103,6 @@ def _both_times(times: list[tuple[float | None, float | None]]) -> str:
     pairs = [(onboard, other) for onboard, other in times if onboard is not None and other is not None]
     if not pairs:
         return "no answer from another site"
-    onboard_ms, other_ms = (1e3 * statistics.fmean(column) for column in zip(*pairs, strict=True))
+    onboard_mean, other_mean = (duration(statistics.fmean(column)) for column in zip(*pairs, strict=True))
     share = sum(onboard > other for onboard, other in pairs) / len(pairs)
-    return (
-        f"cloud mean {other_ms:.1f} ms, onboard mean {onboard_ms:.1f} ms; the cloud was faster in {share:.0%}"
-    )
+    return f"cloud mean {other_mean}, onboard mean {onboard_mean}; the cloud was faster in {share:.0%}"

@@ -10,11 +10,13 @@ from typing import Any
 
 from offboard.common.config import check, from_table, setting
 from offboard.common.errors import ConfigError, DataError
+from offboard.common.text.wording import rounded
 from offboard.common.toml_file import line_of, unknown
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.outcome_figures import FIGURES, SHARE, site_percent
 
 CHECKS_MAX = 100
+DIGITS = 4  # of a figure in a verdict
 
 
 @dataclass(frozen=True)
@@ -76,12 +78,13 @@ class Verdict:
         if self.value is None:
             return f"FAILS  {self.check}: undefined for these tasks"
         if self.holds:
-            return f"holds  {self.check}: {self.value:.4g}"
+            return f"holds  {self.check}: {rounded(self.value, DIGITS)}"
         limit = self.check.at_most if self.check.at_most is not None else self.check.at_least
         assert limit is not None
         side = "above" if self.value > limit else "below"
         note = f" ({self.check.note})" if self.check.note else ""
-        return f"FAILS  {self.check}: {self.value:.4g}, {abs(self.value - limit):.4g} {side} the limit{note}"
+        value, away = rounded(self.value, DIGITS), rounded(abs(self.value - limit), DIGITS)
+        return f"FAILS  {self.check}: {value}, {away} {side} the limit{note}"
 
     def as_dict(self) -> dict[str, Any]:
         return {**asdict(self.check), "value": self.value, "holds": self.holds}

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from offboard.common.errors import DataError
+from offboard.common.text.wording import duration
 from offboard.loadgen.robot_files import read_trace
 from offboard.loadgen.table.confidence_intervals import Blocks
 from offboard.loadgen.table.measured_rows import SHOWN_MAX, VALUE_MAX
@@ -41,8 +42,8 @@ class Change:
     ratio_high: float | None
 
     def __str__(self) -> str:
-        alone_ms, beside_ms = self.alone_s * 1e3, self.beside_s * 1e3
-        found = f"{alone_ms:.1f} ms alone, {beside_ms:.1f} ms with both sites running, ratio {self.ratio:.3f}"
+        alone, beside = duration(self.alone_s), duration(self.beside_s)
+        found = f"{alone} alone, {beside} with both sites running, ratio {self.ratio:.3f}"
         if self.ratio_low is None:
             return found
         return f"{found} (95 % interval: {self.ratio_low:.3f} to {self.ratio_high:.3f})"

@@ -6,6 +6,7 @@
 import threading
 from collections import Counter, deque
 
+from offboard.common.text.wording import duration
 from offboard.robot_client.policies import Outlook
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.sites.runner import ONBOARD
@@ -38,7 +39,7 @@ class Diagnostics:
     def summary(self) -> str:
         """One line: where the last task ran, and how long it took."""
         last = self._last
-        return "no task yet" if last is None else f"{last.used or 'no site'}: {last.waited_s * 1e3:.1f} ms"
+        return "no task yet" if last is None else f"{last.used or 'no site'}: {duration(last.waited_s)}"
 
     def values(self) -> dict[str, str]:
         """The facts by name; times in milliseconds."""

@@ -12,6 +12,7 @@ from offboard.common.empty_task import EMPTY
 from offboard.common.security.exposure import on_loopback
 from offboard.common.security.keys import ROBOT, SERVER, robot_keys
 from offboard.common.tasks import hashes
+from offboard.common.text.wording import duration
 from offboard.common.wire import messages as wire
 from offboard.robot_client.check.network import Address, Listener, connect, identify, reason, resolve
 from offboard.robot_client.check.outcome import FAIL, OK, SKIP, Line, StepFailed
@@ -188,7 +189,7 @@ class Check:
 
     def _ping(self) -> str:
         assert self._session is not None
-        round_trips_ms = []
+        round_trips_s = []
         for number in range(1, PINGS + 1):
             seconds = self._session.ping(number)
             if seconds is None:
@@ -196,9 +197,9 @@ class Check:
                     f"ping {number} of {PINGS} got no answer within {self._timeout_s:g} s",
                     "check the network between robot and server, or pass a longer --timeout",
                 )
-            round_trips_ms.append(1e3 * seconds)
-        median_ms = statistics.median(round_trips_ms)
-        return f"median {median_ms:.1f} ms, worst {max(round_trips_ms):.1f} ms of {PINGS}"
+            round_trips_s.append(seconds)
+        median_s = statistics.median(round_trips_s)
+        return f"median {duration(median_s)}, worst {duration(max(round_trips_s))} of {PINGS}"
 
     def _run_empty_task(self) -> str:
         assert self._session is not None
@@ -220,9 +221,7 @@ class Check:
             )
         if reply.status != "ok":
             raise StepFailed(f"{reply.status}: {reply.error}", "look into the log of the server")
-        return (
-            f"ran; it waited {1e3 * reply.queue_s:.1f} ms and took {1e3 * reply.run_s:.1f} ms on the server"
-        )
+        return f"ran; it waited {duration(reply.queue_s)} and took {duration(reply.run_s)} on the server"
 
 
 def _listen_flags(ip: str, port: int) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 
 from offboard.common.errors import Overtaken, TaskError
 from offboard.common.tasks import Kind, Task, first_number
+from offboard.common.text.wording import duration
 from offboard.robot_client.execution.call_threads import CallThreads
 from offboard.robot_client.execution.placement import (
     BUDGET_SHARE,
@@ -139,8 +140,8 @@ class Batch:
 
     def _end(self, site: str, finish_s: float) -> str:
         lost_s = self._queues[site].lost_s
-        more = f" + {lost_s * 1e3:g} ms for its quality" if lost_s else ""
-        return f"{site} done in {finish_s * 1e3:.3g} ms{more}"
+        more = f" + {duration(lost_s)} for its quality" if lost_s else ""
+        return f"{site} done in {duration(finish_s)}{more}"
 
     def _start(self, threads: CallThreads, number: int, site: str, reason: str) -> None:
         seconds = _seconds(self._look(number).sites).get(site, 0.0)

@@ -130,7 +130,9 @@ class Learner:
         if decision.advised in (execution.site, None):  # None: no other site was there
             self._savings_of(pending).stay()
         elif expected_s is not None:
-            self._savings_of(pending).move(execution.seconds - expected_s)
+            sites = pending.forecast.sites
+            gained_s = sites[execution.site].quality.lost_s - sites[decision.advised].quality.lost_s
+            self._savings_of(pending).move(execution.seconds - expected_s, gained_s)
 
     def _savings_of(self, pending: PendingTask) -> SavingsEstimate:
         return self._savings.setdefault(pending.task.kind.name, SavingsEstimate())

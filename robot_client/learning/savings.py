@@ -6,6 +6,7 @@ Which site a task would have been sent to is said by `policies/observe.py`.
 import math
 from dataclasses import dataclass
 
+from offboard.common.text.wording import duration, with_bounds
 from offboard.robot_client.policies.forecast import student_90
 from offboard.robot_client.predictors.base import WARM_UP
 
@@ -16,6 +17,8 @@ class Savings:
 
     `tasks`: all that were counted. `sent`: the share of them that the policy would have sent to another site.
     `probes`: how many of these really ran there too.
+    `quality_s`: what the better answers of the other sites are worth, in seconds per task; it is not part of
+    the mean. Below 0: they are worse. 0 for a task without variants.
     """
 
     mean_s: float
@@ -24,11 +27,17 @@ class Savings:
     tasks: int
     sent: float
     probes: int
+    quality_s: float = 0.0
 
     def __str__(self) -> str:
-        mean_ms, low_ms, high_ms = 1e3 * self.mean_s, 1e3 * self.low_s, 1e3 * self.high_s
+        quality = ""
+        if self.quality_s:
+            better = "better" if self.quality_s > 0 else "worse"
+            quality = (
+                f"the answers would be {better}, which counts as {duration(abs(self.quality_s))} per task; "
+            )
         return (
-            f"{mean_ms:.3g} ms per task [{low_ms:.3g}, {high_ms:.3g}]; "
+            f"{with_bounds(self.mean_s, self.low_s, self.high_s, 'per task')}; {quality}"
             f"{self.sent:.0%} of {self.tasks} tasks would be sent, {self.probes} were measured"
         )
 
@@ -45,14 +54,19 @@ class SavingsEstimate:
         self._stayed = 0
         self._saved = _Moments()  # as predicted, in seconds
         self._errors = _Moments()
+        self._quality_s = 0.0  # of all tasks
 
     def stay(self) -> None:
         """Take a task that the policy would have run onboard."""
         self._stayed += 1
 
-    def move(self, saved_s: float) -> None:
-        """Take a task that the policy would have sent away: its time onboard less the predicted time."""
+    def move(self, saved_s: float, quality_s: float = 0.0) -> None:
+        """Take a task that the policy would have sent away: its time onboard less the predicted time.
+
+        `quality_s`: what the quality that the answer would have gained is worth.
+        """
         self._saved.add(saved_s)
+        self._quality_s += quality_s
 
     def probe(self, error_s: float) -> None:
         """Take a probe of the site that such a task would have used: predicted less measured time."""
@@ -76,6 +90,7 @@ class SavingsEstimate:
             tasks=tasks,
             sent=sent,
             probes=errors.count,
+            quality_s=self._quality_s / tasks,
         )
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from offboard.common.errors import DeadlineMissed
+from offboard.common.text.wording import duration, with_interval
 from offboard.robot_client.policies.forecast import Forecast, Outlook
 
 
@@ -30,10 +31,9 @@ class Expectation:
             return self.absent
         if self.seconds is None:
             return "unknown"
-        text = f"{self.seconds * 1e3:.3g} ms"
-        if self.interval is not None:
-            low_s, high_s = self.interval
-            text += f" [{low_s * 1e3:.3g}, {high_s * 1e3:.3g}]"
+        text = (
+            duration(self.seconds) if self.interval is None else with_interval(self.seconds, *self.interval)
+        )
         return text if self.in_time is None else f"{text}, in time with {self.in_time:.0%}"
 
 

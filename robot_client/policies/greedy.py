@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from functools import partial
 
 from offboard.common.tasks import show_size
+from offboard.common.text.wording import duration, with_interval
 from offboard.common.variants import group_of
 from offboard.robot_client.policies.decision import Decision
 from offboard.robot_client.policies.forecast import WHOLE, Forecast, Outlook, cheapest, costs_of, home
@@ -98,7 +99,7 @@ def _times(one: Outlook) -> str:
     if quality is WHOLE:
         return said
     if quality.lost_s:
-        return f"{said} + {quality.lost_s * 1e3:g} ms for quality {quality.value:g}"
+        return f"{said} + {duration(quality.lost_s)} for quality {quality.value:g}"
     return f"{said}, quality {quality.value:g}"
 
 
@@ -108,14 +109,14 @@ def _predicted(one: Outlook) -> str:
     if one.predicted_s is None:
         return "unknown"
     if one.low_s is None or one.high_s is None:
-        return f"{one.predicted_s * 1e3:.3g} ms"
-    return f"{one.predicted_s * 1e3:.3g} ms [{one.low_s * 1e3:.3g}, {one.high_s * 1e3:.3g}]"
+        return duration(one.predicted_s)
+    return with_interval(one.predicted_s, one.low_s, one.high_s)
 
 
 def _measured(site: str, condition: Condition, of: str) -> str:
     said, there = "", of if of or site == ONBOARD else " there"
     if condition.round_trip_s is not None:
-        said = f", queue{of} {condition.queue}, rtt{of} {condition.round_trip_s * 1e3:.3g} ms"
+        said = f", queue{of} {condition.queue}, rtt{of} {duration(condition.round_trip_s)}"
     if site == ONBOARD and condition.load >= 0.005:
         said += f", load{of} {condition.load:.0%}"
     if condition.server_load >= 0.005:
@@ -123,5 +124,5 @@ def _measured(site: str, condition: Condition, of: str) -> str:
     if condition.capacity < 1.0:
         said += f", capacity{there} {condition.capacity:.0%}"
     if condition.wait_s:
-        said += f", wait{of} {condition.wait_s * 1e3:.3g} ms"
+        said += f", wait{of} {duration(condition.wait_s)}"
     return said

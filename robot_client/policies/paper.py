@@ -6,6 +6,7 @@ The windows and the least squares that it was published with are in `predictors`
 from collections.abc import Mapping
 from functools import partial
 
+from offboard.common.text.wording import duration
 from offboard.robot_client.policies.decision import Decision
 from offboard.robot_client.policies.forecast import Forecast, cheapest, home
 
@@ -28,4 +29,4 @@ class Paper:
 
 def _compared(predicted: Mapping[str, float], site: str) -> str:
     names = [site, *(name for name in predicted if name != site)]
-    return " against ".join(f"{name} {predicted[name] * 1e3:.1f} ms" for name in names)
+    return " against ".join(f"{name} {duration(predicted[name])}" for name in names)

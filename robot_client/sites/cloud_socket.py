@@ -22,7 +22,8 @@ from offboard.common.errors import ConfigError
 from offboard.common.security.exposure import on_loopback
 from offboard.common.security.keys import RobotKeys
 from offboard.common.wire.channel import Channel, make_context, readable
-from offboard.robot_client.sites.connection import NO_HANDSHAKE, UNKNOWN_ROBOT, HandshakeFailure
+from offboard.robot_client.sites import connection
+from offboard.robot_client.sites.connection import HandshakeFailure
 
 MESSAGE_BYTES_MAX = 256 * 1024 * 1024
 SEND_QUEUE_MAX = 1000  # messages
@@ -46,6 +47,7 @@ class CloudSocket(Channel):
 
     def __init__(self, site: str, endpoint: str, keys: RobotKeys | None) -> None:
         self._endpoint = endpoint
+        self._events = _EVENTS if keys is not None else _EVENTS | _WITHOUT_KEYS
         named = "[" not in endpoint and any(map(str.isalpha, endpoint.removeprefix("tcp://")))
         self._other_family_s = -math.inf if named else math.inf  # when the other kind of address may be tried
         self._context = make_context(f"{site}: endpoint {endpoint!r}")
@@ -67,10 +69,11 @@ class CloudSocket(Channel):
         self.watched_ready = False
         last = 0
         while readable(self._monitor):
-            last = int(zmq.utils.monitor.recv_monitor_message(self._monitor)["event"])
+            message = zmq.utils.monitor.recv_monitor_message(self._monitor)
+            last = int(message["event"])
             if last in _EVENTS:
                 self._stay()
-                yield _EVENTS[last]
+                yield _ONE_WITH_KEYS if (last, message["value"]) == _MISMATCH else self._events[last]
         if last == zmq.EVENT_CONNECT_RETRIED:
             self._try_other_family()
 
@@ -111,10 +114,16 @@ class SocketEvent(Enum):
 _EVENTS: dict[int, SocketEvent | HandshakeFailure] = {
     zmq.EVENT_HANDSHAKE_SUCCEEDED: SocketEvent.HANDSHAKE_SUCCEEDED,
     zmq.EVENT_DISCONNECTED: SocketEvent.DISCONNECTED,
-    zmq.EVENT_HANDSHAKE_FAILED_AUTH: HandshakeFailure(UNKNOWN_ROBOT, final=True),
-    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: HandshakeFailure(NO_HANDSHAKE, final=True),
-    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: HandshakeFailure(NO_HANDSHAKE, final=False),
+    zmq.EVENT_HANDSHAKE_FAILED_AUTH: HandshakeFailure(connection.UNKNOWN_ROBOT, final=True),
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: HandshakeFailure(connection.NO_HANDSHAKE, final=True),
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: HandshakeFailure(connection.NO_HANDSHAKE, final=False),
 }
+_WITHOUT_KEYS: dict[int, SocketEvent | HandshakeFailure] = {
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: HandshakeFailure(connection.BROKEN_HANDSHAKE, final=True),
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: HandshakeFailure(connection.BROKEN_HANDSHAKE, final=False),
+}
+_MISMATCH = zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
+_ONE_WITH_KEYS = HandshakeFailure(connection.ONE_WITH_KEYS, final=True)
 
 
 def _dealer(context: "zmq.Context[Any]", endpoint: str, keys: RobotKeys | None) -> "zmq.Socket[bytes]":

@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass
 from enum import Enum, auto
 
+from offboard.common.text.wording import duration
 from offboard.common.token_bucket import Bucket
 from offboard.robot_client.sites.runner import Lasting
 
@@ -55,6 +56,9 @@ class HandshakeFailure:
 
 UNKNOWN_ROBOT = "the server does not know this robot's key"
 NO_HANDSHAKE = "the handshake failed: the connection broke, or the keys of robot and server do not match"
+# For a robot without keys:
+BROKEN_HANDSHAKE = "the handshake failed: a relay does not reach the server, or no cloud-server listens there"
+ONE_WITH_KEYS = "the handshake failed: of robot and server, one has keys and the other has none"
 
 _WHY = {
     State.CONNECTING: "no answer from {endpoint} yet",
@@ -79,6 +83,7 @@ class Connection:
         self._site = site
         self._endpoint = endpoint
         self._lines, self._logged_s = Bucket(1 / LOG_PAUSE_S, LOG_LINES_MAX), -math.inf
+        self._lost_s: float | None = None  # when a site that was up was lost; None: it was not, or is back
         self.state = State.CONNECTING
         self.why_absent: str | None = None
         self._move(State.CONNECTING)
@@ -104,6 +109,7 @@ class Connection:
                 self._log(
                     logging.WARNING, f"connection to {self._endpoint} lost; remedy: robot-client check", now_s
                 )
+                self._lost_s = now_s
             self._move(State.LOST)
 
     def hello_answered(self, now_s: float) -> bool:
@@ -113,7 +119,13 @@ class Connection:
         """
         if self.state not in (State.GREETING, State.INCOMPATIBLE):
             return False
-        self._log(logging.INFO, f"{self._endpoint} is up", now_s)
+        if self._lost_s is None:
+            self._log(logging.INFO, f"{self._endpoint} is up", now_s)
+        else:  # whoever read of the loss reads of the return
+            away = duration(now_s - self._lost_s)
+            text = f"connected to {self._endpoint} again after {away}; remedy: none is needed"
+            self._log(logging.WARNING, text, now_s)
+            self._lost_s = None
         self._move(State.UP)
         return True
 

@@ -1,6 +1,6 @@
 """Makes a picture of a report: `python -m tests.browser.screenshot REPORT.html PICTURE.png`.
 
-docs/report.png is the picture of `loadgen report loadgen/datasets/paper.csv --predictors huber,lstm`.
+`make figures` makes docs/report.png with it.
 """
 
 import io

@@ -36,7 +36,7 @@ def server(tasks: str, executor: str) -> Iterator[str]:
 def test_an_example_says_where_each_call_ran(name: str) -> None:
     """Every call is answered, its line names site and reason, and the process ends without a crash."""
     library, executor = APPLICATIONS[name]
-    pytest.importorskip(library, reason=f"needs the extra '{name}': pip install 'offboard[{name}]'")
+    pytest.importorskip(library, reason=f"needs the extra '{name}': pip install '.[{name}]'")
     with server(f"examples.{name}", executor) as endpoint:
         done = subprocess.run(
             [sys.executable, "-m", f"examples.{name}", endpoint],

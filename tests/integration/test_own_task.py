@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from offboard.loadgen.play.answer_verification import NEEDS_SAME
+
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
 
 TASK = """from offboard.common.tasks import task
@@ -74,6 +76,24 @@ at_most = 0
 figure = "overhead_ms"
 at_most = 0.0001
 """
+CLOUDS = """name = "clouds"
+[workload]
+task = "halves:centre"
+inputs = "halves:clouds"
+tasks = 8
+[robot]
+policy = "cloud"
+[[check]]
+figure = "wrong"
+at_most = 0
+"""
+INPUTS = """
+
+def clouds(seed):
+    random = np.random.default_rng(seed)
+    while True:
+        yield random.uniform(1, 9, (100, 3))
+"""
 
 
 def run(folder: Path, scenario: str) -> subprocess.CompletedProcess[str]:
@@ -130,6 +150,25 @@ def test_a_scenario_with_inputs_is_played_and_verified(tmp_path: Path) -> None:
     assert 0 < figures["overhead_ms"] < 50
     assert 0 < figures["overhead_percent"] < 100
     assert figures["unverified"] == 0
+
+
+def test_packing_that_loses_detail_needs_same(tmp_path: Path) -> None:
+    """Without it the run says why answers of servers are wrong; with that of own_task.md they are right."""
+    page = (Path(__file__).parents[2] / "docs/own_task.md").read_text()
+    (module,) = re.findall(r"```python\n# halves\.py\n(.*?)```", page, re.DOTALL)
+    assert "def same(" in module
+    (tmp_path / "clouds.toml").write_text(CLOUDS)
+    (tmp_path / "halves.py").write_text(module.replace("def same(", "def unused(") + INPUTS)
+    done = run(tmp_path, "clouds.toml")
+    assert done.returncode == 1, done.stdout + done.stderr
+    (said,) = [line for line in done.stdout.splitlines() if line.startswith("warning: ")]
+    assert re.match(r"warning: \d answers are wrong; the first is that of task \d from cloud: ", said)
+    assert said.endswith(NEEDS_SAME)
+    (tmp_path / "halves.py").write_text(module + INPUTS)
+    done = run(tmp_path, "clouds.toml")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "holds  wrong at most 0 tasks: 0" in done.stdout
+    assert "warning: " not in done.stdout
 
 
 def test_a_library_that_is_missing_is_named_before_the_start(tmp_path: Path) -> None:

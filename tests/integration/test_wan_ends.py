@@ -12,6 +12,10 @@ import pytest
 
 from offboard.loadgen.relay.link.link import Link
 from offboard.loadgen.relay.tcp.relay import Relay
+from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.sites.connection import BROKEN_HANDSHAKE
+from tests import probes
+from tests.curves import Served, until
 from tests.relays import WAIT_S, echo, is_reset, receive, round_trip_s, silent, wait_until
 
 pytestmark = pytest.mark.integration
@@ -219,3 +223,28 @@ def test_a_reset_that_is_due_at_once_is_not_lost(cloud: Any, wan: Any, after_ms:
         with contextlib.suppress(ConnectionResetError), relay.connect() as client:
             assert is_reset(client)
     wait_until(lambda: connections(relay) == 0)
+
+
+@pytest.mark.timeout(60)
+def test_a_server_that_was_killed_behind_the_relay_is_not_blamed_on_keys(
+    wan: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Without keys the reason is the broken connection. When a server is back, the log says so once."""
+    served = Served()
+    relay = wan(served.port, *BARE)
+    try:
+        with Offloader.connect(f"tcp://127.0.0.1:{relay.port}", policy="cloud") as offload:
+            assert offload.wait_for_sites(probes.echo, WAIT_S) == {}
+            served.process.kill()
+            until(lambda: BROKEN_HANDSHAKE in str(offload.wait_for_sites(probes.echo, 0.0)))
+            assert "key" not in str(offload.wait_for_sites(probes.echo, 0.0))
+            served.close()
+            served = Served("--listen", f"tcp://127.0.0.1:{served.port}")
+            assert offload.wait_for_sites(probes.echo, WAIT_S) == {}
+    finally:
+        served.close()
+    said = [one.getMessage() for one in caplog.records if one.levelname == "WARNING"]
+    assert [text.partition("; remedy: ")[0].partition(" again ")[0] for text in said] == [
+        f"cloud: connection to tcp://127.0.0.1:{relay.port} lost",
+        f"cloud: connected to tcp://127.0.0.1:{relay.port}",
+    ]

@@ -12,6 +12,7 @@ import pytest
 from offboard.common.command_line import INTERRUPTED_EXIT
 from offboard.loadgen.__main__ import main
 from offboard.loadgen.play.watch import Page, watching
+from tests.extras import needs
 
 pytestmark = pytest.mark.integration
 
@@ -39,7 +40,7 @@ def test_a_run_without_plotly_goes_on(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr("offboard.common.live.live_files.find_spec", lambda _: None)
     said: list[str] = []
     with watching(tmp_path, said.append, page=Page.OPENED):
-        assert said == ["no live page: the page /live needs the extra 'live': pip install 'offboard[live]'"]
+        assert said == [f"no live page: {needs('the page /live', 'live')}"]
 
 
 def test_watching_ends_with_ctrl_c(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 from offboard.common.errors import OffloadError
 from offboard.common.planning.planner import plan_path
 from offboard.common.task_states import TaskStates
-from offboard.loadgen.play.answer_verification import verified, wrong_plan
+from offboard.loadgen.play.answer_verification import NEEDS_SAME, verified, wrong_plan
 from offboard.loadgen.robot import answers
 from offboard.loadgen.robot.work import make_work
 from offboard.loadgen.scenario.outcome import Answered
@@ -25,6 +25,7 @@ PLANS = Workload(map=MAP, tasks=8, jump=True, obstacles=4, radius_m=0.0)
 CALLS = Workload(task="offboard.loadgen.scenario.hash_tasks:hash_rounds", sizes=("uniform:10:1000",), tasks=8)
 INPUTS = Workload(task="tests.frames:brightness", inputs="tests.frames:frames", tasks=8)
 VARIANTS = Workload(task="tests.variant_tasks:sort_out", sizes=("uniform:10:1000",), tasks=8)
+PACKED = Workload(task="tests.packing_tasks:two", sizes=("uniform:10:1000",), tasks=8)
 LARGE = replace(INPUTS, task="tests.frames:copied")
 
 
@@ -84,6 +85,15 @@ def test_answers_may_differ_within_the_tolerance_of_their_task(mean: Any, wrong:
     assert judged.unverified is None
     assert (judged.wrong is None) == (wrong is None)
     assert wrong is None or re.match(wrong, judged.wrong or "")
+
+
+@pytest.mark.parametrize("used", ["cloud", "onboard"])
+def test_the_wrong_answer_of_a_task_that_packs_names_packing(used: str) -> None:
+    """Only an answer of a server was computed from packed arguments."""
+    found = answered_rightly(PACKED)
+    (judged,) = verified([replace(found[3], answer=found[4].answer, used=used)], PACKED, SEED)
+    assert judged.wrong is not None
+    assert judged.wrong.endswith(NEEDS_SAME) == (used == "cloud")
 
 
 def test_an_answer_that_is_too_large_to_compare_is_not_verified() -> None:

@@ -16,6 +16,7 @@ from offboard.loadgen.robot.config import CallConfig
 from offboard.loadgen.robot.run import LARGE_MADE_MAX, OwnRecord, Run
 from offboard.robot_client.sites.onboard import OnboardRunner
 from tests import frames
+from tests.extras import needs
 from tests.probes import swallow
 from tests.scripted import offloader
 
@@ -85,7 +86,7 @@ def test_a_missing_library_is_one_short_line(
     named = {"task": "tests.frames:brightness", "inputs": "tests.frames:frames"}
     with pytest.raises(ConfigError) as caught:
         make_calls(CallConfig(**named | {missing: "needy_module:f"}))  # type: ignore[arg-type]
-    assert str(caught.value) == "tags needs the extra 'apriltags': pip install 'offboard[apriltags]'"
+    assert str(caught.value) == needs("tags", "apriltags")
 
 
 def test_exactly_as_many_inputs_as_tasks_are_enough() -> None:

@@ -13,13 +13,14 @@ import pytest
 
 from offboard.common.errors import DataError
 from offboard.loadgen.__main__ import main
-from offboard.loadgen.claims.claim import BELOW_ONE, POSITIVE, Claimed, Figure, mean_of
+from offboard.loadgen.claims.claim import ABOVE_ONE, BELOW_ONE, POSITIVE, Claimed, Figure, claim, mean_of
 from offboard.loadgen.claims.claims import run_claims
 from offboard.loadgen.claims.claims_settings import ClaimsConfig
 from offboard.loadgen.claims.prediction_claims import RIVALS, PredictionClaims
 from offboard.loadgen.claims.several_inputs import _filled, read_inputs
 from offboard.loadgen.table.measured_rows import Rows
 from offboard.loadgen.table.table_formats import UNDEFINED
+from tests.extras import needs
 from tests.table_loops import THOUSAND, csv_of, lines_of
 
 ROWS = THOUSAND[:300]
@@ -58,6 +59,10 @@ def found_in(printed: str) -> dict[str, dict[str, Any]]:
         (POSITIVE, Figure(2.0, 1.0, 3.0), "yes"),
         (POSITIVE, Figure(-2.0, -3.0, -1.0), "no"),
         (POSITIVE, Figure(2.0, -1.0, 3.0), "unclear"),
+        (POSITIVE, Figure(0.0158, 9.23e-18, 0.0316), "unclear"),
+        (POSITIVE, Figure(-0.0158, -0.0316, 3e-15), "no"),
+        (BELOW_ONE, Figure(0.9, 0.8, 1.0 - 1e-16), "unclear"),
+        (ABOVE_ONE, Figure(1.1, 1.0 + 3e-16, 1.2), "unclear"),
         (POSITIVE, Figure(0.0, 0.0, 0.0), "no"),
         (POSITIVE, Figure(2.0), "unclear"),
         (POSITIVE, Figure(2.0, exact=True), "yes"),
@@ -277,3 +282,26 @@ def test_a_wrong_choice_is_one_line(
     assert shown.out == ""
     assert said in shown.err
     assert shown.err.count("\n") == 1
+
+
+def test_the_rounding_error_of_a_bound_is_not_shown() -> None:
+    """A bound that only the last bits keep from 0 is 0; a large one has no exponent."""
+    assert claim(2, "gain", Figure(0.0158, 9.23e-18, 0.0316), claimed=POSITIVE).interval == "0 to 0.0316"
+    assert claim(6, "times", Figure(1063.0, 1012.4, 1119.6)).interval == "1010 to 1120"
+
+
+def test_without_scipy_the_other_claims_are_checked(
+    print_claims: Print, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after `make demo`: the lines of the p-values name the extra, and all other lines are there."""
+    whole = found_in(print_claims(format="json"))
+    monkeypatch.setitem(sys.modules, "scipy.special", None)
+    printed = print_claims(format="json")
+    found = found_in(printed)
+    assert found.keys() == whole.keys()
+    lacking = {words for words, line in found.items() if line["ours"] is None} - {
+        words for words, line in whole.items() if line["ours"] is None
+    }
+    assert lacking == {words for words in whole if "p of r" in words or "with p <" in words}
+    assert {found[words]["note"] for words in lacking} == {needs("the p-value of r", "learned")}
+    assert needs("the p-value of r", "learned") in " ".join(print_claims().split())

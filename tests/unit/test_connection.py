@@ -161,6 +161,21 @@ def test_the_log_says_each_change_once(caplog: pytest.LogCaptureFixture) -> None
     ]
 
 
+def test_a_lost_server_that_is_back_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    """Whoever read of the loss reads of the return too, with the time in between, and of no second one."""
+    connection = led_to(LOST)
+    caplog.clear()
+    with caplog.at_level(logging.WARNING):
+        connection.handshake_failed(BROKEN, NOW_S + 1.0)
+        connection.handshake_succeeded(NOW_S + 89.9)
+        connection.hello_answered(NOW_S + 90.0)
+        connection.handshake_succeeded(NOW_S + 91.0)
+        connection.hello_answered(NOW_S + 91.0)
+    assert [record.getMessage() for record in caplog.records] == [
+        f"cloud: connected to {ENDPOINT} again after 90 s; remedy: none is needed"
+    ]
+
+
 def test_a_server_that_comes_and_goes_does_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
     """The first lines are logged, and then one in LOG_PAUSE_S, which says that others are not."""
     connection = Connection("cloud", ENDPOINT)

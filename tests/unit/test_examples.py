@@ -15,6 +15,7 @@ import pytest
 from offboard import MissingExtra
 from offboard.common.tasks import Kind, kinds
 from offboard.common.wire.values import decode, encode
+from tests.extras import needs
 
 ROOT = Path(__file__).parents[2]
 CALLS = 2
@@ -39,7 +40,7 @@ class Application:
 
     def __init__(self, name: str) -> None:
         extra, library, self.short = APPLICATIONS[name]
-        pytest.importorskip(library, reason=f"needs the extra '{extra}': pip install 'offboard[{extra}]'")
+        pytest.importorskip(library, reason=f"needs the extra '{extra}': pip install '.[{extra}]'")
         self.module: ModuleType = importlib.import_module(f"examples.{name}")
         self.kind: Kind = next(one for one in kinds() if one.function.__module__ == self.module.__name__)
         self.engine = () if self.kind.setup is None else (self.kind.setup(),)
@@ -106,7 +107,7 @@ def test_a_missing_library_names_the_extra(name: str, monkeypatch: pytest.Monkey
         monkeypatch.delitem(sys.modules, known)
     monkeypatch.setitem(sys.modules, library, None)
     monkeypatch.delitem(sys.modules, f"examples.{name}", raising=False)
-    with pytest.raises(MissingExtra, match=rf"pip install 'offboard\[{extra}\]'"):
+    with pytest.raises(MissingExtra, match=rf"run pip install '\.\[{extra}\]'"):
         importlib.import_module(f"examples.{name}")
 
 
@@ -125,7 +126,7 @@ def program(name: str, *words: str, absent: str = "") -> "subprocess.CompletedPr
 def test_a_program_without_its_library_says_what_to_install(name: str) -> None:
     """It ends with one line and exit code 2; so does the measurement of this example."""
     extra, library, _ = APPLICATIONS[name]
-    said = f"examples.{name} needs the extra '{extra}': pip install 'offboard[{extra}]'\n"
+    said = f"{needs(f'examples.{name}', extra)}\n"
     done = program(name, "tcp://127.0.0.1:5555", absent=library)
     assert (done.returncode, done.stdout, done.stderr) == (2, "", said)
     done = program("measure", name, absent=library)

@@ -18,6 +18,7 @@ from offboard.loadgen.export.recording import plan_of, read_recording
 from offboard.loadgen.export.ros_topics import number
 from offboard.ros2.converters import grid_of, path_poses, pose_of, scan_of
 from tests.drives import drive
+from tests.extras import needs
 from tests.mazes import warm
 from tests.mcaps import counts, of, read_both
 
@@ -151,7 +152,7 @@ def test_a_missing_library_names_the_extra(tmp_path: Path, library: str) -> None
     command = [sys.executable, "-c", code, "export", str(tmp_path), "--mcap", str(tmp_path / "a.mcap")]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60)
     assert done.returncode == 2
-    assert done.stderr == "loadgen export: --mcap needs the extra 'mcap': pip install 'offboard[mcap]'\n"
+    assert done.stderr == f"loadgen export: {needs('--mcap', 'mcap')}\n"
     assert not (tmp_path / "a.mcap").exists()
 
 

@@ -26,6 +26,7 @@ FOLDERS: dict[str, set[str]] = {
     "common/security": {"common"},
     "common/source": {"common", "common/security"},
     "common/host": set(),
+    "common/text": set(),
     "common/live": {"common", "common/security"},
     "robot_client/sites": set(),
     "robot_client/openpi": {"robot_client/sites"},

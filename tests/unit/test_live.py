@@ -151,7 +151,7 @@ def test_every_file_of_the_pages_is_there(path: str) -> None:
 def test_without_plotly_the_page_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     """One line says what to install; /docs needs no extra."""
     monkeypatch.setattr("offboard.common.live.live_files.find_spec", lambda _: None)
-    with pytest.raises(MissingExtra, match=r"the page /live needs the extra 'live': pip install"):
+    with pytest.raises(MissingExtra, match=r"the page /live needs the extra 'live': run pip install"):
         page_file("/live")
     assert page_file("/docs").path.exists()
 

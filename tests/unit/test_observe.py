@@ -14,6 +14,7 @@ from offboard.robot_client.learning.savings import Savings
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Probe
 from offboard.robot_client.policies.allowance import DUPLICATES, DUPLICATES_MAX, Allowance
+from offboard.robot_client.policies.objectives import S_PER_QUALITY
 from offboard.robot_client.policies.observe import Observe
 from offboard.robot_client.policies.probe import PROBE_EVERY
 from offboard.robot_client.predictors.base import WARM_UP
@@ -36,6 +37,20 @@ def observed_echo(number: float) -> float:
 @task("observed_once", size=lambda: 1.0, duplicate=False)
 def observed_once() -> str:
     return "done"
+
+
+def observed_roughly(number: float) -> float:
+    return number
+
+
+@task(
+    "observed_graded",
+    size=lambda number: number,
+    variants={ONBOARD: observed_roughly},
+    quality={ONBOARD: 0.5, CLOUD: 1.0},
+)
+def observed_graded(number: float) -> float:
+    return number
 
 
 class Robot:
@@ -114,6 +129,19 @@ def test_a_cloud_that_is_slower_saves_nothing() -> None:
         robot.call()
     found = robot.saved()
     assert (found.mean_s, found.sent) == (0.0, 0.0)
+
+
+def test_a_better_answer_is_worth_its_quality() -> None:
+    """The cloud is 0.2 s slower, and its better answers count as 0.5 s: each task would be sent."""
+    robot = Robot()
+    robot.sites[ONBOARD].takes, robot.sites[CLOUD].takes = 1.0, 1.2
+    for _ in range(200):
+        robot.offload(observed_graded, 1.0)
+    found = robot.offload.savings()["observed_graded"]
+    assert found is not None
+    assert found.sent > 0.9
+    assert found.mean_s == pytest.approx(-0.2, rel=0.15)
+    assert found.quality_s == pytest.approx(0.5 * S_PER_QUALITY * found.sent)
 
 
 def test_the_saving_is_unknown_at_first_and_without_observing() -> None:

@@ -136,7 +136,7 @@ def test_the_smaller_prediction_wins_and_the_reason_shows_both() -> None:
         Forecast(size=1.0, sites={CLOUD: outlook(0.0999), ONBOARD: outlook(0.1)})
     )
     assert decision.site == CLOUD
-    assert decision.reason == "cloud 99.9 ms against onboard 100.0 ms"
+    assert decision.reason == "cloud 99.9 ms against onboard 100 ms"
 
 
 @pytest.mark.parametrize(("cloud", "onboard"), [(True, False), (False, True), (False, False)])

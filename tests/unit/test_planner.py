@@ -17,6 +17,7 @@ from offboard.common.planning.map_files import read_map
 from offboard.common.planning.maps import GridMap
 from offboard.common.planning.planner import Plan, Point, Pose, Scan, plan_path
 from offboard.common.tasks import kind_of
+from tests.extras import needs
 
 ROOT = Path(__file__).parents[2]
 planner.warm()  # compile now, so that the timeout of no test includes it
@@ -258,7 +259,7 @@ def test_without_numba_planning_names_the_extra() -> None:
         "except MissingExtra as error: print(error)\n"
     )
     ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert ran.stdout.strip() == "planning needs the extra 'planning': pip install 'offboard[planning]'"
+    assert ran.stdout.strip() == needs("planning", "planning")
 
 
 def test_scan_hits_are_in_cells() -> None:

@@ -1,15 +1,19 @@
 """Endpoints of policy servers: which are allowed, and which need --insecure."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from offboard import Offloader, Settings
 from offboard.common.errors import ConfigError
 from offboard.common.tasks import task
+from offboard.common.variants import QUALITY_OF_POLICY_SERVER
 from offboard.robot_client.openpi.endpoint import check_policy_server, check_site, is_readable
+from tests.extras import needs
 
 ROOT = Path(__file__).parents[2]
 ALLOWED = [
@@ -60,7 +64,7 @@ def test_anything_else_is_refused(endpoint: str) -> None:
 
 def test_connect_asks_for_the_setting() -> None:
     """Nothing is opened before the endpoints are checked."""
-    pytest.importorskip("websockets", reason="needs the extra 'openpi': pip install 'offboard[openpi]'")
+    pytest.importorskip("websockets", reason="needs the extra 'openpi': pip install '.[openpi]'")
     with pytest.raises(
         ConfigError, match=r"^gpu: 'ws://192.0.2.1:8000' is not encrypted.*Settings\(insecure"
     ):
@@ -79,6 +83,25 @@ def test_a_task_of_a_policy_server_has_one_argument() -> None:
             task("openpi_other", policy_server=True, size=len)(function)
 
 
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"quality": {"onboard": 0.7, "gpu": 1.0}},
+        {"variants": {"cloud": None}},
+        {"variants": {"gpu": None}, "quality": {"onboard": 0.7, "gpu": 1.0}},
+        {"variants": {"cloud": None}, "quality": {"onboard": 0.7}},
+    ],
+    ids=["no variants", "no quality", "no cloud", "no quality of cloud"],
+)
+def test_a_refused_quality_says_how_to_give_it(given: dict[str, Any]) -> None:
+    """A policy server has no function on this robot, so its quality is given in a way of its own."""
+    with pytest.raises(ConfigError, match=re.escape(QUALITY_OF_POLICY_SERVER)):
+        task("openpi_graded", policy_server=True, size=len, **given)(len)
+    with pytest.raises(ConfigError) as caught:  # other tasks need no word of policy servers
+        task("openpi_graded", size=len, **given)(len)
+    assert "policy server" not in str(caught.value)
+
+
 def test_without_its_library_one_line_names_the_extra() -> None:
     """Where websockets is absent, connecting to a policy server is a MissingExtra."""
     block = (
@@ -91,6 +114,4 @@ def test_without_its_library_one_line_names_the_extra() -> None:
         "    print(error)\n"
     )
     done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True, cwd=ROOT, timeout=30)
-    assert done.stdout == (
-        "a policy server (ws:// or wss://) needs the extra 'openpi': pip install 'offboard[openpi]'\n"
-    ), done.stderr
+    assert done.stdout == (f"{needs('a policy server (ws:// or wss://)', 'openpi')}\n"), done.stderr

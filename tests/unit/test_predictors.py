@@ -125,7 +125,9 @@ def test_a_missing_library_names_its_extra(name: str, library: str, extra: str) 
         "except MissingExtra as missing:\n"
         "    print(missing)\n"
     )
-    assert said.endswith(f"needs the extra '{extra}': pip install 'offboard[{extra}]'\n"), said
+    assert said.endswith(
+        f"needs the extra '{extra}': run pip install '.[{extra}]' in a checkout of Offboard\n"
+    ), said
     assert said.count("\n") == 1
 
 

@@ -17,6 +17,7 @@ from offboard.loadgen.report.inline_svg import inline
 from offboard.loadgen.report.report import ReportConfig, run_report
 from offboard.loadgen.table import published_table_two as paper
 from offboard.loadgen.table.table_formats import render
+from tests.extras import needs
 from tests.reports import CHARTS, write_rows
 from tests.table_loops import PAGE, THOUSAND, csv_of
 from tests.unit.test_replay import trace_of
@@ -208,8 +209,6 @@ def test_without_matplotlib_the_extra_is_named(tmp_path: Path) -> None:
         return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=30)
 
     done = run(str(write_rows(tmp_path, THOUSAND[:4])))
-    assert done.stderr == (
-        "loadgen report: loadgen report needs the extra 'report': pip install 'offboard[report]'\n"
-    )
+    assert done.stderr == (f"loadgen report: {needs('loadgen report', 'report')}\n")
     assert done.returncode == 2
     assert run("--help").returncode == 0

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.extras import needs
+
 pytestmark = pytest.mark.timeout(60)  # it starts Python
 
 ROOT = Path(__file__).parents[2]
@@ -35,9 +37,7 @@ def test_without_cyclonedds_one_line_names_the_extra() -> None:
         "import offboard.robot_client.__main__ as main; sys.exit(main.main(['ros2', '--bridge']))"
     )
     assert done.returncode == 2
-    assert done.stderr == (
-        "robot-client ros2: a bridge without ROS needs the extra 'dds': pip install 'offboard[dds]'\n"
-    )
+    assert done.stderr == (f"robot-client ros2: {needs('a bridge without ROS', 'dds')}\n")
 
 
 @pytest.mark.parametrize(

@@ -55,6 +55,32 @@ def test_the_error_of_the_predictions_is_corrected() -> None:
     )
 
 
+def test_the_worth_of_quality_is_said_and_not_added() -> None:
+    """Of four tasks three go away, each for 0.2 s of quality, so it is 0.15 s per task; time is apart."""
+    for gained_s, said in ((0.2, "better"), (-0.2, "worse")):
+        estimate = SavingsEstimate()
+        for _ in range(10):
+            estimate.stay()
+        for _ in range(30):
+            estimate.move(-0.1, gained_s)
+            estimate.probe(0.0)
+        found = estimate.estimate()
+        assert found is not None
+        assert found.mean_s == pytest.approx(-0.075)
+        assert found.quality_s == pytest.approx(0.75 * gained_s)
+        words = f"-75 ms per task [-75, -75]; the answers would be {said}, which counts as 150 ms per task; "
+        assert str(found).startswith(f"{words}75% of 40 tasks")
+
+
+def test_no_word_of_quality_without_variants() -> None:
+    """A task with one function for all sites has the same answers everywhere."""
+    estimate = SavingsEstimate()
+    for _ in range(10):
+        estimate.move(1.25)
+        estimate.probe(0.0)
+    assert str(estimate.estimate()).startswith("1.25 s per task [1.25, 1.25]; 100% of 10 tasks would be sent")
+
+
 @pytest.mark.parametrize("probes", [WARM_UP, 10, 30])
 def test_the_interval_holds_the_truth_in_90_of_100_runs(probes: int) -> None:
     """The true mean saving is inside the interval in 90 % of runs, to 3 points."""

@@ -204,10 +204,10 @@ def test_it_is_printed_as_text_and_as_json(tmp_path: Path) -> None:
     assert found.lines() == [
         "Disturbance between the sites, from 1 plans that ran on each site alone and on both "
         "at once (0 records of incomplete plans were skipped):",
-        "onboard, total time: 200.0 ms alone, 250.0 ms with both sites running, ratio 1.250",
+        "onboard, total time: 200 ms alone, 250 ms with both sites running, ratio 1.250",
         "onboard, alone: the task used the CPU for 20% of its run time",
-        "cloud, total time: 100.0 ms alone, 120.0 ms with both sites running, ratio 1.200",
-        "cloud, time outside the server: 40.0 ms alone, 60.0 ms with both sites running, ratio 1.500",
+        "cloud, total time: 100 ms alone, 120 ms with both sites running, ratio 1.200",
+        "cloud, time outside the server: 40 ms alone, 60 ms with both sites running, ratio 1.500",
         "cloud, alone: the task used the CPU for 100% of its run time",
     ]
     found_json = json.loads(json.dumps(found.as_dict()))

@@ -64,7 +64,7 @@ def record(i: int = 0) -> Record:
         regret=Regret(0.01, 0.0, 0.02, 9),
         started_at=datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC),
         deadline_s=2.0,
-        savings=Savings(0.03, 0.02, 0.04, tasks=50, sent=0.5, probes=8),
+        savings=Savings(0.03, 0.02, 0.04, tasks=50, sent=0.5, probes=8, quality_s=0.2),
     )
 
 
@@ -160,6 +160,7 @@ def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
             "tasks": 50,
             "sent": 0.5,
             "probes": 8,
+            "quality_s": 0.2,
         },
     }
 

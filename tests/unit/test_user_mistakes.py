@@ -254,7 +254,7 @@ def test_a_missing_extra_is_named(command: list[str], extra: str) -> None:
     )
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, timeout=30)
     assert done.returncode == 2
-    assert done.stderr.endswith(f"pip install 'offboard[{extra}]'\n")
+    assert done.stderr.endswith(f"run pip install '.[{extra}]' in a checkout of Offboard\n")
     assert len(done.stderr.splitlines()) == 1
 
 

@@ -8,7 +8,7 @@ import zmq
 from benchmarks.keyring import Keys
 from offboard.common.security.keys import PRIVATE, make_keys, robot_keys
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.sites.connection import NO_HANDSHAKE, UNKNOWN_ROBOT
+from offboard.robot_client.sites.connection import NO_HANDSHAKE, ONE_WITH_KEYS, UNKNOWN_ROBOT
 from tests.curves import WAIT_S, Dealer, recorded, says_until_closed, until
 from tests.integration.keys.servers import Robot, Serve, metric, run, stays_onboard, why_not
 from tests.probes import echo, mark_once, nap
@@ -36,7 +36,7 @@ def test_a_robot_without_keys_is_not_served(keys: Keys, serve: Serve, robot: Rob
     """The handshake fails, the tasks of the robot stay onboard, and the server reads none of its bytes."""
     served = serve(keys)
     offload = robot(served.endpoint, None)
-    until(lambda: NO_HANDSHAKE in why_not(offload))
+    until(lambda: ONE_WITH_KEYS in why_not(offload))
     stays_onboard(offload)
     assert metric(served, "received_bytes_total") == 0
 
@@ -99,7 +99,7 @@ def test_a_plain_server_gets_no_task_from_a_robot_with_keys(keys: Keys, serve: S
     """A robot with keys never sends plain text."""
     served = serve(None)
     offload = robot(served.endpoint, keys.add("arm"))
-    until(lambda: NO_HANDSHAKE in why_not(offload))
+    until(lambda: ONE_WITH_KEYS in why_not(offload))
     assert metric(served, "received_bytes_total") == 0
 
 

@@ -15,7 +15,8 @@ import pytest
 from websockets.sync.server import ServerConnection
 
 from offboard.common.errors import CloudBroken, CloudBusy, CloudTimeout, Overtaken
-from offboard.common.tasks import Task, kind_of
+from offboard.common.tasks import Task, kind_of, task
+from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.openpi import policy_server
 from offboard.robot_client.openpi.numpy_msgpack import pack, unpack
 from offboard.robot_client.openpi.observation_queue import QUEUE_MAX
@@ -30,6 +31,17 @@ pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
 ROOT = Path(__file__).parents[3]
 KIND = kind_of(act)
 SHORT_S = 0.1
+
+
+@task(
+    "openpi_graded",
+    policy_server=True,
+    size=len,
+    variants={"cloud": None},
+    quality={"onboard": 0.7, "cloud": 1.0},
+)
+def graded(observation: dict[str, int]) -> dict[str, int]:
+    return {"number": -observation["state"]}
 
 
 class Held:
@@ -208,3 +220,18 @@ def test_without_heartbeats_nothing_is_measured() -> None:
         server.may_answer.release()
         assert submitted(runner, 1).result(START_S).ok
         assert runner.condition().round_trip_s is None
+
+
+def test_the_quality_of_a_policy_server_counts() -> None:
+    """It has no function on the robot: `variants` names None for it, and the record has both qualities."""
+    server = Held()
+    server.may_answer.release(100)
+    with serving(server.talk) as endpoint, Offloader.connect(sites={"gpu": endpoint}) as offload:
+        assert offload.wait_for_sites(graded, START_S) == {}
+        assert offload(graded, {"state": 3}, where="gpu") == {"number": 3}
+        assert offload(graded, {"state": 3}, where="onboard") == {"number": -3}
+        assert offload.last is not None
+        assert {site: one.quality.value for site, one in offload.last.sites.items()} == {
+            "gpu": 1.0,
+            "onboard": 0.7,
+        }
