@@ -21,7 +21,7 @@ from tests.flags import completed
 ROOT = Path(__file__).parents[3]
 WAIT_S = 8.0
 MODULE = '''
-import os, signal, threading
+import os, signal, sys, threading
 from offboard.common.tasks import task
 
 started = []
@@ -52,6 +52,15 @@ def served_count():
 @task("served_thread", size=lambda: 0)
 def served_thread():
     return threading.get_ident()
+
+@task("served_fork", size=lambda how: 0)
+def served_fork(how):
+    child = os.fork()
+    if child == 0 and how == "raises":
+        raise ValueError(how)
+    if child == 0 and how == "exits":
+        sys.exit(3)
+    return child
 
 @task("served_die", size=lambda: 0)
 def served_die():
