@@ -133,7 +133,7 @@ def _server(endpoint: str) -> None:
     from offboard.common.host import load_watch
 
     reader_threads.SHORT_S = reader_threads.AWAY_S = NEVER_S
-    server.SERVER_EVERY_S = tcp_connections.LOOK_S = load_watch.HURRIED_S = NEVER_S
+    server.SERVER_EVERY_S = server.LOOK_S = tcp_connections.LOOK_S = load_watch.HURRIED_S = NEVER_S
     flags = ["--listen", endpoint, "--http", "127.0.0.1:0", "--tasks", "benchmarks.tasks", "--log", "error"]
     sys.argv = ["cloud-server", *flags, "--robot-mib-s", "65536"]
     sys.exit(__main__.main())

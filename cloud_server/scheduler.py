@@ -129,13 +129,20 @@ class Scheduler:
                 work.blobs[digest] = blob
         return tuple(digest for digest in work.request.blobs if digest not in work.blobs)
 
-    def cancel(self, peer: bytes, id: int) -> None:
-        """The robot does not want the answer to this request any more."""
-        for work in self._queue.take(lambda work: work.peer == peer and work.request.id == id):
+    def cancel(self, peer: bytes, id: int | None = None) -> None:
+        """Nobody wants the answer to this request (None: to any request of this connection) any more."""
+
+        def cancelled(work: Work) -> bool:
+            return work.peer == peer and id in (None, work.request.id)
+
+        for work in self._queue.take(cancelled):
             self._count(work.request, "cancelled")
-        for work in self._running:
-            if work.peer == peer and work.request.id == id:
-                work.wanted = False
+        for work in filter(cancelled, self._running):
+            work.wanted = False
+
+    def peers(self) -> set[bytes]:
+        """The connections that wait for answers."""
+        return {work.peer for work in (*self._queue, *self._running) if work.wanted}
 
     def expire(self, now: float) -> None:
         """Answer the waiting requests whose budget is over."""
@@ -168,8 +175,14 @@ class Scheduler:
             self._chosen.append(work)
 
     def wanted(self, work: Work) -> bool:
-        """True if the robot still waits for the answer and may have it. Called in any thread."""
-        return work.wanted and self._access.knows(work.peer)
+        """False if this run should stop: its answer is not wanted, or its robot may not have it.
+
+        A run that must not be repeated goes on, within its budget. Called in any thread.
+        """
+        return (work.wanted or self._goes_on(work)) and self._access.knows(work.peer)
+
+    def _goes_on(self, work: Work) -> bool:
+        return not tasks.kind_named(work.request.kind).duplicate and not work.expired(time.monotonic())
 
     def answer(self, work: Work, outcome: Outcome) -> None:
         """A task has ended: send its reply."""

@@ -14,6 +14,7 @@ from typing import Any
 import zmq
 
 from offboard.cloud_server.authorisation import Access, Authorisation, Everyone
+from offboard.cloud_server.connections import LOOK_S, Connections
 from offboard.cloud_server.executors.executor import Executor
 from offboard.cloud_server.executors.task_run import Outcome
 from offboard.cloud_server.fair_queue import Work
@@ -102,6 +103,8 @@ class Server:
         self._unread = UnreadLimit(
             port, message_max, limits.blob_bytes_max, metrics, encrypted=keys is not None
         )
+        self._connections = Connections()
+        self._look_due = self._started
         self._rate_limit = RateLimit(limits.robot_bytes_per_s, message_max)
         self._blobs = BlobStore(limits.blob_bytes_max)
         self._channel = Channel(self._socket)
@@ -183,7 +186,16 @@ class Server:
                 if not self._receive():
                     break
             self._scheduler.expire(now)
+            if now >= self._look_due:
+                self._look_due = now + LOOK_S
+                self._drop_ended()
             return self._scheduler.take_chosen()
+
+    def _drop_ended(self) -> None:
+        """Cancel the requests of connections that have ended: nobody can have the answers."""
+        for peer in self._scheduler.peers():
+            if self._connections.ended(peer):
+                self._scheduler.cancel(peer)
 
     def _tend_executor(self) -> None:
         """Start the executor, and notice when it is warm."""
@@ -221,6 +233,7 @@ class Server:
         self._unread.took(file, sizes)
         if not self._access.lets_in(peer):
             return True
+        self._connections.heard(peer.bytes, file)
         size = sum(sizes)
         self.metrics.bytes_in.inc(size)
         verdict = self._rate_limit.judge(self._access.robot_of(peer.bytes), size, self._last_turn)
@@ -270,6 +283,7 @@ class Server:
             case Blob(data, int(size)):
                 self._decompress(peer, file, data, size)
             case Ping(id):
+                self._connections.pings(peer)
                 self._sender.send(peer, Pong(id, self._scheduler.waiting, *self._latest_load()))
             case Hello():
                 self._other_versions.hear(message)

@@ -23,6 +23,7 @@ MESSAGES_UNREAD = 2  # messages of the largest size that may be unread on one co
 CURVE_BYTES = 33  # that encryption adds to a frame (RFC 26)
 SHORT_FRAME = 255  # bytes; the length of a longer frame takes more bytes (RFC 23)
 RECEIVED = struct.Struct("@128xQ")  # tcpi_bytes_received of struct tcp_info, Linux 4.1 on
+SILENT_MS = struct.Struct("@52xI")  # tcpi_last_data_recv of it: since the last bytes came
 STATM, STATM_BYTES_MAX = Path("/proc/self/statm"), 256
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
@@ -130,6 +131,15 @@ def other_end(file: int) -> Any:
         return None
     finally:
         borrowed.detach()
+
+
+def silent_s(file: int, expected: Any) -> float:
+    """The seconds since bytes came from `expected`; 0 if this connection is not to it, or nobody knows."""
+    with contextlib.suppress(OSError, AttributeError), socket.socket(fileno=os.dup(file)) as held:
+        info = held.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, SILENT_MS.size)
+        if held.getpeername() == expected and len(info) == SILENT_MS.size:
+            return float(SILENT_MS.unpack(info)[0] / 1e3)
+    return 0.0
 
 
 def end(file: int, expected: Any) -> None:

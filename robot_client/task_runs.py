@@ -55,7 +55,7 @@ class TaskRuns:
             return race.run(plan)
         except BaseException:  # closed during the task, or Ctrl-C: nobody waits for what still runs
             with self._lock:
-                self._flights.end_all(pending.task.id)
+                self._flights.end_all(pending.task.id, now_s=self._clock.now_s())
             raise
 
     def race(self, pending: PendingTask) -> tuple[Race, Plan]:
@@ -96,7 +96,7 @@ class TaskRuns:
         """Learn the runs that have ended by now. Called under the lock."""
         for one in executions:
             if not isinstance(one.failure, Overtaken):
-                self._flights.end(one.site, pending.task.id)
+                self._flights.end(one.site, pending.task.id, now_s=self._clock.now_s())
         if not self._life.closed:  # a run that `close` gave up says nothing about its site
             self._learner.learn(pending, executions)
 
@@ -108,7 +108,9 @@ class TaskRuns:
 
     def _begun(self, pending: PendingTask, site: str) -> None:
         outlook = pending.forecast.sites.get(site)
-        predicted_s = (outlook.predicted_s if outlook else None) or 0.0
+        predicted_s = 0.0
+        if outlook is not None and outlook.predicted_s is not None:
+            predicted_s = max(0.0, outlook.predicted_s - outlook.condition.wait_s)
         with self._lock:
             self._flights.begin(
                 site,
@@ -134,7 +136,7 @@ class TaskRuns:
     ) -> None:
         """A run has ended after its task was answered; called in any thread."""
         with self._lock:
-            self._flights.end(site, pending.task.id)
+            self._flights.end(site, pending.task.id, now_s=self._clock.now_s())
             if execution.started and not self._life.closed:
                 self._learner.learn_late(pending, execution, beside=beside)
             self.late.append(Late(pending.id, execution.without_value()))

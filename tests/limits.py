@@ -8,6 +8,7 @@ from typing import Any
 
 from offboard.cloud_server import (
     authorisation,
+    connections,
     http_api,
     rate_limit,
     robot_socket,
@@ -147,8 +148,10 @@ SERVER = {
     "replies that a robot does not read": [robot_socket.PEER_MESSAGES_MAX],
     "robots that a server knows": [authorisation.ROBOTS_MAX],
     "a handshake": [robot_socket.HANDSHAKE_S],
+    "a connection that ended": [connections.LOOK_S + server.POLL_S, connections.KEPT],
     "a robot that vanished silently": [
-        robot_socket.KEEPALIVE_IDLE_S + robot_socket.KEEPALIVE_EVERY_S * robot_socket.KEEPALIVE_PROBES
+        connections.SILENT_S,
+        robot_socket.KEEPALIVE_IDLE_S + robot_socket.KEEPALIVE_EVERY_S * robot_socket.KEEPALIVE_PROBES,
     ],
     "free files and threads at the start": [channel.FILES, channel.THREADS],
     "a key file; the token": [private_files.PRIVATE_BYTES_MAX, private_files.TOKEN_CHARS_MIN],

@@ -108,16 +108,13 @@ class Batch:
         first = _usable(self._look(self._waiting[0]))
         for site, one in first.items():
             self._queues[site].lost_s = one.quality.lost_s
-        cold = _cold(first)
-        for site in cold:
+        for site in _cold(first):
             if not self._queues[site].running:
                 return self._warm_up(site, first[site].observations)
         looked = self._waiting[:LOOK_AHEAD]
-        start = next_start(
-            (_seconds(_usable(self._look(number)), cold) for number in looked),
-            self._queues,
-            self._clock.now_s(),
-        )
+        sites = (_usable(self._look(number)) for number in looked)
+        known = (_seconds(one, _cold(one)) for one in sites)
+        start = next_start(known, self._queues, self._clock.now_s())
         return None if start is None else (looked[start.place], start.site, self._reason(start))
 
     def _look(self, number: int) -> Forecast:

@@ -5,6 +5,7 @@ Multiprocessing Timing Anomalies). It is repeated whenever a task has ended: onl
 placed. There is no clock here; `batch` runs the tasks.
 """
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -119,7 +120,7 @@ def next_start(
     as needed. A task that would end earlier on a busy site waits for that site, and the tasks after it take
     that into account.
     """
-    behind_s = dict.fromkeys(queues, 0.0)
+    behind_s: defaultdict[str, float] = defaultdict(float)  # reading `predicted` may bring sites
     for place, seconds in enumerate(predicted):
         finish_s = {site: queues[site].finish_s(one, now_s, behind_s[site]) for site, one in seconds.items()}
         if not finish_s:

@@ -10,6 +10,8 @@ OVERDUE = 0.5  # of its time so far: an overdue run should still need this long
 
 @dataclass(slots=True)
 class _Flight:
+    """`began_s`: when it started; if it waited for other runs, when the last of them ended."""
+
     kind: str
     began_s: float
     predicted_s: float
@@ -26,20 +28,23 @@ class Flights:
         self._flights: dict[str, dict[int, _Flight]] = {}  # of the sites that have any
 
     def begin(self, site: str, task: int, *, kind: str, predicted_s: float, now_s: float) -> None:
-        """A run of the task with this id starts."""
+        """A run of the task with this id starts; it is predicted to take this long once it has its turn."""
         self._flights.setdefault(site, {})[task] = _Flight(kind, now_s, predicted_s)
 
-    def end(self, site: str, task: int) -> None:
-        """The run has ended. Safe to call twice."""
+    def end(self, site: str, task: int, *, now_s: float) -> None:
+        """The run has ended, and the next one has its turn. Safe to call twice."""
         flights = self._flights.get(site, {})
+        had_turn = task == next(iter(flights), None)
         flights.pop(task, None)
         if not flights:
             self._flights.pop(site, None)
+        elif had_turn:
+            next(iter(flights.values())).began_s = now_s
 
-    def end_all(self, task: int) -> None:
+    def end_all(self, task: int, *, now_s: float) -> None:
         """All runs of the task were given up."""
         for site in list(self._flights):
-            self.end(site, task)
+            self.end(site, task, now_s=now_s)
 
     def count(self, site: str) -> int:
         return len(self._flights.get(site, ()))
@@ -49,5 +54,6 @@ class Flights:
         return any(one.kind == kind for one in self._flights.get(site, {}).values())
 
     def left_s(self, site: str, now_s: float) -> float:
-        """How long the runs on this site should still take, one after the other."""
-        return sum([one.left_s(now_s) for one in self._flights.get(site, {}).values()])
+        """How long the runs on this site should still take. They run one after the other."""
+        runs = list(self._flights.get(site, {}).values())
+        return sum([one.left_s(now_s) for one in runs[:1]]) + sum([one.predicted_s for one in runs[1:]])

@@ -47,6 +47,7 @@ from offboard.robot_client.sites.shared_reader import Answer, SharedReader
 PENDING_MAX = 1024
 ATTEMPTS_MAX = 4  # sends of one request: the first, and one after each `need_blob`
 CLOSE_WAIT_S = 2.0
+CANCEL_LINGER_MS = 200  # for the cancels of a close to leave
 IDLE_WAIT_S = 1.0
 READ_MAX = 100  # messages read at once: a server that floods the robot must not keep tasks waiting
 
@@ -390,6 +391,10 @@ class CloudRunner:
         self._connection.close()
         self._reader.close()
         with self._reader.turn, self._socket.lock:
-            for request_id in list(self._pending):
+            cancelled = list(
+                reversed(self._pending)
+            )  # the last first: no place is free before it is cancelled
+            for request_id in cancelled:
+                self._send(wire.Cancel(request_id))
                 self._give_up(request_id, SiteClosed("closed while the task was in flight"))
-            self._socket.close()
+            self._socket.close(CANCEL_LINGER_MS if cancelled else 0)

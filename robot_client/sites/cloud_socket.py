@@ -90,9 +90,10 @@ class CloudSocket(Channel):
             return False
         return True
 
-    def close(self) -> None:
+    def close(self, linger_ms: int = 0) -> None:
+        """Close, at the latest after this time for the messages that were not sent yet."""
         self._dealer.disable_monitor()
-        self._context.destroy(linger=0)
+        self._context.destroy(linger=linger_ms)
         super().close()
 
     def _try_other_family(self) -> None:

@@ -1,7 +1,10 @@
 """The onboard runner: queue, cancelled runs, closing, and the load of the robot."""
 
 import os
+import signal
+import sys
 import threading
+import warnings
 from collections.abc import Iterator
 from concurrent.futures import CancelledError, Future
 
@@ -52,6 +55,19 @@ def looking(number: int) -> int:
 @task("at_once", size=float)
 def at_once(number: int) -> int:
     return number
+
+
+@task("forking", size=float)
+def forking(status: int) -> int:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12 warns, because there are threads
+        child = os.fork()
+    if child == 0:
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.alarm(int(WAIT_S))  # ends a copy that does not end by itself
+        if status:
+            sys.exit(status)
+    return child
 
 
 def call(number: int, function: object = held_back) -> Task:
@@ -227,3 +243,11 @@ def test_as_many_tasks_run_at_a_time_as_there_are_workers() -> None:
     assert [future.result(WAIT_S).value for future in futures] == list(range(6))
     assert sorted(gate.begun) == list(range(6))
     many.close()
+
+
+@pytest.mark.parametrize("status", [0, 3])
+def test_a_task_that_forks_leaves_no_copy_of_the_robot(runner: OnboardRunner, status: int) -> None:
+    """The copy ends when the task returns or exits in it, with the exit code that it asked for."""
+    child = runner.submit(call(status, forking), 1.0).result(WAIT_S).value
+    _, ended = os.waitpid(child, 0)
+    assert os.waitstatus_to_exitcode(ended) == status

@@ -2,7 +2,7 @@
 
 import heapq
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from random import Random
 
 import pytest
@@ -191,3 +191,19 @@ def test_an_overdue_task_is_taken_over() -> None:
     assert takeover(slow, held, 0.5) is None
     assert takeover(slow, held, 3.9) is None
     assert takeover(slow, held, 4.1) == (1, "onboard")
+
+
+def test_a_site_that_comes_while_tasks_are_looked_at_is_compared_too() -> None:
+    """A new server brings its queue while the predictions are read; the task goes where it ends first."""
+    held = queues("onboard")
+
+    def predicted() -> Iterator[Mapping[str, float]]:
+        yield {"onboard": 1.0}
+        held["g/s1"] = Queue("g/s1", WITHIN_S)
+        yield {"onboard": 1.0, "g/s1": 0.1}
+
+    held["onboard"].start(7, 1.0, 0.0)
+    start = next_start(predicted(), held, 0.0)
+    assert start is not None
+    assert (start.place, start.site) == (1, "g/s1")
+    assert start.finish_s == pytest.approx({"onboard": 3.0, "g/s1": 0.1})

@@ -1,6 +1,7 @@
 """Sites that come and go while tasks run, with an offloader in virtual time and no thread."""
 
 import threading
+from collections.abc import Callable
 
 import pytest
 
@@ -10,8 +11,11 @@ from offboard.robot_client import policies
 from offboard.robot_client.discovery.present_sites import LEAVING_MAX_S, LEAVING_MIN_S, PresentSites
 from offboard.robot_client.discovery.roster import LOOK_EVERY, LOOK_S, TRY_EVERY, Roster, Server
 from offboard.robot_client.offloader import Offloader
+from offboard.robot_client.predictors.base import WARM_UP
+from offboard.robot_client.records.trace import Record
 from offboard.robot_client.settings import Settings
-from offboard.robot_client.sites.runner import ONBOARD
+from offboard.robot_client.sites.runner import ONBOARD, Execution, Sending
+from tests.fakes import ScriptedRunner
 from tests.virtual import VirtualClock, VirtualRunner
 
 WAIT_S = 5.0
@@ -229,3 +233,46 @@ def test_each_site_has_one_name() -> None:
     for names in ([ONBOARD, "a", "a"], ["a"]):
         with pytest.raises(ConfigError, match="each site once, and 'onboard' among them"):
             PresentSites([VirtualRunner(name, clock) for name in names])
+
+
+class ArrivalRunner(ScriptedRunner):
+    """Onboard. A server comes when the caller's thread asks `looks` times more what a task would send."""
+
+    def __init__(self) -> None:
+        super().__init__(ONBOARD, answered_by(ONBOARD))
+        self.sites = PresentSites(
+            [self], roster=Roster(), connect=lambda one: ScriptedRunner(one.site, answered_by(one.site))
+        )
+        self.looks = 0
+        self._caller = threading.get_ident()
+
+    def to_send(self, task: Task) -> Sending:
+        if threading.get_ident() == self._caller:
+            self.looks -= 1
+            if not self.looks:
+                self.sites.follow([Server("g/new", "tcp://new.test:5555")])
+        return super().to_send(task)
+
+
+def answered_by(site: str) -> Callable[[Task], Execution]:
+    """Right answers that took as long as the task is large."""
+    return lambda one: Execution(site, one.size / 100, one.args[0], queue_s=0.0, run_s=one.size / 100)
+
+
+@pytest.mark.parametrize("look", range(1, 60, 3))
+def test_a_server_that_comes_while_a_batch_is_placed_loses_no_task(look: int) -> None:
+    """Whenever it comes, all answers are right; as any other site, it is warmed up first."""
+    onboard, records = ArrivalRunner(), list[Record]()
+    with Offloader(
+        onboard.sites,
+        policy=policies.make("greedy"),
+        memories=Settings().make_memories("greedy"),
+        observers=[records.append],
+    ) as offload:
+        for number in range(1, 1 + WARM_UP):
+            offload(carried, number)
+        onboard.looks = look
+        assert offload.map(carried, range(1, 31)) == list(range(1, 31))
+    batch = [one.decision for one in records if one.decision.policy == "map"]
+    new = [one.reason for one in batch if one.site == "g/new"]
+    assert all(one.startswith("warm-up") for one in new[:WARM_UP]), new

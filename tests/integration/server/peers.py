@@ -21,8 +21,10 @@ from tests.flags import completed
 ROOT = Path(__file__).parents[3]
 WAIT_S = 8.0
 MODULE = '''
-import os, signal, threading
+import os, signal, sys, threading, time
+from offboard.common.errors import Unwanted
 from offboard.common.tasks import task
+from offboard.common.wanted import check_wanted
 
 started = []
 
@@ -52,6 +54,39 @@ def served_count():
 @task("served_thread", size=lambda: 0)
 def served_thread():
     return threading.get_ident()
+
+@task("served_look", size=lambda path: 0)
+def served_look(path):
+    """Run until nobody waits for the answer, or a text is written to the file."""
+    started.append(path)
+    return look(path)
+
+@task("served_once", size=lambda path: 0, duplicate=False)
+def served_once(path):
+    return look(path)
+
+def look(path):
+    with open(path + ".begun", "a") as begun:
+        print("begun", file=begun)
+    try:
+        while not os.path.getsize(path):
+            check_wanted()
+            time.sleep(0.002)
+    except Unwanted:
+        with open(path + ".stopped", "a") as stopped:
+            print("stopped", file=stopped)
+        raise
+    with open(path + ".ended", "a") as ended:
+        print("ended", file=ended)
+
+@task("served_fork", size=lambda how: 0)
+def served_fork(how):
+    child = os.fork()
+    if child == 0 and how == "raises":
+        raise ValueError(how)
+    if child == 0 and how == "exits":
+        sys.exit(3)
+    return child
 
 @task("served_die", size=lambda: 0)
 def served_die():
