@@ -80,8 +80,13 @@ def connect_sites(
             tended=True,
         )
         opened.callback(present.close)
+        present.awaited = {
+            site: f"the addresses of {one} are not known yet" for site, one in servers.items() if is_dns(one)
+        }
         for source in sources:
-            Following(source, present, settings.reread_s).start()
+            if isinstance(source, SitesFile):  # a mistake in it is an error now
+                present.follow(source.read() or (), source.name)
+            Following(source, present, float(settings.reread_s)).start()
         opened.pop_all()
     return present
 
