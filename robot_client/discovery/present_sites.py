@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, ItemsView, Iterable, Iterator,
 from offboard.common.errors import ConfigError, OffloadError
 from offboard.common.variants import group_of
 from offboard.robot_client.discovery.roster import Roster, Server
+from offboard.robot_client.sites.absence import Absent
 from offboard.robot_client.sites.runner import ONBOARD, Runner
 
 LEAVING_MIN_S = 5.0  # for which a server that is no longer used may still get tasks that began before
@@ -48,7 +49,7 @@ class PresentSites(Mapping[str, Runner]):
             raise ConfigError(f"sites {given}: each site once, and {ONBOARD!r} among them")
         self.staying = tuple(staying)
         self.changing = roster is not None
-        self.awaited: dict[str, str] = {}  # why no server of a group is there yet, by group
+        self.awaited = Absent()  # why no server of a group is there yet, by group
         self.in_flight: Callable[[str], int] = lambda _: 0  # tasks on a site; the offloader says it
         self._roster = roster or Roster()
         self._connect = connect

@@ -89,9 +89,7 @@ def present_sites(runners: Mapping[str, Runner], absent: Mapping[str, str]) -> M
     return {site: one for site, one in runners.items() if site not in absent} if absent else runners
 
 
-def wait_for_sites(
-    runners: Mapping[str, Runner], kind: Kind, timeout_s: float, awaited: Mapping[str, str]
-) -> Absent:
+def wait_for_sites(runners: Mapping[str, Runner], kind: Kind, timeout_s: float, awaited: Absent) -> Absent:
     """Begin the setup of the kind onboard, and wait until it is made and every site can take the kind.
 
     A site whose reason is a `Lasting` one is not waited for. `awaited`: sites that have no runner yet.
@@ -101,7 +99,7 @@ def wait_for_sites(
         site: runner.prepare(kind) for site, runner in runners.items() if isinstance(runner, OnboardRunner)
     }
     while True:
-        absent = Absent(dict(awaited) | absent_sites(runners, kind))
+        absent = Absent(awaited | absent_sites(runners, kind))
         waits = [site for site, why in absent.items() if not isinstance(why, Lasting)]
         waits += [site for site, setup in setups.items() if not setup.done()]
         if not waits or not time.monotonic() < until_s:  # also if `timeout_s` is no number
