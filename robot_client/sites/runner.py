@@ -168,8 +168,8 @@ class Runner(Protocol):
 
 def checked_timeout(timeout_s: float, name: str = "timeout_s") -> float:
     """The same number as a float; ConfigError unless it is a time that a task may have, in seconds."""
-    number = isinstance(timeout_s, Real) and not isinstance(timeout_s, bool)
-    if not (number and 0 < timeout_s <= TIMEOUT_MAX_S):
+    given: object = timeout_s  # whatever the annotation says
+    if isinstance(given, bool) or not (isinstance(given, Real) and 0 < timeout_s <= TIMEOUT_MAX_S):
         raise ConfigError(f"{name} {timeout_s!r}: must be a number above 0, at most {TIMEOUT_MAX_S:g}")
     return float(timeout_s)
 
