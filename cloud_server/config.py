@@ -201,7 +201,7 @@ class ServerConfig:
     @property
     def resources(self) -> dict[str, float]:
         """What each worker needs on a Ray node, by Ray's names."""
-        with contextlib.suppress(ValueError):
+        with contextlib.suppress(ValueError, RecursionError):
             found = json.loads(self.ray_resources)
             if isinstance(found, dict) and all(map(_is_amount, found.values())):
                 return {name: float(amount) for name, amount in found.items()}

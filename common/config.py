@@ -6,6 +6,7 @@ Each process lists its own settings in its own config file; `command_line` turns
 import argparse
 import dataclasses
 import functools
+import math
 import types
 import typing
 from collections.abc import Mapping, Sequence
@@ -161,6 +162,8 @@ def _check_value(where: str, field: dataclasses.Field[Any], value: Any) -> None:
             raise ConfigError(f"{where}: {item} is below {low:g}, the minimum")
         if high is not None and not item <= high:
             raise ConfigError(f"{where}: {item} is above {high:g}, the maximum")
+        if isinstance(item, float) and not math.isfinite(item):
+            raise ConfigError(f"{where}: {item} is not a finite number")
 
 
 def _read_known(path: Path, cls: type) -> dict[str, Any]:

@@ -79,7 +79,7 @@ def drive_path(path: Path) -> Path:
 def _parse(where: str, line: bytes, names: Sequence[str]) -> dict[str, Any]:
     try:
         fields = json.loads(line)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{where}: not a JSON line: {error}") from None
     if not isinstance(fields, dict):
         raise DataError(f"{where}: {type(fields).__name__} where an object was expected")

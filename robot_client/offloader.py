@@ -240,7 +240,7 @@ class Offloader:
         """What this call should take on each site, and how likely it is in time; nothing runs or counts."""
         self._life.refuse_in_fork()
         if deadline_s is not None:
-            checked_timeout(deadline_s, "deadline_s")
+            deadline_s = checked_timeout(deadline_s, "deadline_s")
         kind = kind_in_use(function)
         args = kind.bind(args, kwargs)
         task, runners = new_task(kind, args), self._sites.now
@@ -267,7 +267,7 @@ class Offloader:
         once if waiting changes nothing, as for a server that has other source.
         """
         self._life.refuse_in_fork()
-        return wait_for_sites(self._sites, kind_in_use(function), timeout_s)
+        return wait_for_sites(self._sites, kind_in_use(function), timeout_s, self._sites.awaited)
 
     def show_on(self, live: RobotLive[Record]) -> None:
         """Show these sites and this allowance on a live page, next to the records that it gets."""

@@ -55,9 +55,8 @@ def connect_sites(
     folder = None if keys is None else Path(keys)
     key_of = partial(_key_of, folder, insecure=settings.insecure)
     fixed = {site: one for site, one in servers.items() if not is_dns(one)}
-    sources: list[Source] = [
-        DnsName(site, one, key_of(site, None)) for site, one in servers.items() if is_dns(one)
-    ]
+    names = servers.keys() - fixed.keys()
+    sources: list[Source] = [DnsName(site, servers[site], key_of(site, None)) for site in sorted(names)]
     if isinstance(sites, Path | str):
         sources.append(SitesFile(Path(sites), key_of, {ONBOARD, BOTH, *fixed}))
     heartbeat_s = heartbeat.EVERY_S if settings.beats(policy) else 0.0
@@ -80,8 +79,11 @@ def connect_sites(
             tended=True,
         )
         opened.callback(present.close)
+        present.awaited.update({one: f"the addresses of {servers[one]} are not known yet" for one in names})
         for source in sources:
-            Following(source, present, settings.reread_s).start()
+            if isinstance(source, SitesFile):  # a mistake in it is an error now
+                present.follow(source.read() or (), source.name)
+            Following(source, present, float(settings.reread_s)).start()
         opened.pop_all()
     return present
 

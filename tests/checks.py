@@ -54,12 +54,13 @@ def predicts_from_the_first_observation(make: Make) -> None:
 
 
 def predicts_finite_times_of_any_data(make: Make) -> None:
-    """Sizes and seconds from 0 to 1e15, tiny differences and many equal values give finite predictions."""
+    """Sizes and seconds from 0 to 1e15, tiny ones and differences, and equal ones give finite predictions."""
     rng = random.Random(11)
     wild = [(10 ** rng.uniform(-15, 15), 10 ** rng.uniform(-15, 15)) for _ in range(WINDOW)]
     near = [(1e15 + i % 3 / 8, 1e-15 * (i % 2)) for i in range(WINDOW)]
     steps = [(float(i % 2), 1e15 * (i % 5 == 0)) for i in range(WINDOW)]
-    for rows in (wild, near, steps, [(0.0, 0.0)] * WINDOW):
+    tiny = [[(float(i % 3), small) for i in range(WINDOW)] for small in (5e-324, 1e-310, 1e-200, 1e-160)]
+    for rows in (wild, near, steps, [(0.0, 0.0)] * WINDOW, *tiny):
         check_finite(teach(make(), rows), (0.0, 1.0, 1e15))
 
 

@@ -100,6 +100,7 @@ UNSENDABLE: dict[str, tuple[Callable[[], Any], str]] = {
     "too deep": (deep, "the value nests deeper than 32 levels"),
     "a circle": (circle, "the value nests deeper than 32 levels"),
     "too many arrays": (lambda: [np.zeros(1)] * 1001, ": the value holds more than 1000 arrays"),
+    "too many numbers": (lambda: [0] * 1_000_000, " has more than 1000000 items"),
     "too long": (lambda: ["x" * MIB] * 17, "bytes without its arrays; at most 16777216 are allowed"),
 }
 TOO_LARGE = 2 * MIB  # for a server with --message-mib 1

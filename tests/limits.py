@@ -21,7 +21,7 @@ from offboard.cloud_server.executors import worker, worker_pool
 from offboard.common import task_states, tasks, tracebacks
 from offboard.common.planning import maps, planner
 from offboard.common.security import bounded_http, private_files
-from offboard.common.wire import channel, messages, values
+from offboard.common.wire import channel, item_count, messages, values
 from offboard.loadgen.relay import control_api, link_schedule
 from offboard.loadgen.relay.link import delay_samples
 from offboard.loadgen.relay.tcp import forwarder, link_record
@@ -66,6 +66,7 @@ ROBOT = {
     ],
     "arguments, or the result, of one task": [
         values.VALUE_BYTES_MAX,
+        item_count.ITEMS_MAX,
         values.ARRAYS_MAX,
         values.BLOBS_MAX,
         values.BLOB_BYTES_MIN,

@@ -1,6 +1,6 @@
-"""Writes to plain files only: a FIFO would stop the program, and a device or a link must stay what it is.
+"""Reads and writes plain files only: a FIFO would stop the program, and a device or link must stay as it is.
 
-What is written, and when, is up to the callers. Every failure is an OSError.
+What is read and written, and when, is up to the callers. Every failure is an OSError.
 """
 
 import contextlib
@@ -27,6 +27,13 @@ def check_plain(path: Path, *, link: bool = False) -> None:
         return
     if not stat.S_ISREG(mode):
         raise OSError(errno.EINVAL, f"is {_KINDS[stat.S_IFMT(mode)]}, not a plain file")
+
+
+def read_plain(path: Path, bytes_max: int) -> bytes:
+    """The first bytes of a plain file, or of a link to one."""
+    check_plain(path, link=True)
+    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:  # it may have become a FIFO
+        return file.read(bytes_max)
 
 
 def replace_file(path: Path, data: bytes) -> None:

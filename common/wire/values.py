@@ -27,6 +27,7 @@ from offboard.common.wire.blobs import (
     checked_dtype,
 )
 from offboard.common.wire.compression import decompress
+from offboard.common.wire.item_count import ITEMS_MAX, TOO_MANY_ITEMS, count_items
 
 BLOB_BYTES_MIN = 64 * 1024  # a larger argument is a blob
 VALUE_BYTES_MAX = 16 * 1024 * 1024  # of the msgpack part of a value, without its arrays
@@ -38,6 +39,7 @@ NESTING_MAX = 32
 DATACLASS_LEVELS = 3  # that a dataclass counts as: its message is a list with a map in it
 DIMENSIONS_MAX = 8
 ARRAY_BYTES_MAX = 2**31 - 1  # of one array: no message is larger
+PLACE_BYTES_MAX = 128  # of the msgpack that names the frame or blob of an array, its dtype and its shape
 PLACE_LENGTH_MAX = 80  # of the text that says where a bad part is
 
 _IN_FRAME, _IN_BLOB, _DATACLASS, _COMPRESSED = 1, 2, 3, 4
@@ -74,11 +76,13 @@ def encode(
     bytes of an array. If it returns them, or other bytes, which are then the compressed ones, these are sent
     in a frame instead. Arrays are not copied, so do not change them before the frames are sent. One that is
     not contiguous is copied, unless it has more than `array_bytes_max`. BadValue says what cannot be sent and
-    where it is, such as `result['poses'][3].x`; `name` is its first word.
+    where it is, such as `result['poses'][3].x`; `name` is its first word. All items together are limited too.
     """
     encoder = _Encoder(types, use_blobs=blobs, along=along, array_bytes_max=array_bytes_max)
     try:
         main = encoder.pack(value, 0)
+    except _TooManyItems as error:  # no part of the value is to blame
+        raise BadValue(f"{name or 'the value'} has {error}") from None
     except BadValue as error:
         place = name + _shortened(_place_of_bad(value, encoder, 0))
         raise BadValue(f"{place}: {error}" if place else str(error)) from error
@@ -113,6 +117,10 @@ def unpack_bounded(data: Buffer, bytes_max: int) -> Any:
         raise ProtocolError(f"not msgpack: {type(error).__name__} {error}") from error
 
 
+class _TooManyItems(BadValue):
+    """The value has more than ITEMS_MAX items."""
+
+
 class _Encoder:
     """Turns a value into a tree for msgpack, and collects the frames of arrays and the blobs."""
 
@@ -132,14 +140,22 @@ class _Encoder:
         self.blobs: dict[bytes, memoryview] = {}
         self.arguments: dict[bytes, int] = {}
         self._argument = 0
+        self._items = 0  # as the reader will count them
 
     def pack(self, value: Any, depth: int) -> bytes:
+        self._count(1)
         tree = self._tree(value, depth)
         try:
             packed: bytes = msgpack.packb(tree)
         except (ValueError, OverflowError) as error:
             raise BadValue(f"the value cannot be sent: {error}") from error
         return packed
+
+    def _count(self, items: int) -> None:
+        """Count the items of a list or dict before they are looked at."""
+        self._items += items
+        if self._items > ITEMS_MAX:
+            raise _TooManyItems(TOO_MANY_ITEMS)
 
     def _tree(self, value: Any, depth: int) -> Any:
         kind = type(value)
@@ -150,12 +166,14 @@ class _Encoder:
         if depth > NESTING_MAX:
             raise BadValue(f"the value nests deeper than {NESTING_MAX} levels")
         if kind is list or kind is tuple:
+            self._count(len(value))
             if set(map(type, value)) <= _SCALARS:
                 return value
             if depth == 0:
                 return list(map(self._part, itertools.count(), value))
             return [one if type(one) in _SCALARS else self._tree(one, depth + 1) for one in value]
         if kind is dict:
+            self._count(2 * len(value))
             return {
                 self._key(key): one if type(one) in _SCALARS else self._tree(one, depth + 1)
                 for key, one in value.items()
@@ -258,8 +276,14 @@ class _Decoder:
         self.types = {cls.__name__: cls for cls in types}
         self.blobs = blobs
         self.bytes_left = DECOMPRESSED_BYTES_MAX
+        self.counts = byte_length(frames[0]) > ITEMS_MAX  # each item takes at least one byte
+        self.items_left = ITEMS_MAX
 
     def unpack(self, data: Buffer, depth: int) -> Any:
+        if self.counts:
+            self.items_left -= count_items(data, self.items_left)
+            if self.items_left < 0:
+                raise ProtocolError(f"the value has {TOO_MANY_ITEMS}")
         return self._value(unpack_bounded(data, VALUE_BYTES_MAX), depth)
 
     def _value(self, tree: Any, depth: int) -> Any:
@@ -283,7 +307,7 @@ class _Decoder:
     def _extension(self, code: int, data: bytes, depth: int) -> Any:
         if code == _DATACLASS:
             return self._dataclass(self.unpack(data, depth + 1))
-        tree = unpack_bounded(data, VALUE_BYTES_MAX)
+        tree = unpack_bounded(data, PLACE_BYTES_MAX)
         if code not in (_IN_FRAME, _IN_BLOB, _COMPRESSED) or not isinstance(tree, list) or len(tree) != 3:
             raise ProtocolError(f"unknown extension {code}")
         where, dtype, shape = tree[0], tree[1], _shape(tree[2])

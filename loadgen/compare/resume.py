@@ -85,7 +85,7 @@ def _read_summary(path: Path) -> dict[str, Any]:
         about = json.loads(path.read_text())
     except FileNotFoundError:
         raise DataError("it was not played to its end") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{path.name} cannot be read: {error}") from None
     return about if isinstance(about, dict) else {}
 

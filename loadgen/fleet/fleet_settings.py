@@ -52,7 +52,11 @@ class FleetConfig(ColumnSettings):
     )
     tasks: int = setting(100, "tasks of each robot", group=TASKS, minimum=1, maximum=TASKS_MAX)
     load: float = setting(
-        0.7, "share of the servers' time that the tasks need, if all run there", group=TASKS, minimum=0.01
+        0.7,
+        "share of the servers' time that the tasks need, if all run there",
+        group=TASKS,
+        minimum=0.01,
+        maximum=1000.0,
     )
     rounds: float = setting(
         200_000, "mean input size: rounds of PBKDF2, 48 ms for 200,000", group=TASKS, rare=True, minimum=1

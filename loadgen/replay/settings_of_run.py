@@ -52,7 +52,7 @@ def settings_of_run(trace: Path) -> SettingsOfRun:
         summary = json.loads(path.read_text(encoding="utf-8"))
         window, predictor = summary.get("window"), summary.get("predictor")
         decided_by = dict(summary.get("decided_by", {}))
-    except (OSError, ValueError, AttributeError, TypeError) as error:
+    except (OSError, ValueError, RecursionError, AttributeError, TypeError) as error:
         raise DataError(f"{path}: no summary of a run: {error}") from error
     if window is not None and not _is_length(window):
         raise DataError(f"{path}: window: {window!r} is not a whole number from 2 to {WINDOW_MAX}")

@@ -109,7 +109,7 @@ def _read(path: Path, kind: str | None) -> Run:
     summary = source.parent / SUMMARY
     try:
         about = json.loads(summary.read_text()) if path.is_dir() and summary.is_file() else {}
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{summary}: not JSON: {error}") from None
     name = path.name if path.is_dir() else path.stem
     return Run(path, name, waited_s=lived.waited_s, to_cloud=lived.to_cloud, summary=about)

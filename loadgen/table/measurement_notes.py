@@ -38,7 +38,7 @@ def _written(path: Path) -> tuple[str, ...]:
         return ()
     try:
         found = json.loads(path.read_text(encoding="utf-8"))["notes"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
         raise DataError(
             f"{path}: no notes found: {error}; the file must come from `loadgen dataset`"
         ) from error

@@ -7,7 +7,7 @@ import logging
 import threading
 from typing import Protocol
 
-from offboard.common.errors import DataError, OffloadError
+from offboard.common.errors import OffloadError
 from offboard.robot_client.discovery.present_sites import PresentSites
 from offboard.robot_client.discovery.roster import Server
 
@@ -40,24 +40,23 @@ class Following:
         sites.on_close(self._stop.set)
 
     def start(self) -> None:
-        """Read the list, and go on in a thread. A mistake in a file is a DataError now."""
-        self.read(first=True)
+        """Read the list in a thread from now on: a name server may keep it waiting."""
+        self._left_s = 0.0
         self._thread.start()
 
-    def read(self, *, first: bool = False) -> None:
+    def read(self) -> None:
         """Read the list once. A problem is logged once, until the list can be used again."""
         try:
             listed = self._source.read()
         except OffloadError as error:
-            if first and isinstance(error, DataError):
-                raise
             if str(error) != self._warned:
                 self._warned = str(error)
                 said = "%s: %s; the last servers stay in use; remedy: correct it, it is read again"
                 log.warning(said, self._source.name, error)
             return
-        if listed is not None:
+        if not self._source.settling:
             self._warned = ""
+        if listed is not None:
             self._sites.follow(listed, self._source.name)
 
     def tend(self, passed_s: float) -> None:

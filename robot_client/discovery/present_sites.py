@@ -6,10 +6,12 @@ Which servers are in use is decided in `roster`; the threads that read lists are
 import logging
 import threading
 import time
-from collections.abc import Callable, ItemsView, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, ItemsView, Iterable, Iterator, Mapping, Sequence
 
 from offboard.common.errors import ConfigError, OffloadError
+from offboard.common.variants import group_of
 from offboard.robot_client.discovery.roster import Roster, Server
+from offboard.robot_client.sites.absence import Absent
 from offboard.robot_client.sites.runner import ONBOARD, Runner
 
 LEAVING_MIN_S = 5.0  # for which a server that is no longer used may still get tasks that began before
@@ -47,6 +49,7 @@ class PresentSites(Mapping[str, Runner]):
             raise ConfigError(f"sites {given}: each site once, and {ONBOARD!r} among them")
         self.staying = tuple(staying)
         self.changing = roster is not None
+        self.awaited = Absent()  # why no server of a group is there yet, by group
         self.in_flight: Callable[[str], int] = lambda _: 0  # tasks on a site; the offloader says it
         self._roster = roster or Roster()
         self._connect = connect
@@ -61,11 +64,13 @@ class PresentSites(Mapping[str, Runner]):
         self._on_close: list[Callable[[], None]] = []
         self.refresh()
 
-    def follow(self, listed: Iterable[Server], source: str = "") -> None:
+    def follow(self, listed: Collection[Server], source: str = "") -> None:
         """This is the list of this source from now on."""
         with self._roster_lock:
             self._roster.follow(listed, source)
         self.refresh()
+        for one in listed:
+            self.awaited.pop(group_of(one.site), None)
 
     def count_task(self, finish_s: Mapping[str, float], now_s: float) -> None:
         """Count a task, and sometimes change the servers in use: see `Roster.look`.

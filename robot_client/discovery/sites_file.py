@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from offboard.common.errors import ConfigError, DataError
+from offboard.common.security.plain_files import read_plain
 from offboard.common.toml_file import parse_toml, unknown
 from offboard.common.variants import IN_GROUP, SITE_LENGTH_MAX
 from offboard.robot_client.discovery.roster import Server
@@ -43,8 +44,7 @@ class SitesFile:
     def read(self) -> list[Server] | None:
         """The servers of the file; None if nothing is new, or before two reads have found the same."""
         try:
-            with self._path.open("rb") as file:
-                found = file.read(FILE_BYTES_MAX + 1)
+            found = read_plain(self._path, FILE_BYTES_MAX + 1)
         except OSError as error:
             raise DataError(f"{self._path}: {error.strerror}") from error
         self.settling = self._seen not in (None, found)

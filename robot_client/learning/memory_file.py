@@ -4,7 +4,6 @@ When the file is read and written is in `store`.
 """
 
 import json
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -16,6 +15,7 @@ from offboard.robot_client.predictors.base import REMEMBERED
 from offboard.robot_client.sites.runner import Condition
 
 FORMAT = 2  # version of the file: a file of another version is not read
+NUMBER_MIN, NUMBER_MAX = 1e-50, 1e50  # so that squares and quotients stay in the range of a float
 PER_SIZE, PER_WORK = "size", "work"
 
 
@@ -104,7 +104,7 @@ def _observation(given: Any) -> Observation:
         seconds=_number(given["seconds"]),
         ok=_fact(given["ok"]),
         condition=_condition(given["condition"]),
-        predicted_s=None if given["predicted_s"] is None else _number(given["predicted_s"], -math.inf),
+        predicted_s=None if given["predicted_s"] is None else _number(given["predicted_s"], -NUMBER_MAX),
         waited_s=_number(given["waited_s"]),
         bytes_out=_number(given["bytes_out"]),
         bytes_in=_number(given["bytes_in"]),
@@ -134,11 +134,11 @@ def _size(given: Any) -> Size:
     return tuple(map(_number, given)) if isinstance(given, list) and len(given) > 1 else _number(given)
 
 
-def _number(given: Any, least: float = 0.0) -> float:
+def _number(given: Any, least: float = NUMBER_MIN) -> float:
     if isinstance(given, bool) or not isinstance(given, int | float):
         raise TypeError(f"{given!r} where a number was expected")
-    if not (least <= given and math.isfinite(given)):
-        raise ValueError(f"{given} where a finite number from {least:g} was expected")
+    if given != 0 and not least <= given <= NUMBER_MAX:
+        raise ValueError(f"{given!r:.40} where 0 or a number from {least:g} to {NUMBER_MAX:g} was expected")
     return float(given)
 
 

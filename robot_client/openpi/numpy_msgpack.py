@@ -11,6 +11,7 @@ import msgpack
 import numpy as np
 
 from offboard.common.errors import BadValue, ProtocolError
+from offboard.common.wire.item_count import check_items
 from offboard.common.wire.values import NESTING_MAX, unpack_bounded
 
 OBSERVATION_BYTES_MAX = 64 * 1024 * 1024
@@ -36,11 +37,13 @@ def pack(observation: Any) -> bytes:
     packed: bytes = msgpack.packb(observation, default=_tree_of)
     if len(packed) > OBSERVATION_BYTES_MAX:
         raise BadValue(f"it has {len(packed)} bytes; at most {OBSERVATION_BYTES_MAX} are allowed")
+    check_items(packed, "it", BadValue)
     return packed
 
 
 def unpack(data: bytes) -> Any:
     """The value in a message. Its arrays are read-only. ProtocolError for anything malformed."""
+    check_items(data, "the value", ProtocolError)
     return _value(unpack_bounded(data, ANSWER_BYTES_MAX), 0)
 
 

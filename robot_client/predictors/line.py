@@ -84,7 +84,7 @@ class Line:
         beyond = min(max(0.0, error - reach) / unit, TAIL_MAX)
         self._tail += rate * (beyond - self._tail)
         if not changed:  # a change is no noise
-            seen = max(0.0, min(error * error, 0.5 * reach * reach) - variance) / (unit * unit)
+            seen = max(0.0, min(error * error, 0.5 * reach * reach) - variance) / (unit * unit or 1.0)
             self._noise += rate * (min(1.0, seen) - self._noise)  # a wrong first guess is no noise either
         self._correct(x, max(-reach, min(reach, error)), unit)
 

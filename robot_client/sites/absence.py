@@ -64,17 +64,17 @@ def present_sites(runners: Mapping[str, Runner], absent: Mapping[str, str]) -> M
     return {site: one for site, one in runners.items() if site not in absent} if absent else runners
 
 
-def wait_for_sites(runners: Mapping[str, Runner], kind: Kind, timeout_s: float) -> Absent:
+def wait_for_sites(runners: Mapping[str, Runner], kind: Kind, timeout_s: float, awaited: Absent) -> Absent:
     """Begin the setup of the kind onboard, and wait until it is made and every site can take the kind.
 
-    A site whose reason is a `Lasting` one is not waited for.
+    A site whose reason is a `Lasting` one is not waited for. `awaited`: sites that have no runner yet.
     """
     until_s = time.monotonic() + timeout_s
     setups = {
         site: runner.prepare(kind) for site, runner in runners.items() if isinstance(runner, OnboardRunner)
     }
     while True:
-        absent = absent_sites(runners, kind)
+        absent = Absent(awaited | absent_sites(runners, kind))
         waits = [site for site, why in absent.items() if not isinstance(why, Lasting)]
         waits += [site for site, setup in setups.items() if not setup.done()]
         if not waits or not time.monotonic() < until_s:  # also if `timeout_s` is no number

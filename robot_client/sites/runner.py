@@ -5,6 +5,7 @@ Which site runs a task is decided in `policies`.
 
 import re
 from dataclasses import dataclass, field, fields
+from numbers import Real
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -166,14 +167,11 @@ class Runner(Protocol):
 
 
 def checked_timeout(timeout_s: float, name: str = "timeout_s") -> float:
-    """The same number; ConfigError unless it is a time that a task may have, in seconds."""
-    try:
-        allowed = 0 < timeout_s <= TIMEOUT_MAX_S
-    except TypeError:  # it is no number
-        allowed = False
-    if not allowed:
-        raise ConfigError(f"{name} {timeout_s!r}: must be above 0 and at most {TIMEOUT_MAX_S:g}")
-    return timeout_s
+    """The same number as a float; ConfigError unless it is a time that a task may have, in seconds."""
+    given: object = timeout_s  # whatever the annotation says
+    if isinstance(given, bool) or not (isinstance(given, Real) and 0 < timeout_s <= TIMEOUT_MAX_S):
+        raise ConfigError(f"{name} {timeout_s!r}: must be a number above 0, at most {TIMEOUT_MAX_S:g}")
+    return float(timeout_s)
 
 
 def check_endpoint(where: str, endpoint: str) -> None:

@@ -9,10 +9,14 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from decimal import Decimal
+from fractions import Fraction
+from typing import Any
 
+import numpy as np
 import pytest
 
-from offboard.common.errors import DeadlineMissed, TaskFailed
+from offboard.common.errors import ConfigError, DeadlineMissed, TaskFailed
 from offboard.common.tasks import Task, task
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.learning.memories import Memories
@@ -61,6 +65,39 @@ def offload(records: "queue.SimpleQueue[Record]") -> Iterator[Offloader]:
         present.append(made)
         yield made
         go_on.set()
+
+
+@pytest.mark.parametrize("seconds", [np.float32(2.5), np.float64(2.5), np.int64(2), 2, Fraction(5, 2)])
+def test_a_deadline_may_be_any_real_number(
+    offload: Offloader, records: "queue.SimpleQueue[Record]", seconds: float
+) -> None:
+    """Numbers of NumPy work as a float does, for `timeout_s` too; the record has a float."""
+    assert offload(deadline_echo, 5, deadline_s=seconds, timeout_s=seconds) == 5
+    record = records.get(timeout=WAIT_S)
+    assert record.deadline_s == float(seconds)
+    assert type(record.deadline_s) is float
+    assert type(record.timeout_s) is float
+    outlook = offload.expect(deadline_echo, 5, deadline_s=seconds)[ONBOARD]
+    assert outlook == offload.expect(deadline_echo, 5, deadline_s=float(seconds))[ONBOARD]
+
+
+@pytest.mark.parametrize(
+    "seconds", [True, np.True_, Decimal("2.5"), np.array(2.5), np.array([2.5]), np.ones(3), 1j, "2", [2.5]]
+)
+def test_what_is_no_real_number_is_refused_at_once(offload: Offloader, seconds: Any) -> None:
+    """It is one ConfigError that names the option, before the task runs."""
+    for name in ("deadline_s", "timeout_s"):
+        with pytest.raises(ConfigError, match=f"^{name} .*: must be a number above 0, at most 86400$"):
+            offload(deadline_echo, 5, **{name: seconds})
+    with pytest.raises(ConfigError, match=r"^deadline_s "):
+        offload.expect(deadline_echo, 5, deadline_s=seconds)
+    with pytest.raises(ConfigError, match=r"^timeout_s "):
+        offload.map(deadline_echo, [5], timeout_s=seconds)
+    with pytest.raises(ConfigError, match=r"^timeout_s "):
+        Offloader.connect(timeout_s=seconds)
+    with pytest.raises(ConfigError, match=r"^deadline_s "):
+        offload.submit(deadline_echo, 5, deadline_s=seconds).result(WAIT_S)
+    assert not ran
 
 
 def test_an_answer_in_time_is_returned(offload: Offloader, records: "queue.SimpleQueue[Record]") -> None:

@@ -147,7 +147,7 @@ def test_intervals_and_probabilities_are_calibrated(robot: Robot) -> None:
 @pytest.mark.parametrize("deadline_s", [0.0, -1.0, float("nan"), "1"])
 def test_a_deadline_is_a_time_above_zero(robot: Robot, deadline_s: float) -> None:
     """Both a question and a call refuse anything else, and name it."""
-    said = f"deadline_s {deadline_s!r}: must be above 0 and at most"
+    said = f"deadline_s {deadline_s!r}: must be a number above 0, at most"
     with pytest.raises(ConfigError, match=said):
         robot.offload.expect(expected_echo, 1.0, deadline_s=deadline_s)
     with pytest.raises(ConfigError, match=said):

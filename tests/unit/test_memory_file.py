@@ -49,7 +49,7 @@ def test_the_file_is_bounded(robot: Robot) -> None:
         (b'{"v": 2, "kinds": {"store_plain": {}}}', "KeyError: 'per'"),
         (
             b'{"v":2,"kinds":{"a":{"source":"","per":"work","worked":[[1,NaN]],"sites":{}}}}',
-            "nan where a finite",
+            "nan where 0 or a number",
         ),
         (
             b'{"v":2,"kinds":{"a":{"source":"","per":"work","worked":[[1,true]],"sites":{}}}}',
@@ -96,7 +96,60 @@ def test_one_bad_number_makes_the_file_unreadable(
     robot.path.write_text(json.dumps(whole))
     with robot.started() as offload:
         assert robot.outlooks(offload)[ONBOARD].predicted_s is None
-    assert "-1.0 where a finite number from 0 was expected" in caplog.text
+    assert "-1.0 where 0 or a number from 1e-50 to 1e+50 was expected" in caplog.text
+
+
+FIELDS = ("size", "amount", "work", "seconds", "predicted_s", "waited_s", "bytes_out", "bytes_in", "cpu_s")
+FIELDS += ("run_s", "queue_s", "round_trip_s", "queue", "load", "wait_s", "capacity", "server_load")
+
+
+def spoil(robot: Robot, name: str, value: float) -> None:
+    """Put this value in every observation of both sites."""
+    whole = json.loads(robot.path.read_bytes())
+    for site in whole["kinds"]["store_plain"]["sites"].values():
+        for one in site["observations"]:
+            (one if name in one else one["condition"])[name] = value
+    robot.path.write_text(json.dumps(whole))
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_a_number_that_no_robot_writes_makes_the_file_unreadable(
+    robot: Robot, caplog: pytest.LogCaptureFixture, name: str
+) -> None:
+    """A whole number of 400 digits, a time of 5e-324 s or of 1e300 s: one short warning, and a cold start."""
+    for predictor in ("parts", "least-squares"):
+        for value in (10**399, 5e-324, 1e-200, 1e300):
+            if name == "predicted_s" and value < 1:
+                continue  # a prediction may be as short as it likes
+            robot.path.unlink(missing_ok=True)
+            with robot.started(predictor) as offload:
+                robot.ask(offload, 20)
+            spoil(robot, name, value)
+            caplog.clear()
+            with robot.started(predictor) as offload:
+                assert robot.outlooks(offload)[ONBOARD].predicted_s is None
+                robot.ask(offload, 5)
+            (warning,) = (one for one in caplog.records if one.levelno == logging.WARNING)
+            assert "where 0 or a number from " in warning.getMessage()
+            assert len(warning.getMessage()) < 500
+
+
+@pytest.mark.parametrize("name", ["size", "seconds", "predicted_s", "waited_s", "bytes_out", "run_s"])
+@pytest.mark.parametrize("policy", ["paper", "default"])
+def test_the_largest_and_smallest_numbers_that_are_read_do_no_harm(
+    robot: Robot, name: str, policy: str
+) -> None:
+    """The robot answers each call, whatever it recalls."""
+    for predictor in ("parts", "least-squares"):
+        for value in (1e-50, 1e50, 0.0):
+            robot.path.unlink(missing_ok=True)
+            with robot.started(predictor) as offload:
+                robot.ask(offload, 20)
+            spoil(robot, name, value)
+            with robot.started(predictor, policy) as offload:
+                assert robot.outlooks(offload)[ONBOARD].predicted_s is not None
+                robot.ask(offload, 5)
+                assert [offload(store_plain, 2.0) for _ in range(10)] == [2.0] * 10
 
 
 @pytest.mark.parametrize("capacity", [0.0, 1.5])

@@ -336,9 +336,9 @@ def test_onboard_must_be_among_the_sites() -> None:
 @pytest.mark.parametrize("timeout_s", [0.0, -1.0, float("nan"), float("inf"), 1e9, "3", [1.0]])
 def test_a_timeout_is_above_zero_and_bounded(make: Make, timeout_s: float) -> None:
     """The timeout of an offloader and the timeout of a call must both be finite."""
-    with pytest.raises(ConfigError, match="must be above 0 and at most"):
+    with pytest.raises(ConfigError, match="must be a number above 0, at most"):
         make(OnboardRunner(), timeout_s=timeout_s)
-    with make(OnboardRunner()) as offload, pytest.raises(ConfigError, match="must be above 0"):
+    with make(OnboardRunner()) as offload, pytest.raises(ConfigError, match="must be a number above 0"):
         offload(add_one, 1, timeout_s=timeout_s)
 
 

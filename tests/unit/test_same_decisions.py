@@ -94,7 +94,7 @@ def test_a_robot_that_starts_again_knows_nothing(simulated: Simulated, tmp_path:
         ('"waited_s":', '"waited_s":null,"was":', "TypeError"),
         ('"seconds":', '"seconds":-1,"was":', "-1.0 is not a finite number"),
         ('"decision":{"site":"', '"decision":{"site":"moon","was":"', "'moon' is not one of its sites"),
-        ('"timeout_s":', '"timeout_s":0,"was":', "timeout_s 0: must be above 0"),
+        ('"timeout_s":', '"timeout_s":0,"was":', "timeout_s 0: must be a number above 0"),
         ('"onboard.capacity":', '"onboard.capacity":0,"was":', "onboard.capacity is 0"),
     ],
 )

@@ -1,6 +1,7 @@
 """The list of servers in a file: what is taken, what is refused, and when a change counts."""
 
 import logging
+import os
 from pathlib import Path
 
 import pytest
@@ -83,6 +84,70 @@ def test_a_mistake_is_named(listed: SitesFile, tmp_path: Path, text: str, said: 
         listed.read()
     assert "\n" not in str(raised.value)
     assert str(raised.value).startswith(str(tmp_path / "sites.toml"))
+
+
+@pytest.mark.parametrize("linked", [False, True])
+def test_what_is_no_plain_file_is_refused_at_once(
+    listed: SitesFile, tmp_path: Path, linked: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A FIFO, which may never be written, is no list; the servers stay, and one line says so."""
+    path, clock = tmp_path / "sites.toml", VirtualClock()
+    sites = PresentSites(
+        [VirtualRunner(ONBOARD, clock)],
+        roster=Roster(),
+        connect=lambda server: VirtualRunner(server.site, clock),
+    )
+    following = Following(listed, sites, 1.0)
+    following.read()
+    path.unlink()
+    fifo = tmp_path / "fifo" if linked else path
+    os.mkfifo(fifo)
+    if linked:
+        path.symlink_to(fifo)
+    with pytest.raises(DataError, match=r"sites\.toml: is a FIFO, not a plain file$"):
+        listed.read()
+    for _ in range(3):
+        following.read()
+    assert caplog.text.count("is a FIFO, not a plain file") == 1
+    assert set(sites) == {ONBOARD, "gpu"}
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(DataError, match="is a folder, not a plain file"):
+        listed.read()
+
+
+def test_a_link_to_a_plain_file_is_followed(listed: SitesFile, tmp_path: Path) -> None:
+    """Kubernetes mounts files as links."""
+    (tmp_path / "sites.toml").rename(tmp_path / "other.toml")
+    (tmp_path / "sites.toml").symlink_to(tmp_path / "other.toml")
+    assert [one.site for one in listed.read() or []] == ["gpu"]
+
+
+def test_an_equal_problem_is_logged_again_once_the_list_was_right(
+    listed: SitesFile, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Also if the right list is the one that is in use, as after a writer that was interrupted."""
+    clock, path = VirtualClock(), tmp_path / "sites.toml"
+    sites = PresentSites(
+        [VirtualRunner(ONBOARD, clock)],
+        roster=Roster(),
+        connect=lambda server: VirtualRunner(server.site, clock),
+    )
+    following = Following(listed, sites, 1.0)
+    for time in range(1, 4):
+        for text in (GPU, "[gpu"):
+            path.write_text(text)
+            for _ in range(3):
+                following.read()
+        assert len(caplog.records) == time
+    for time in range(4, 6):
+        path.unlink()
+        for _ in range(3):
+            following.read()
+        path.write_text(GPU)
+        for _ in range(3):
+            following.read()
+        assert len(caplog.records) == time
 
 
 def test_a_surprise_does_not_end_the_thread(listed: SitesFile, caplog: pytest.LogCaptureFixture) -> None:

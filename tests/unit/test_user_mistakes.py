@@ -12,6 +12,9 @@ FILES = {
     "text-image.yaml": "image: words.txt\nresolution: 0.1\n" + YAML,
     "words.txt": "not an image",
     "bad.jsonl": '{"v": 1}\nnonsense\n',
+    "deep.jsonl": '{"v":1,"i":' + "[" * 50_000 + "\n",
+    "deep/trace.jsonl": '{"v":1,"i":' + "[" * 50_000 + "\n",
+    "deep/summary.json": "[" * 50_000,
     "text.csv": "size,onboard_s,cloud_s\n1,2,3\n1,two,3\n",
     "empty.csv": "",
     "empty.jsonl": "",
@@ -220,12 +223,21 @@ at_most = 1
             ["loadgen", "drive", "--map", "open.map", "--obstacles", "0", "--memory", "/dev/null"],
             "memory /dev/null: is a device",
         ),
+        (["loadgen", "table", "deep.jsonl"], "deep.jsonl:1: not a JSON line: maximum recursion depth"),
+        (["loadgen", "replay", "deep.jsonl"], "deep.jsonl:1: not a JSON line: maximum recursion depth"),
+        (["loadgen", "claims", "deep.jsonl"], "deep.jsonl:1: not a JSON line: maximum recursion depth"),
+        (["loadgen", "report", "deep"], "maximum recursion depth"),
+        (["loadgen", "export", "deep.jsonl", "--csv", "f"], "deep.jsonl:1: not a JSON line: maximum recurs"),
+        (["loadgen", "fleet", "--load", "inf"], "--load: inf is above 1000, the maximum"),
+        (["loadgen", "fleet", "--rounds", "inf"], "--rounds: inf is not a finite number"),
+        (["loadgen", "fleet", "--start-s", "inf"], "--start-s: inf is not a finite number"),
         (["loadgen", "wan", "--to", "nowhere"], "--to: 'nowhere' is not HOST:PORT"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(command: list[str], message: str, tmp_path: Path) -> None:
     """The error is one line on stderr that names the mistake, without a traceback."""
     for name, text in FILES.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
     done = subprocess.run(
         [sys.executable, "-m", f"offboard.{command[0]}", *command[1:]],
