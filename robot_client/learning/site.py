@@ -83,8 +83,7 @@ class SiteMemory:
         self._energy = energy
         self._quality = quality
         self._bytes_in = RunningMean()
-        self._cpu_s = RunningMean()
-        self._busy_s = RunningMean()  # the seconds of the runs whose CPU seconds are known
+        self._cpu_share = RunningMean()  # CPU seconds in each second of a run
 
     def outlook(
         self,
@@ -121,10 +120,8 @@ class SiteMemory:
             seconds = max(seconds, timeout_s)
         low_s, high_s = self._conformal.interval(seconds, found.spread_s) or (None, None)
         energy, errors, quality = self._energy, self._conformal.errors, self._quality
-        if self._site == ONBOARD:
-            joules = energy.onboard_j(found.seconds * self._cpu_share)
-        else:
-            joules = energy.remote_j(seconds, moved)
+        onboard_s = found.seconds * (self._cpu_share.value or 1.0)
+        joules = energy.onboard_j(onboard_s) if self._site == ONBOARD else energy.remote_j(seconds, moved)
         cost = self._objective.cost(Expected(seconds, found.spread_s, joules, quality, bytes=moved), errors)
         # All fields in their order: with keywords, it takes three times as long.
         return Outlook._make((
@@ -203,11 +200,6 @@ class SiteMemory:
             return self._energy.onboard_j(execution.cpu_s or execution.run_s or execution.seconds)
         return self._energy.remote_j(execution.seconds, execution.bytes_out + execution.bytes_in)
 
-    @property
-    def _cpu_share(self) -> float:
-        """The CPU seconds in each second of a run; 1 while they are unknown."""
-        return self._cpu_s.value / self._busy_s.value if self._busy_s.value else 1.0
-
     def _predict(self, amount: Size, moved: float, condition: Condition) -> Prediction | None:
         if self._parts is not None:
             return self._parts.predict(first_number(amount), moved=moved, condition=condition)
@@ -245,9 +237,8 @@ class SiteMemory:
         self.observations.append(one)
         if one.ok:
             self._bytes_in.add(one.bytes_in)
-        if one.cpu_s is not None:
-            self._cpu_s.add(one.cpu_s)
-            self._busy_s.add(one.seconds)
+        if one.cpu_s is not None and one.seconds:
+            self._cpu_share.add(one.cpu_s / one.seconds)
         if one.predicted_s is not None and one.ok:
             self._conformal.learn(one.predicted_s, one.seconds + one.waited_s)
         elif one.predicted_s is not None:
