@@ -21,7 +21,7 @@ from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 DEFAULT = "default"
 CONSTANTS = (ONBOARD, CLOUD)  # the policies that always choose the same site
-POLICIES = ("paper", DEFAULT, *CONSTANTS)
+POLICIES = (DEFAULT, *CONSTANTS, "paper")
 WORST = 10  # tasks that are listed
 COLUMNS = (
     "scenario",
@@ -126,6 +126,17 @@ def table(runs: Sequence[Run]) -> str:
     for scenario in dict.fromkeys(run.scenario for run in runs):
         rows += [line.cells(intervals=intervals) for line in lines(_of(runs, scenario))]
     return "\n".join(f"| {' | '.join(row)} |" for row in rows) + "\n"
+
+
+def in_words(runs: Sequence[Run]) -> list[str]:
+    """How `default` compares with the better constant policy: a sentence for each scenario."""
+    said = []
+    for scenario in dict.fromkeys(run.scenario for run in runs):
+        of = {line.policy: line for line in lines(_of(runs, scenario))}
+        better = min(CONSTANTS, key=lambda policy: of[policy].mean_ms.value)
+        ratio = of[DEFAULT].over_constant.text(2, interval=True)
+        said.append(f"{scenario}: {DEFAULT} took {ratio} of the time of the better constant ({better}).")
+    return said
 
 
 def lines(runs: Sequence[Run]) -> list[Line]:

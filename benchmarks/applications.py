@@ -13,7 +13,7 @@ from datetime import datetime
 from pathlib import Path
 
 from benchmarks.application_runs import Planned, Progress, find_kind, planned, play
-from benchmarks.application_tables import WORST, Run, faults, table, tasks_csv, worst_tasks
+from benchmarks.application_tables import WORST, Run, faults, in_words, table, tasks_csv, worst_tasks
 from benchmarks.measure import processor
 from offboard.common.command_line import CommandParser, add_flags, run_command
 from offboard.common.config import check, flag_of, resolve, setting, settings_of
@@ -93,7 +93,7 @@ def measure(names: Sequence[str], config: ApplicationsConfig) -> int:
 
 def write(name: str, runs: Sequence[Run], notes: str, out: Path) -> None:
     """Write the files of one application, and print its table and its worst tasks."""
-    text = f"{table(runs)}\n{notes}"
+    text = "\n".join([table(runs), *(f"- {line}" for line in in_words(runs)), "", notes])
     write_whole(out / f"{name}.md", text)
     write_whole(out / f"{name}-tasks.csv", tasks_csv(runs))
     first = min(run.seed for run in runs)

@@ -16,6 +16,7 @@ from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 SEEDS_MAX = 1000
 JOBS_MAX = 256
 SIMULATION = "simulation"
+CONSTANTS = (ONBOARD, CLOUD)  # the policies that always choose one site; the better one is the divisor
 NAMES = "NAME,NAME,.."
 POLICIES = (
     f"policies to play: {rivals.POLICY_HELP}; POLICY@PREDICTOR uses another predictor than its own,"
@@ -78,7 +79,7 @@ class RunsConfig:
 class CompareConfig(ColumnSettings, RunsConfig):
     """What is compared, and where the runs are played."""
 
-    policies: tuple[str, ...] = setting(("paper", policies.DEFAULT, ONBOARD, CLOUD), POLICIES, metavar=NAMES)
+    policies: tuple[str, ...] = setting((policies.ALIAS, *CONSTANTS, "paper"), POLICIES, metavar=NAMES)
     out: Path = setting(Path("out/compare"), OUT, metavar="DIR")
     tasks: int | None = setting(None, "number of tasks (default: as in the scenario)", minimum=1)
     reference: int | None = setting(

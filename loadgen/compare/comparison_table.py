@@ -1,15 +1,18 @@
 """The table of a comparison: one line of figures for each policy, with 95 % intervals.
 
 It starts from the outcomes of the runs; `compare` plays them, `simulated_tables` simulates them.
+The sentence below the table is in `comparison_in_words`.
 """
 
+import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from offboard.loadgen.compare.compare_settings import SIMULATION, CompareConfig
+from offboard.loadgen.compare.compare_settings import CONSTANTS, SIMULATION, CompareConfig
+from offboard.loadgen.compare.comparison_in_words import in_words
 from offboard.loadgen.compare.machine_speed import at_one_speed, speed_slope
 from offboard.loadgen.progress import progress
 from offboard.loadgen.scenario.interval_coverage import interval_columns, interval_figures
@@ -29,11 +32,11 @@ from offboard.robot_client.sites.runner import CLOUD
 class Line:
     """The figures of one policy over the tasks of all its runs; None: undefined.
 
-    - `over_first`: mean time / mean time of the first policy, on the same tasks
-    - `server_over_first`: the same ratio for the server's own run time, on tasks that both sent to the cloud
-    - `at_one_speed`: `over_first` without the difference in machine speed (`machine_speed`)
-    - `cost`: what the scenario's objective makes small, per task; `cost_over_first`: over that of the first
-      policy, on the same tasks
+    - `cost`: what the scenario's objective makes small, per task; `quality`: of the variants that answered
+    - `cost_over_constant`, `over_constant`: cost and mean time, over those of the better one of the policies
+      `onboard` and `cloud`, on the same tasks; the better one has the lower cost
+    - `server_over_constant`: the same for the server's own run time, on tasks that both sent to the cloud
+    - `at_one_speed`: `over_constant` without the difference in machine speed (`machine_speed`)
     - `recovery`: number of tasks until recovery from an outage
     - `coverage_percent`, `relative_width`, `width_over_constant`: of the prediction intervals
     - `time_over_oracle`, `regret_ms`: over the `referenced` tasks, which also ran on each site alone
@@ -44,11 +47,12 @@ class Line:
     tasks: int = 0
     lost: int | None = None
     mean_ms: float | None = None
-    over_first: float | None = None
+    over_constant: float | None = None
     at_one_speed: float | None = None
-    server_over_first: float | None = None
+    server_over_constant: float | None = None
     cost: float | None = None
-    cost_over_first: float | None = None
+    cost_over_constant: float | None = None
+    quality: float | None = None
     p95_ms: float | None = None
     p99_ms: float | None = None
     late_percent: float | None = None
@@ -70,11 +74,12 @@ HEADINGS: dict[str, Heading] = {
     "tasks": Heading("tasks", "tasks", 0),
     "lost": Heading("lost", "lost", 0),
     "mean_ms": Heading("mean ms", "mean ms", 1),
-    "over_first": Heading("mean / first policy", "mean / first policy", 3),
-    "at_one_speed": Heading("mean / first policy at equal machine speed", "at equal speed", 3),
-    "server_over_first": Heading("server time / first policy", "server time / first policy", 3),
+    "over_constant": Heading("mean / better constant", "mean / better constant", 3),
+    "at_one_speed": Heading("mean / better constant at equal machine speed", "at equal speed", 3),
+    "server_over_constant": Heading("server time / better constant", "server time / better constant", 3),
     "cost": Heading("cost", "cost", 4),
-    "cost_over_first": Heading("cost / first policy", "cost / first policy", 3),
+    "cost_over_constant": Heading("cost / better constant", "cost / better constant", 3),
+    "quality": Heading("quality", "quality", 3),
     "p95_ms": Heading("P95 ms", "P95 ms", 1),
     "p99_ms": Heading("P99 ms", "P99 ms", 1),
     "late_percent": Heading("late %", r"late \%", 2),
@@ -89,14 +94,13 @@ HEADINGS: dict[str, Heading] = {
     "regret_ms": Heading("regret ms", "regret ms", 1),
 }
 FIRST = (  # the most important columns
-    *("tasks", "lost", "mean_ms", "over_first", "p95_ms", "p99_ms"),
+    *("tasks", "lost", "mean_ms", "over_constant", "p95_ms", "p99_ms"),
     *("late_percent", "cloud_percent", "time_over_oracle", "recovery"),
 )
 
-
-# If the objective is not the mean time, its cost takes the place of the columns that judge by time.
-BY_COST = (
-    *("tasks", "lost", "cost", "cost_over_first", "mean_ms", "p95_ms"),
+COST = ("cost", "cost_over_constant", "quality")
+BY_COST = (  # if a scenario has an objective or variants: its cost comes first, and mean times judge nothing
+    *("tasks", "lost", "mean_ms", "p95_ms"),
     *("late_percent", "cloud_percent", "twice_percent"),
 )
 
@@ -107,14 +111,16 @@ def comparison_table(
     runs: Mapping[str, Sequence[Outcome]],
     each: Callable[..., Iterable[list[Line]]] = map,
 ) -> Table:
-    """One line for each policy, with the ends of its 95 % interval below it.
+    """One line for each policy, with the ends of its 95 % interval below it, and one sentence at the end.
 
     `each` is `map`, or a replacement that uses several processes.
     """
-    names, first = config.policies, runs[config.policies[0]]
+    names, costing = config.policies, scenario.costing()
+    constant = _better_constant(runs, costing)
+    divisor = runs[constant] if constant else ()
     lines: list[Line] = []
     with progress("bootstrap", len(names)) as shown:
-        judged = [runs[name] for name in names], [first for _ in names], [scenario.costing() for _ in names]
+        judged = [runs[name] for name in names], [divisor for _ in names], [costing for _ in names]
         for found in each(_lines, names, *judged):
             lines.extend(found)
             shown.step()
@@ -126,8 +132,28 @@ def comparison_table(
         " Below each policy are the bounds of its 95 % intervals, from blocks of neighbouring tasks."
     )
     about = {"scenario": scenario.name, "testbed": config.where, "seeds": config.seeds}
-    columns = FIRST if scenario.robot.objective == MEAN else BY_COST
-    return Table(caption=caption, about=about, headings=HEADINGS, lines=lines, first=columns)
+    varied = any(line.quality is not None for line in lines)
+    by_cost = varied or scenario.robot.objective != MEAN
+    leading = [name for name in COST if varied or name != "quality"] if by_cost else []
+    return Table(
+        caption=caption,
+        about=about,
+        headings={name: HEADINGS[name] for name in dict.fromkeys(("policy", "bound", *leading, *HEADINGS))},
+        lines=lines,
+        first=(*leading, *(BY_COST if by_cost else FIRST)),
+        ending=in_words([line for line in lines if not line.bound], constant, by_cost=by_cost),
+    )
+
+
+def _better_constant(runs: Mapping[str, Sequence[Outcome]], costing: Costing) -> str | None:
+    """The constant policy with the lower cost over all its tasks; None unless both were played."""
+    costs = {}
+    for name in CONSTANTS:
+        paid = [one.cost(costing) for run in runs.get(name, ()) for one in run.answered]
+        if not paid:
+            return None
+        costs[name] = float(costing.over(np.array(paid)))
+    return min(costs, key=costs.__getitem__)
 
 
 def _runs_and_seeds(first: int, count: int) -> str:
@@ -136,10 +162,10 @@ def _runs_and_seeds(first: int, count: int) -> str:
     return f"{count} runs of each policy with seeds {first} to {first + count - 1}"
 
 
-def _lines(policy: str, runs: Sequence[Outcome], first: Sequence[Outcome], costing: Costing) -> list[Line]:
+def _lines(policy: str, runs: Sequence[Outcome], constant: Sequence[Outcome], costing: Costing) -> list[Line]:
     """The figures of a policy, then the low and the high ends of their intervals."""
     asked = sum(sum(run.asked.values()) for run in runs)
-    columns, referenced = _columns(runs, first, costing), _referenced(runs)
+    columns, referenced = _columns(runs, constant, costing), _referenced(runs)
     count = len(columns["response_s"])
     lost = asked - count
     counts: dict[str, Any] = {"tasks": count, "referenced": len(referenced["sent_s"])}
@@ -166,36 +192,38 @@ def _lines(policy: str, runs: Sequence[Outcome], first: Sequence[Outcome], costi
 
 @dataclass(frozen=True, slots=True)
 class _Pair:
-    """One task of a policy, the same task of the first policy if it was answered there, and the deadline."""
+    """One task of a policy, the same task of the better constant if answered there, and the deadline."""
 
     mine: Answered
-    first: Answered | None
+    constant: Answered | None
     deadline_s: float | None
 
 
-def _pairs(runs: Sequence[Outcome], first: Sequence[Outcome]) -> list[_Pair]:
+def _pairs(runs: Sequence[Outcome], constant: Sequence[Outcome]) -> list[_Pair]:
+    """`constant` is empty if there is no better constant."""
     found = []
-    for run, other in zip(runs, first, strict=True):
-        theirs = {(one.robot, one.i): one for one in other.answered}
+    for run, other in itertools.zip_longest(runs, constant):
+        theirs = {(one.robot, one.i): one for one in other.answered} if other else {}
         for one in sorted(run.answered, key=lambda one: (one.robot, one.i)):
             found.append(_Pair(one, theirs.get((one.robot, one.i)), run.deadline_s))
     return found
 
 
-def _columns(runs: Sequence[Outcome], first: Sequence[Outcome], costing: Costing) -> dict[str, Column]:
+def _columns(runs: Sequence[Outcome], constant: Sequence[Outcome], costing: Costing) -> dict[str, Column]:
     """Columns with one value for each task; NaN where a task has no value."""
 
     def column(value: Callable[[_Pair], float | None]) -> Column:
         return np.array([value(pair) for pair in pairs], dtype=float)
 
-    pairs = _pairs(runs, first)
+    pairs = _pairs(runs, constant)
     return {
         "response_s": column(lambda pair: pair.mine.response_s),
-        "first_s": column(lambda pair: pair.first.response_s if pair.first else None),
+        "constant_s": column(lambda pair: pair.constant.response_s if pair.constant else None),
         "server_s": column(lambda pair: pair.mine.server_s),
-        "first_server_s": column(lambda pair: pair.first.server_s if pair.first else None),
+        "constant_server_s": column(lambda pair: pair.constant.server_s if pair.constant else None),
         "cost": column(lambda pair: pair.mine.cost(costing)),
-        "first_cost": column(lambda pair: pair.first.cost(costing) if pair.first else None),
+        "constant_cost": column(lambda pair: pair.constant.cost(costing) if pair.constant else None),
+        "quality": column(lambda pair: pair.mine.quality),
         "late": column(_late),
         "cloud": column(_sent_to_cloud),
         "twice": column(lambda pair: len(pair.mine.sites) > 1),
@@ -223,16 +251,17 @@ def _referenced(runs: Sequence[Outcome]) -> dict[str, Column]:
 
 def _task_figures(columns: Mapping[str, Column], picks: Picks, costing: Costing) -> dict[str, Column]:
     """The figures over all tasks, for each resample (one row of `picks`)."""
-    cost, first_cost = columns["cost"][picks], columns["first_cost"][picks]
-    shared = np.where(np.isnan(first_cost), np.nan, cost)
-    response, first = columns["response_s"][picks], columns["first_s"][picks]
-    server, first_server = columns["server_s"][picks], columns["first_server_s"][picks]
+    cost, constant_cost = columns["cost"][picks], columns["constant_cost"][picks]
+    shared = np.where(np.isnan(constant_cost), np.nan, cost)
+    response, constant = columns["response_s"][picks], columns["constant_s"][picks]
+    server, constant_server = columns["server_s"][picks], columns["constant_server_s"][picks]
     return {
         "mean_ms": 1e3 * response.mean(axis=-1),
-        "over_first": _ratio(response, first),
-        "server_over_first": _ratio(server, first_server),
+        "over_constant": _ratio(response, constant),
+        "server_over_constant": _ratio(server, constant_server),
         "cost": costing.over(cost),
-        "cost_over_first": _over(costing.over(shared), costing.over(first_cost)),
+        "cost_over_constant": _over(costing.over(shared), costing.over(constant_cost)),
+        "quality": known_mean(columns["quality"][picks]),
         "p95_ms": 1e3 * quantile(response, 95),
         "p99_ms": 1e3 * quantile(response, 99),
         "late_percent": 100 * known_mean(columns["late"][picks]),
@@ -259,9 +288,9 @@ def _ratio(over: Column, under: Column) -> Column:
     return ratio
 
 
-def _over(cost: Column, first: Column) -> Column:
-    """NaN where the first policy costs nothing, or answered none of these tasks."""
-    ratio: Column = np.divide(cost, first, where=first > 0, out=np.full(len(cost), np.nan))
+def _over(cost: Column, constant: Column) -> Column:
+    """NaN where the better constant costs nothing, or answered none of these tasks."""
+    ratio: Column = np.divide(cost, constant, where=constant > 0, out=np.full(len(cost), np.nan))
     return ratio
 
 

@@ -17,8 +17,8 @@ SLOPES = (0.0, 1.0)  # a machine that is twice as slow makes no task faster, and
 
 
 def speed_slope(resampled: Mapping[str, Column]) -> float:
-    """The exponent with which `over_first` follows `server_over_first`; 0 if the latter never differs."""
-    server, over = (np.log(resampled[name]) for name in ("server_over_first", "over_first"))
+    """The exponent with which `over_constant` follows `server_over_constant`; 0 if that never differs."""
+    server, over = (np.log(resampled[name]) for name in ("server_over_constant", "over_constant"))
     known = np.isfinite(server) & np.isfinite(over)
     if not known.any() or not np.ptp(server[known]):
         return 0.0
@@ -27,9 +27,9 @@ def speed_slope(resampled: Mapping[str, Column]) -> float:
 
 
 def at_one_speed(figures: Mapping[str, Column], slope: float) -> Column:
-    """`over_first` of each resample, as if the server had been equally fast in the runs of both policies.
+    """`over_constant` of each resample, as if the server had been equally fast in the runs of both policies.
 
     NaN if no task was sent to the cloud by both.
     """
-    found: Column = figures["over_first"] * np.exp(-slope * np.log(figures["server_over_first"]))
+    found: Column = figures["over_constant"] * np.exp(-slope * np.log(figures["server_over_constant"]))
     return found

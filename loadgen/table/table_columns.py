@@ -94,7 +94,8 @@ def _notes_outside(table: Table) -> Table:
 
 
 def _wrapped(table: Table) -> Table:
-    return replace(table, caption=_filled(table.caption), notes=tuple(map(_filled_note, table.notes)))
+    notes = tuple(map(_filled_note, table.notes))
+    return replace(table, caption=_filled(table.caption), notes=notes, ending=_filled_note(table.ending))
 
 
 def _filled_note(text: str) -> str:

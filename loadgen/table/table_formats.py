@@ -31,6 +31,7 @@ class Table:
     `about` comes before the cells of each CSV line, and with the lines in JSON.
     The `note` of a line is shown in its first column. None in a line means undefined.
     `first` names the most important columns: they are printed if there is no room for all.
+    `ending` is a sentence below the table; CSV has no room for it.
     """
 
     caption: str
@@ -39,6 +40,7 @@ class Table:
     lines: Sequence[Any]
     notes: tuple[str, ...] = ()
     first: tuple[str, ...] = ()
+    ending: str = ""
 
 
 def render(tables: Sequence[Table], format: str) -> str:
@@ -65,7 +67,8 @@ def _markdown(tables: Sequence[Table]) -> str:
         rule = ["-" * (width - number) + ":" * number for width, number in zip(widths, numbers, strict=True)]
         lines = [_markdown_line(line, widths, numbers) for line in (texts[0], rule, *texts[1:])]
         notes = [f"- {note}" for note in table.notes]
-        blocks.append("\n".join([table.caption, *notes, "", *lines, ""]))
+        ending = ["", f"- {table.ending}"] if table.ending else []
+        blocks.append("\n".join([table.caption, *notes, "", *lines, *ending, ""]))
     return "\n".join(blocks)
 
 
@@ -98,7 +101,12 @@ def _csv(tables: Sequence[Table]) -> str:
 
 def _json(tables: Sequence[Table]) -> str:
     plain = [
-        {**table.about, "notes": table.notes, "scores": [asdict(line) for line in table.lines]}
+        {
+            **table.about,
+            "notes": table.notes,
+            "scores": [asdict(line) for line in table.lines],
+            **({"ending": table.ending} if table.ending else {}),
+        }
         for table in tables
     ]
     return json.dumps({"tables": plain}, indent=2, ensure_ascii=False) + "\n"
@@ -111,7 +119,7 @@ def _latex(tables: Sequence[Table]) -> str:
         lines = [
             " & ".join(_latex_cell(cell) for cell in cells(table, line)) + r" \\" for line in table.lines
         ]
-        caption = _latex_text(" ".join([table.caption, *table.notes]))
+        caption = _latex_text(" ".join([table.caption, *table.notes, table.ending]).rstrip())
         top = [r"\begin{table*}", rf"\caption{{{caption}}}"]
         body = [r"\begin{tabular}{l" + "r" * (len(table.headings) - 1) + "}", r"\hline", heading, r"\hline"]
         blocks.append("\n".join([*top, *body, *lines, r"\hline", r"\end{tabular}", r"\end{table*}", ""]))

@@ -85,7 +85,7 @@ class SiteMemory:
         self._energy = energy
         self._quality = quality
         self._bytes_in = RunningMean()
-        self._cpu_s = RunningMean()
+        self._cpu_share = RunningMean()  # CPU seconds in each second of a run
 
     def outlook(
         self,
@@ -125,7 +125,7 @@ class SiteMemory:
         spread_s, error_s = found.spread_s, found.error_s or 0.0
         low_s, high_s = self._conformal.interval(seconds, spread_s, error_s) or (None, None)
         energy, errors, quality = self._energy, self._conformal.errors, self._quality
-        onboard_s = self._cpu_s.value or seconds
+        onboard_s = found.seconds * (self._cpu_share.value or 1.0)
         joules = energy.onboard_j(onboard_s) if self._site == ONBOARD else energy.remote_j(seconds, moved)
         expected = Expected(seconds, spread_s, joules, quality, bytes=moved, error_s=error_s)
         cost = self._objective.cost(expected, errors)
@@ -251,8 +251,8 @@ class SiteMemory:
         self.observations.append(one)
         if one.ok:
             self._bytes_in.add(one.bytes_in)
-        if one.cpu_s is not None:
-            self._cpu_s.add(one.cpu_s)
+        if one.cpu_s is not None and one.seconds:
+            self._cpu_share.add(one.cpu_s / one.seconds)
         if one.predicted_s is not None and one.ok:
             self._conformal.learn(one.predicted_s, one.seconds + one.waited_s)
         elif one.predicted_s is not None:

@@ -137,6 +137,18 @@ def test_arguments_are_compressed_on_a_slow_link_if_they_shrink(
     assert [bool(run["packed"]) for run in noise] == [True] + [False] * (CALLS - 1)
 
 
+@pytest.mark.parametrize("policy", ["default", CLOUD])
+def test_the_constant_cloud_compresses_as_the_default_does(
+    testbed: Beds, connect: Connect, policy: str
+) -> None:
+    """So a comparison of the two is one of sites, and not of bytes."""
+    offload, rng = connect(testbed(TASKS, **SLOW), policy=policy), np.random.default_rng(1)
+    for _ in range(CALLS):
+        one = noisy(rng, 4)
+        assert offload(packing_tasks.image, one, where=None if policy == CLOUD else CLOUD) == one.sum()
+        assert execution(offload).bytes_out < PIXELS / 2
+
+
 def test_nothing_is_compressed_if_the_settings_say_so(testbed: Beds) -> None:
     """Also on a slow link."""
     with Offloader.connect(testbed(TASKS, **SLOW).endpoint, settings=Settings(compress=False)) as offload:

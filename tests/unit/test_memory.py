@@ -218,6 +218,18 @@ def test_bytes_are_those_of_the_task_and_of_the_usual_answer() -> None:
     assert math.isfinite(outlook(one, ONBOARD).cost or 0.0)
 
 
+def test_the_joules_of_a_run_onboard_follow_its_amount() -> None:
+    """A task of a tenth of the work takes a tenth of the CPU seconds, not those of the mean task."""
+    one = memory()
+    for n in range(40):
+        amount, ran = (1.0, 0.5) if n % 2 else (0.1, 0.05)
+        run = Execution(ONBOARD, ran, queue_s=0.0, run_s=ran, cpu_s=0.4 * ran)
+        one.site(ONBOARD).learn(amount, run, None, silent=False, size=amount)
+    for amount, ran in ((1.0, 0.5), (0.1, 0.05)):
+        found = one.site(ONBOARD).outlook(amount, UNMEASURED, in_flight=0, timeout_s=2.0, sending=Sending(0))
+        assert found.joules == pytest.approx(0.4 * ran * Energy().compute_w, rel=0.1)
+
+
 def test_more_bytes_take_longer() -> None:
     """A task that sends ten times the bytes of the others is predicted by the rate of the link."""
     one = memory()

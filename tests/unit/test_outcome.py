@@ -166,6 +166,10 @@ def test_each_policy_comes_first_equally_often() -> None:
     assert [rotated("abc", n) for n in range(4)] == [list("abc"), list("bca"), list("cab"), list("abc")]
 
 
+SMALL = Scenario("small", 1, Workload(task="m:f", sizes=("constant:1",)))
+PLAYED = CompareConfig(policies=("onboard", "cloud", "paper"), seeds=1)
+
+
 @pytest.fixture
 def outcome() -> Callable[[float], Outcome]:
     """Forty cloud tasks that take `seconds` to 1.2 times as long; every fourth is a reference task."""
@@ -182,31 +186,24 @@ def outcome() -> Callable[[float], Outcome]:
 
 def test_a_comparison_pairs_equal_tasks(outcome: Callable[[float], Outcome]) -> None:
     """If every task takes twice as long, the ratio is exactly 2; regret equals the one by hand."""
-    config = CompareConfig(policies=("paper", "cloud"), seeds=2)
-    runs = {"paper": [outcome(0.1)] * 2, "cloud": [outcome(0.2)] * 2}
     compared = comparison_table(
-        Scenario("small", 1, Workload(task="m:f", sizes=("constant:1",))), config, runs
+        SMALL, PLAYED, {"onboard": [outcome(0.1)], "cloud": [outcome(0.3)], "paper": [outcome(0.2)]}
     )
-    paper, *_, cloud, low, high = compared.lines
-    assert (paper.policy, paper.tasks, paper.over_first) == ("paper", 80, 1.0)
-    assert cloud.over_first == pytest.approx(2.0)
-    assert (low.over_first, high.over_first) == (pytest.approx(2.0), pytest.approx(2.0))
-    assert low.mean_ms < cloud.mean_ms < high.mean_ms
-    assert (cloud.referenced, cloud.time_over_oracle) == (20, pytest.approx(2.0))
-    assert cloud.regret_ms == pytest.approx(100)
-    assert (cloud.late_percent, cloud.lost, cloud.cloud_percent) == (0.0, 0, 100.0)
+    (onboard, *_, paper, low, high) = compared.lines
+    assert (onboard.policy, onboard.tasks, onboard.over_constant) == ("onboard", 40, 1.0)
+    assert paper.over_constant == pytest.approx(2.0)
+    assert (low.over_constant, high.over_constant) == (pytest.approx(2.0), pytest.approx(2.0))
+    assert low.mean_ms < paper.mean_ms < high.mean_ms
+    assert (paper.referenced, paper.time_over_oracle) == (10, pytest.approx(2.0))
+    assert paper.regret_ms == pytest.approx(100)
+    assert (paper.late_percent, paper.lost, paper.cloud_percent) == (0.0, 0, 100.0)
 
 
 def test_a_lost_task_is_counted_but_not_compared(outcome: Callable[[float], Outcome]) -> None:
     """A policy that lost tasks is compared on its answered tasks only."""
-    config = CompareConfig(policies=("paper", "cloud"), seeds=1)
     whole, part = outcome(0.1), outcome(0.2)
     part = Outcome(part.asked, part.answered[5:], part.references, deadline_s=part.deadline_s)
-    compared = comparison_table(
-        Scenario("small", 1, Workload(task="m:f", sizes=("constant:1",))),
-        config,
-        {"paper": [whole], "cloud": [part]},
-    )
-    cloud = next(line for line in compared.lines if line.policy == "cloud" and not line.bound)
-    assert (cloud.lost, cloud.tasks) == (5, 35)
-    assert cloud.over_first == pytest.approx(2.0)
+    compared = comparison_table(SMALL, PLAYED, {"onboard": [whole], "cloud": [outcome(0.3)], "paper": [part]})
+    paper = next(line for line in compared.lines if line.policy == "paper" and not line.bound)
+    assert (paper.lost, paper.tasks) == (5, 35)
+    assert paper.over_constant == pytest.approx(2.0)

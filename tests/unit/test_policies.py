@@ -60,6 +60,13 @@ def test_default_is_a_name_like_any_other() -> None:
     assert policies.weighs_cost("default")
 
 
+def test_the_constants_predict_as_the_default_does() -> None:
+    """Only that predictor knows what a byte takes, so without it they would compress nothing."""
+    of_default = policies.predictor_of("default")
+    assert [policies.predictor_of(name) for name in ("onboard", "cloud")] == [of_default] * 2
+    assert policies.predictor_of("paper") == predictors.LEAST_SQUARES
+
+
 @pytest.mark.parametrize("name", [rivals.policy(rule) for rule in rivals.RULES])
 def test_every_rule_names_a_predictor_that_exists(name: str) -> None:
     """The predictor that a policy is meant for can be made, and wrappers do not change it."""

@@ -12,8 +12,8 @@ from offboard.loadgen.table.table_formats import Table
 from tests.table_loops import THOUSAND, csv_of, lines_of
 
 LINES = [
-    Line("paper", tasks=200, lost=0, mean_ms=1234.5, over_first=1.0, p95_ms=4321.0, note="no outage"),
-    Line("hedge:probe:greedy@bayesian", tasks=200, lost=0, mean_ms=234.5, over_first=0.2, p95_ms=321.0),
+    Line("paper", tasks=200, lost=0, mean_ms=1234.5, over_constant=1.0, p95_ms=4321.0, note="no outage"),
+    Line("hedge:probe:greedy@bayesian", tasks=200, lost=0, mean_ms=234.5, over_constant=0.2, p95_ms=321.0),
 ]
 TABLE = Table("About two policies. " * 9, {"scenario": "calm"}, HEADINGS, LINES, ("A note. " * 30,), FIRST)
 
