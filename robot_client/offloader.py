@@ -34,10 +34,10 @@ from offboard.robot_client.learning.savings import Savings
 from offboard.robot_client.lifetime import Lifetime
 from offboard.robot_client.policies import BOTH, Forecast, Policy
 from offboard.robot_client.policies.allowance import Allowance
-from offboard.robot_client.policies.deadline import by_deadline
 from offboard.robot_client.policies.decision import pairs
 from offboard.robot_client.policies.expectation import Expectation, expectations, missed
 from offboard.robot_client.policies.forecast import finishes_of
+from offboard.robot_client.policies.objectives import by_deadline
 from offboard.robot_client.policies.observe import Observe
 from offboard.robot_client.records.recording import Recording, record_of, tell
 from offboard.robot_client.records.trace import Record

@@ -10,6 +10,7 @@ from offboard.cloud_server import (
     authorisation,
     connections,
     http_api,
+    other_versions,
     rate_limit,
     robot_socket,
     scheduler,
@@ -21,6 +22,7 @@ from offboard.cloud_server.executors import worker, worker_pool
 from offboard.common import task_states, tasks, tracebacks
 from offboard.common.planning import maps, planner
 from offboard.common.security import bounded_http, private_files
+from offboard.common.source import covered_files, covers, uncovered
 from offboard.common.wire import channel, item_count, messages, values
 from offboard.loadgen.relay import control_api, link_schedule
 from offboard.loadgen.relay.link import delay_samples
@@ -64,6 +66,12 @@ ROBOT = {
         tasks.NAME_LENGTH_MAX,
         tasks.SIZE_NUMBERS_MAX,
     ],
+    "what a task, or one of its variants, covers; one file of it": [
+        covers.COVERS_MAX,
+        covered_files.FILE_BYTES_MAX,
+        covered_files.PIECE_BYTES,
+    ],
+    "helpers that `robot-client check` names": [uncovered.HELPERS_SHOWN],
     "arguments, or the result, of one task": [
         values.VALUE_BYTES_MAX,
         item_count.ITEMS_MAX,
@@ -135,6 +143,7 @@ ROBOT = {
 }
 
 SERVER = {
+    "log lines about robots with another version of Offboard": [other_versions.VERSIONS_MAX],
     "requests waiting": [default(ServerConfig, "queue_max")],
     "large arguments kept": [default(ServerConfig, "blob_mib")],
     "one message": [default(ServerConfig, "message_mib")],

@@ -115,8 +115,8 @@ class Race:
     def _wait_for_answer(self, plan: Plan) -> Generator[Wait, None, str | None]:
         """Start the later runs when they are due; the site of the first answer, None if all runs failed."""
         began_s, call = self._clock.now_s(), plan.call
-        later = [one for one in (plan.second, plan.latest) if one is not None]
-        later.sort(key=_due_s, reverse=True)  # the next one is the last
+        # The next one to start comes last.
+        later = sorted(filter(None, (plan.second, plan.latest)), key=_due_s, reverse=True)
         while later and _due_s(later[-1]) <= 0:
             self._start_later(later.pop(), plan)
         while True:
@@ -124,7 +124,7 @@ class Race:
             for site, (run, _) in self._runs.items():
                 if not run.done():
                     pending.append(run)
-                elif _is_answer(result_of(site, run)):
+                elif _is_answer(result_of(site, run), plan):
                     return site
             if not pending:
                 return None
@@ -202,9 +202,13 @@ def result_of(site: str, future: "Future[Execution]") -> Execution:
         return Execution(site, 0.0, failure=SiteClosed("closed while the task was in flight"), started=False)
 
 
-def _is_answer(execution: Execution) -> bool:
-    """Whether the race is over: if the task itself fails, it fails on every site; its setup may not."""
-    return execution.ok or (isinstance(execution.failure, TaskError) and execution.started)
+def _is_answer(execution: Execution, plan: Plan) -> bool:
+    """Whether the race is over: if the task itself fails, it fails on every site; its setup may not.
+
+    In a warm-up nobody knows that, and the other site runs it anyway.
+    """
+    failed = not plan.keep and isinstance(execution.failure, TaskError) and execution.started
+    return execution.ok or failed
 
 
 def _may_fall_back(execution: Execution, kind: Kind) -> bool:

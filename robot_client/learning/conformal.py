@@ -8,7 +8,7 @@ import operator
 from bisect import bisect_left, insort
 from collections import deque
 
-from offboard.robot_client.policies.forecast import ERRORS_MIN, PredictionErrors, unit_s, widened_s
+from offboard.robot_client.policies.forecast import ERRORS_MIN, SPREADS_90, PredictionErrors, unit_s
 from offboard.robot_client.predictors.line import RATE, RunningMean
 
 COVERAGE = 0.9  # share of the times that an interval should hold
@@ -76,9 +76,10 @@ class Conformal:
             half_s = self.errors.half_90_s(predicted_s, spread_s, error_s)
             return max(0.0, predicted_s - half_s), predicted_s + half_s
         unit, (low, high) = unit_s(predicted_s, self._usual_s.value), self._ends or self._interval()
-        low_s = predicted_s - widened_s(unit * max(0.0, -low), error_s)
-        high_s = predicted_s + widened_s(unit * max(0.0, high), error_s)
-        return max(0.0, low_s), high_s
+        more_s = SPREADS_90 * error_s
+        low_s = predicted_s - math.hypot(unit * min(0.0, low), more_s)
+        high_s = predicted_s + math.hypot(unit * max(0.0, high), more_s)
+        return (low_s if low_s > 0 else 0.0), (high_s if high_s > 0 else 0.0)
 
     def _adapt(self, *, missed: bool) -> None:
         outside = self._outside + RATE * (1 - COVERAGE - missed)  # below 0: wider than all errors seen

@@ -15,7 +15,7 @@ from offboard.robot_client.predictors.base import REMEMBERED
 from offboard.robot_client.sites.runner import Condition
 
 FORMAT = 2  # version of the file: a file of another version is not read
-NUMBER_MIN, NUMBER_MAX = 1e-50, 1e50  # so that squares and quotients stay in the range of a float
+NUMBER_MAX = 1e50  # and its inverse: squares and quotients stay in the range of a float
 PER_SIZE, PER_WORK = "size", "work"
 
 
@@ -134,7 +134,7 @@ def _size(given: Any) -> Size:
     return tuple(map(_number, given)) if isinstance(given, list) and len(given) > 1 else _number(given)
 
 
-def _number(given: Any, least: float = NUMBER_MIN) -> float:
+def _number(given: Any, least: float = 1 / NUMBER_MAX) -> float:
     if isinstance(given, bool) or not isinstance(given, int | float):
         raise TypeError(f"{given!r} where a number was expected")
     if given != 0 and not least <= given <= NUMBER_MAX:

@@ -11,13 +11,12 @@ from functools import cached_property
 from typing import NamedTuple
 
 from offboard.common.tasks import Size
-from offboard.robot_client.predictors.base import WARM_UP
+from offboard.robot_client.predictors.base import SIZE_MIN, WARM_UP
 from offboard.robot_client.sites.runner import NOTHING, ONBOARD, UNMEASURED, Condition, Sending
 
 ERRORS_MIN = 10  # with fewer errors, they are taken to be normal, and the spread counts as one of them
 SPREADS_90 = 1.645  # standard deviations on each side that hold 90 % of the times, and above which 5 % are
 TAIL_SHARE = 0.2  # of the errors, the largest ones: they say how much longer a late task may take
-UNIT_MIN_S = 1e-100  # below it, errors in this unit would leave the range of a float
 BEYOND = 0.25  # of the distance from the median to the largest error: later than that, no task has ended
 
 
@@ -246,7 +245,7 @@ def normal_of_student(t: float, freedom: int) -> float:
 def unit_s(predicted_s: float, usual_s: float) -> float:
     """The unit of the errors: a part of the noise grows with the task, and a part does not."""
     unit = 0.5 * ((predicted_s if predicted_s > 0 else 0.0) + usual_s)
-    return unit if unit > UNIT_MIN_S else 1.0
+    return unit if unit > SIZE_MIN else 1.0  # errors in this unit must not leave the range of a float
 
 
 def widened_s(beyond_s: float, error_s: float) -> float:

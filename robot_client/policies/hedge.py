@@ -1,6 +1,6 @@
 """The wrapper `hedge`: plans a second run for a task that is late, or whose deadline comes near.
 
-When a task counts as late is in `Outlook.overdue_s`; when onboard must start for a deadline is in `deadline`.
+When a task is late is in `Outlook.overdue_s`; when onboard must start for a deadline is in `objectives`.
 `execution/race.py` starts the second run.
 """
 

@@ -14,9 +14,8 @@ from offboard.robot_client import policies
 from offboard.robot_client.learning.conformal import Conformal
 from offboard.robot_client.policies import Decision, Forecast, Hedge, Outlook
 from offboard.robot_client.policies.allowance import Allowance
-from offboard.robot_client.policies.deadline import by_deadline
 from offboard.robot_client.policies.forecast import NO_ERRORS, PredictionErrors, Quality
-from offboard.robot_client.policies.objectives import Deadline, Expected
+from offboard.robot_client.policies.objectives import Deadline, Expected, by_deadline
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition

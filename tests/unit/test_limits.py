@@ -9,7 +9,7 @@ import pytest
 from tests.limits import CONSTANTS, WITHOUT
 
 PAGE = Path(__file__).parents[2] / "docs" / "operations.md"
-UNITS = {"KiB": 2**10, "MiB": 2**20, "million": 1e6, "minutes": 60, "hours": 3600}
+UNITS = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "million": 1e6, "minutes": 60, "hours": 3600}
 NUMBER = re.compile(rf"(\d[\d,]*(?:\.\d+)?)(?: ({'|'.join(UNITS)}))?\b")
 NO_LIMIT = re.compile(r"`[^`]*`|exit code \d+|\b413\b")  # names, and what a program answers
 

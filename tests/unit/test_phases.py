@@ -29,6 +29,7 @@ TIMEOUT_S = 2.0
 HEDGE_S = 0.4
 
 WARM_UP = Decision(ONBOARD, "warm-up", "scripted", both=True)
+MEASURED = Decision(ONBOARD, "warm-up that waits", "scripted", both=True, waits=True)
 PROBE = Decision(ONBOARD, "probe", "scripted", second=Probe(CLOUD))
 PROBE_BACK = Decision(CLOUD, "probe", "scripted", second=Probe(ONBOARD))
 HEDGE = Decision(CLOUD, "hedge", "scripted", second=Hedge(ONBOARD, HEDGE_S))
@@ -137,10 +138,12 @@ def lost(fault: OffloadError) -> list[Case]:
 OWN = "TaskFailed"  # a failure of the task itself is raised, from the site that reports it first
 CASES = [
     *(case for fault in (BROKEN, BUSY, LATE) for case in lost(fault)),
-    Case("warm-up", WARM_UP, (0.3, OK), (0.2, OK), "onboard, cloud", 0.3, 0.2),
-    Case("warm-up, silent", WARM_UP, (0.3, OK), NEVER, "onboard, cloud CloudTimeout", 0.3, 2.0),
+    Case("warm-up", WARM_UP, (0.3, OK), (0.2, OK), "onboard Overtaken, cloud", 0.3, 0.2),
+    Case("warm-up that waits", MEASURED, (0.3, OK), (0.2, OK), "onboard, cloud", 0.3, 0.2),
+    Case("warm-up, silent", WARM_UP, (0.3, OK), NEVER, "onboard, cloud Overtaken", 0.3, 2.0),
+    Case("warm-up that waits, silent", MEASURED, (0.3, OK), NEVER, "onboard, cloud CloudTimeout", 0.3, 2.0),
     Case("warm-up, cloud fails", WARM_UP, (0.3, OK), (0.2, FAILED), "onboard, cloud TaskFailed", 0.3, None),
-    Case("warm-up, onboard fails", WARM_UP, (0.3, FAILED), (0.2, OK), "onboard TaskFailed, cloud", None, 0.2),
+    Case("warm-up, onboard fails", WARM_UP, (0.1, FAILED), (0.2, OK), "onboard TaskFailed, cloud", None, 0.2),
     Case(
         *("warm-up, task fails", WARM_UP, (0.3, FAILED), (0.2, FAILED)),
         *("onboard TaskFailed, cloud TaskFailed", None, None),

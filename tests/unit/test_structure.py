@@ -9,7 +9,7 @@ from tests import structure
 
 ROOT = Path(__file__).parents[2]
 MODULES = structure.modules(ROOT)
-FOLDER_FILES_MAX = {"common": 16}
+FOLDER_FILES_MAX = {"common": 16, "cloud_server": 15}
 FILES_MAX = 14
 MODULE_LINES_MAX = 400
 TEST_LINES_MAX = 400

@@ -255,13 +255,15 @@ def test_waiting_for_sites_runs_the_setup(runner: OnboardRunner) -> None:
     """The first task then finds its state; a setup that takes too long, or raises, is the reason given."""
     sites, kind = {"onboard": runner}, kind_of(modelled)
     bench.setup_may_end.clear()
-    slow = wait_for_sites(sites, kind, 0.0)
+    slow = wait_for_sites(sites, kind, 0.0, Absent())
     assert slow == {"onboard": "the setup of task modelled is not over"}
     bench.broken = True
     bench.setup_may_end.set()
-    assert wait_for_sites(sites, kind, WAIT_S) == {"onboard": "setup of task modelled: ValueError: no model"}
+    assert wait_for_sites(sites, kind, WAIT_S, Absent()) == {
+        "onboard": "setup of task modelled: ValueError: no model"
+    }
     bench.broken = False
-    found = wait_for_sites(sites, kind, WAIT_S)
+    found = wait_for_sites(sites, kind, WAIT_S, Absent())
     assert (found, str(found)) == ({}, "all sites can take this task")
     assert runner.submit(call(2), 1.0).result(WAIT_S).value == (2, 1)
 
@@ -276,13 +278,13 @@ def test_a_reason_that_waiting_cannot_change_is_not_waited_for(
     if not setup_ends:
         bench.setup_may_end.clear()
     began_s = time.monotonic()
-    absent = wait_for_sites(sites, kind, WAIT_S if setup_ends else 0.1)
+    absent = wait_for_sites(sites, kind, WAIT_S if setup_ends else 0.1, Absent())
     waited_s = time.monotonic() - began_s
     assert absent[CLOUD] == "other source"
     assert waited_s < WAIT_S / 2 if setup_ends else waited_s >= 0.1
     other.absent = "not connected"
     began_s = time.monotonic()
-    assert wait_for_sites(sites, kind, 0.1)[CLOUD] == "not connected"
+    assert wait_for_sites(sites, kind, 0.1, Absent())[CLOUD] == "not connected"
     assert time.monotonic() - began_s >= 0.1
 
 

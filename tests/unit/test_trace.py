@@ -134,6 +134,8 @@ def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
             "second_after_s": 0.5,
             "spared": [],
             "advised": None,
+            "waits": False,
+            "latest_s": None,
         },
         "executions": [
             ran(
