@@ -1,191 +1,175 @@
-"""What a robot asked for, from the files that it left: the same as it really asked for."""
+"""The model of a recorded link, against the same rule written in numpy."""
 
-import json
-from collections.abc import Callable
-from datetime import datetime, timedelta
+import math
 from pathlib import Path
-from typing import Any
+from random import Random
 
 import numpy as np
 import pytest
 
-from offboard.common.errors import DataError
-from offboard.loadgen.drive_record import DriveRecord
-from offboard.loadgen.export.recording import Recording, plan_of, read_recording
-from offboard.loadgen.robot import answers
-from offboard.loadgen.robot_files import drive_path, read_trace
-from tests.drives import drive
-from tests.mazes import warm
+from offboard.common.errors import ConfigError
+from offboard.loadgen.relay.link.link import SEGMENT_BYTES, Link, LinkConditions
+from offboard.loadgen.relay.link.link_settings import LinkFlags
+from offboard.loadgen.relay.link.pipe import Pipe
+from offboard.loadgen.relay.link.recording import Playback, Recording
+from offboard.loadgen.relay.link.recording_file import read_recording
 
-warm()  # compiles before the clock of any test runs
-OPEN = {"jump": True, "arrivals": "constant", "rate": 200.0, "in_flight": 3}
-
-
-def trace_of(folder: Path) -> Path:
-    return folder / "trace.jsonl"
+TIMES = (0.0, 1.0, 2.0, 4.0, 5.0)
+RTT_MS = (20.0, 800.0, 30.0, 10.0)
+MBPS = (8.0, 0.0, 0.8, 4.0)  # 1,000,000, 0, 100,000 and 500,000 bytes a second
 
 
-def change(path: Path, edit: Callable[[list[dict[str, Any]]], list[dict[str, Any]]]) -> None:
-    """Write the lines of a file anew."""
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    path.write_text("".join(json.dumps(line) + "\n" for line in edit(lines)))
+def recording(**columns: tuple[float, ...]) -> Recording:
+    return Recording("run.csv", "ab" * 32, TIMES, columns)
 
 
-def assert_asked(recording: Recording, asked: list[tuple[Any, ...]]) -> None:
-    """The recording has these requests, to the last digit."""
-    assert len(recording.tasks) == len(asked)
-    for task, (grid, scan, pose, goal, *rest) in zip(recording.tasks, asked, strict=True):
-        found_grid, found_scan, *found = task.request
-        np.testing.assert_array_equal(found_grid.cells, grid.cells)
-        np.testing.assert_array_equal(found_scan.ranges, scan.ranges)
-        assert found == [pose, goal, *rest]
+def played(
+    begun_s: float = 0.0, *, repeats: bool = True, from_s: float = 0.0, **columns: tuple[float, ...]
+) -> Playback:
+    return Playback(recording(**columns), "up", from_s=from_s, repeats=repeats, begun_s=begun_s)
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [{}, {"jump": True}, OPEN, {"sizes": ("uniform:0:3",)}, {"seed": 8, "planner": "astar"}],
-    ids=["drives", "jumps", "open", "sizes", "settings"],
-)
-def test_the_robot_asks_again_for_what_it_asked(tmp_path: Path, settings: dict[str, Any]) -> None:
-    """Map, scan, pose and goal of every task are those of the run, and so is every path."""
-    asked = drive(tmp_path, **settings)
-    recording = read_recording(trace_of(tmp_path))
-    assert_asked(recording, asked)
-    assert recording.left_out == 0
-    for task, (grid, *_) in zip(recording.tasks, asked, strict=True):
-        plan = plan_of(task.line, grid)
-        assert plan is not None
-        assert plan.status == "NONE"
-        np.testing.assert_array_equal(plan.metres, grid.metres(plan.cells).astype(np.float32))
+def pipe(playback: Playback, **conditions: float) -> Pipe:
+    return Pipe(LinkConditions(recording=playback, **conditions), 1, 1, "up")  # type: ignore[arg-type]
 
 
-def test_failed_tasks_are_part_of_the_recording(tmp_path: Path) -> None:
-    """After a failed task the robot picks another goal; the task has no path, and no site answered it."""
-    asked = drive(tmp_path, picky=True, tasks=20)
-    recording = read_recording(trace_of(tmp_path))
-    assert_asked(recording, asked)
-    failed = [plan_of(task.line, recording.grid) is None for task in recording.tasks]
-    assert failed == [int(goal.x) % 3 == 0 for _, _, _, goal, *_ in asked]
-    assert 0 < sum(failed) < 20
-    assert [task.decided.used is None for task in recording.tasks] == failed
+def test_a_message_is_delayed_by_half_the_round_trip_of_its_time() -> None:
+    """A value holds until the next row, and the recording starts again at its end."""
+    link = played(100.0, rtt_ms=RTT_MS)
+    for after_s, delay_ms in (
+        (0.0, 10),
+        (0.999, 10),
+        (1.0, 400),
+        (3.9, 15),
+        (4.5, 5),
+        (5.0, 10),
+        (11.5, 400),
+    ):
+        assert link.delay_ms(100.0 + after_s) == delay_ms, after_s
 
 
-def test_times_come_from_the_clock_of_the_answers(tmp_path: Path) -> None:
-    """The first task began when the trace says, and the others as much later as the answers say."""
-    drive(tmp_path)
-    tasks = read_recording(trace_of(tmp_path)).tasks
-    records, lines = list(read_trace(trace_of(tmp_path))), list(answers.read(tmp_path / "answers.jsonl"))
-    first = datetime.fromisoformat(records[0]["started_at"]).timestamp()
-    assert tasks[0].begin_ns == pytest.approx(first * 1e9, abs=1e3)
-    for task, line, record in zip(tasks, lines, records, strict=True):
-        later_s, took_s = line["began_s"] - lines[0]["began_s"], line["ended_s"] - line["began_s"]
-        assert task.begin_ns - tasks[0].begin_ns == pytest.approx(later_s * 1e9, abs=2)
-        assert task.end_ns - task.begin_ns == pytest.approx(took_s * 1e9, abs=2)
-        assert task.decided.waited_ms == 1e3 * record["waited_s"]
+def test_what_was_held_back_arrives_together() -> None:
+    """In order: messages behind a late one come out with it, as numpy computes from the rows."""
+    random = Random(5)
+    sent = np.sort([random.uniform(0, 20) for _ in range(500)])
+    rows = np.searchsorted(TIMES, sent % TIMES[-1], side="right") - 1
+    expected = np.maximum.accumulate(sent + np.array(RTT_MS)[rows] / 2e3)
+    line = pipe(played(rtt_ms=RTT_MS))
+    assert [line.due(at, 40) for at in sent] == pytest.approx(expected)
+    assert np.unique(expected).size < len(sent) - 20
 
 
-def test_a_robot_that_was_started_again_has_two_clocks(tmp_path: Path) -> None:
-    """The answers of each process count from its own first task; the trace says when that was."""
-    drive(tmp_path, jump=True)
-    change(tmp_path / "answers.jsonl", lambda lines: lines[:5])
-    before = trace_of(tmp_path).read_text()
-    drive(tmp_path, jump=True)
-    assert trace_of(tmp_path).read_text().startswith(before)
-
-    def a_day_later(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        times = [
-            datetime.fromisoformat(line["started_at"]) + timedelta(days=n >= 12)
-            for n, line in enumerate(lines)
-        ]
-        return [line | {"started_at": time.isoformat()} for line, time in zip(lines, times, strict=True)]
-
-    change(trace_of(tmp_path), a_day_later)
-    recording = read_recording(trace_of(tmp_path))
-    begins_s = [(task.begin_ns - recording.tasks[0].begin_ns) / 1e9 for task in recording.tasks]
-    assert begins_s == sorted(begins_s)
-    assert [round(begin_s / 86_400) for begin_s in begins_s] == [0] * 5 + [1] * 7
-    assert recording.left_out == 7, "seven answers of the first process are lost"
+def test_bytes_pass_at_the_rates_of_the_seconds_that_they_take() -> None:
+    """Fine steps through the rates give the same end as the model, over several rounds of the recording."""
+    random, step = Random(6), 1e-4
+    grid = np.arange(0, 40, step)
+    rates = 125_000 * np.array(MBPS)[np.searchsorted(TIMES, grid % TIMES[-1] + step / 2, side="right") - 1]
+    through = np.concatenate([[0.0], np.cumsum(rates * step)])
+    link = played(mbps=MBPS)
+    for _ in range(200):
+        at, size = random.uniform(0, 12), random.randrange(1, 4_000_000)
+        begin = np.interp(at, np.append(grid, grid[-1] + step), through)
+        end = grid[np.searchsorted(through, begin + size) - 1]
+        assert link.sent_s(at, size) == pytest.approx(end, abs=3 * step), (at, size)
 
 
-def test_after_a_missing_answer_only_jumps_are_known(tmp_path: Path) -> None:
-    """A robot that drives goes on from where the missing path ended, so the tasks after it are left out."""
-    for name, jump, known in (("drive", False, 5), ("jump", True, 11)):
-        folder = tmp_path / name
-        folder.mkdir()
-        asked = drive(folder, jump=jump)
-        change(folder / "answers.jsonl", lambda lines: [line for line in lines if line["i"] != 5])
-        recording = read_recording(trace_of(folder))
-        assert_asked(recording, [one for i, one in enumerate(asked) if i != 5][:known])
-        assert recording.left_out == 12 - known
+def test_a_rate_of_0_holds_everything_back() -> None:
+    """Until the rate is above 0; it is not unlimited."""
+    link = played(mbps=MBPS)
+    assert link.sent_s(1.2, 1) == pytest.approx(2.0, abs=1e-4)
+    assert link.sent_s(0.5, 500_001) == pytest.approx(2.0, abs=1e-4)
+    assert link.sent_s(0.5, 500_000) == pytest.approx(1.0)  # the last byte that gets through before
+    assert played(mbps=(0.0, 0.0, 0.0, 8.0)).sent_s(0.5, 2_500_000) == pytest.approx(14.5)
 
 
-def test_a_task_without_a_line_in_the_trace_is_left_out(tmp_path: Path) -> None:
-    """Its path is known, so the robot goes on; its decision and times are not."""
-    asked = drive(tmp_path)
-    change(trace_of(tmp_path), lambda lines: [line for line in lines if line["i"] != 5])
-    recording = read_recording(trace_of(tmp_path))
-    assert_asked(recording, asked[:5] + asked[6:])
-    assert recording.left_out == 1
+def test_the_last_row_holds_without_repeats() -> None:
+    """After the end the last value holds for ever; a last rate of 0 lets nothing pass any more."""
+    assert played(repeats=False, rtt_ms=RTT_MS).delay_ms(1e6) == 5
+    ended = played(repeats=False, mbps=MBPS)
+    assert ended.sent_s(4.9, 1_050_000) == pytest.approx(7.0)
+    assert ended.sent_s(100.0, 500_000) == pytest.approx(101.0)
+    assert played(repeats=False, mbps=(8.0, 0.0, 0.8, 0.0)).sent_s(3.9, 20_000) == math.inf
 
 
-def other_seed(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [line | {"settings": line["settings"] | {"seed": 99}} for line in lines]
+def test_a_recording_waits_at_its_place_until_it_begins() -> None:
+    """The value of that place holds, or the first rate above 0, so that robots can connect."""
+    waiting = played(math.inf, from_s=1.5, rtt_ms=RTT_MS, mbps=MBPS)
+    assert (waiting.delay_ms(1e6), waiting.sent_s(1e6, 100_000)) == (400, 1e6 + 1)
+    begun = Link(LinkConditions(recording=waiting)).begun(50.0).up.recording
+    assert begun is not None
+    assert (begun.delay_ms(50.4), begun.delay_ms(50.6)) == (400, 15)
 
 
-def unknown_setting(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [line | {"settings": line["settings"] | {"speed": 1}} for line in lines]
+def test_the_place_where_it_begins_is_in_the_recording() -> None:
+    """Another one is refused with the length of the file."""
+    with pytest.raises(ConfigError, match=r"from_s: 5 is not from 0 to below 5, the seconds of run\.csv"):
+        played(from_s=5.0, rtt_ms=RTT_MS)
 
 
-def short_map(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [line | {"map": line["map"] | {"shape": [1, 2]}} for line in lines]
+def test_a_chunk_is_a_segment_where_rates_are_recorded() -> None:
+    """So the bytes of a long message come out one after the other, at the recorded rate."""
+    line = pipe(played(mbps=MBPS))
+    assert line.chunk_bytes(100_000) == SEGMENT_BYTES
+    due = [line.due(0.0, line.chunk_bytes(1 << 20)) for _ in range(600)]
+    assert due == pytest.approx([SEGMENT_BYTES * n / 1e6 for n in range(1, 601)])
+    assert line.busy_until_s == due[-1]
 
 
-def without_sites(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [line | {"sites": 3} for line in lines]
+def test_other_conditions_act_on_top() -> None:
+    """A recorded delay leaves jitter and bandwidth to the link, a recorded rate leaves the delay."""
+    line = pipe(played(rtt_ms=RTT_MS), bandwidth_mbps=0.8)
+    assert line.due(0.0, 10_000) == pytest.approx(0.1 + 0.01)
+    jittery = pipe(played(rtt_ms=RTT_MS), jitter_ms=1.0)
+    drawn_ms = [jittery.due(0.0, SEGMENT_BYTES) and jittery.drawn_ms for _ in range(300)]
+    assert (np.mean(drawn_ms), np.std(drawn_ms)) == (pytest.approx(10, abs=0.3), pytest.approx(1, abs=0.2))
+    assert pipe(played(mbps=MBPS), delay_ms=7.0).due(0.0, 1000) == pytest.approx(0.001 + 0.007)
 
 
-def without(name: str) -> Callable[[list[dict[str, Any]]], list[dict[str, Any]]]:
-    return lambda lines: [{key: value for key, value in line.items() if key != name} for line in lines]
+def test_a_long_message_meets_the_delays_of_its_time() -> None:
+    """Each part is delayed by the value at the time when it begins to be sent."""
+    line = pipe(played(rtt_ms=RTT_MS), bandwidth_mbps=0.8)
+    assert line.due(0.5, 100_000) == pytest.approx(1.5 + 0.4, abs=0.02)
+    assert pipe(played(rtt_ms=RTT_MS), bandwidth_mbps=0.8).due(0.5, 40_000) == pytest.approx(0.91)
 
 
-def with_answer(**fields: Any) -> Callable[[list[dict[str, Any]]], list[dict[str, Any]]]:
-    return lambda lines: [line | {"answer": line["answer"] | fields} for line in lines]
+def test_a_recorded_quantity_cannot_be_changed(tmp_path: Path) -> None:
+    """One line says which file it is recorded in; the other conditions can be changed."""
+    file = tmp_path / "run.csv"
+    file.write_text("t_s,rtt_ms\n0,30\n")
+    link = LinkFlags(recording=file, delay_ms=40).link
+    assert (link.up.delay_ms, link.up.bandwidth_mbps) == (0, 400)
+    assert link.changed({"loss": 0.1, "bandwidth_mbps": 3}).down.loss == 0.1
+    with pytest.raises(ConfigError) as caught:
+        link.changed({"delay_ms": 5})
+    assert str(caught.value) == "up.delay_ms: cannot be changed, because it is recorded in run.csv"
+    file.write_text("t_s,up_mbps\n0,30\n")
+    link = LinkFlags(recording=file).link
+    assert (link.up.bandwidth_mbps, link.down.bandwidth_mbps, link.down.recording) == (0, 400, None)
+    with pytest.raises(ConfigError, match=r"up.bandwidth_mbps: cannot be changed"):
+        link.changed({"bandwidth_mbps": 0})
 
 
-@pytest.mark.parametrize(
-    ("name", "edit", "said"),
-    [
-        ("trace.drive.jsonl", other_seed, "task 0 does not fit the robot that is driven again by trace."),
-        ("trace.drive.jsonl", unknown_setting, "unknown key 'speed'"),
-        ("trace.drive.jsonl", short_map, "trace.drive.jsonl: no drive record: ValueError"),
-        ("trace.drive.jsonl", without("map"), "trace.drive.jsonl:1: no field 'map'"),
-        ("trace.drive.jsonl", lambda _: [], "trace.drive.jsonl: there is no whole line in it"),
-        ("answers.jsonl", lambda _: [], "none of its tasks is in "),
-        ("answers.jsonl", with_answer(start=[5000, 1]), "task 0 does not fit the robot"),
-        ("answers.jsonl", with_answer(start="here"), "task 0: its lines are wrong: "),
-        ("answers.jsonl", with_answer(steps="9"), "steps '9' contain a character other than 0 to 7"),
-        ("trace.jsonl", without_sites, "task 0: its lines are wrong: "),
-    ],
-)  # fmt: skip
-def test_files_that_do_not_fit_together_are_refused(
-    tmp_path: Path, name: str, edit: Callable[[list[dict[str, Any]]], list[dict[str, Any]]], said: str
-) -> None:
-    """The error names the file and what is wrong, and nothing is guessed."""
-    drive(tmp_path)
-    change(tmp_path / name, edit)
-    with pytest.raises(DataError) as error:
-        read_recording(trace_of(tmp_path))
-    assert said in str(error.value)
-    assert str(tmp_path) in str(error.value) or said.startswith("steps")
+def test_each_direction_has_its_own_file(tmp_path: Path) -> None:
+    """As the two files that mahimahi has for a link."""
+    (tmp_path / "lte.up").write_text("1\n2\n")
+    (tmp_path / "lte.down").write_text("1\n1\n2\n2\n")
+    link = LinkFlags(up_recording=tmp_path / "lte.up", down_recording=tmp_path / "lte.down").link
+    assert link.up.recording is not None
+    assert link.down.recording is not None
+    assert link.up.recording.sent_s(0.0, 15_000) == pytest.approx(0.01)
+    assert link.down.recording.sent_s(0.0, 15_000) == pytest.approx(0.005)
 
 
-def test_a_run_may_be_moved_to_another_folder(tmp_path: Path) -> None:
-    """The drive record holds the map, and finds the answers next to itself."""
-    here, there = tmp_path / "here", tmp_path / "there"
-    here.mkdir()
-    drive(here)
-    here.rename(there)
-    record = DriveRecord.read(trace_of(there))
-    assert record.answers == there / "answers.jsonl"
-    assert drive_path(trace_of(there)).stat().st_size < record.prior.cells.size, "the map is compressed"
-    assert len(read_recording(trace_of(there)).tasks) == 12
+def test_a_link_shows_what_it_plays(tmp_path: Path) -> None:
+    """With the hash of the file, so that results of different recordings are told apart."""
+    file = tmp_path / "run.csv"
+    file.write_text("t_s,rtt_ms\n0,30\n")
+    shown = LinkFlags(recording=file, recording_repeats=False).link.up.shown()["recording"]
+    assert shown == {
+        "file": "run.csv",
+        "sha256": read_recording(file).sha256,
+        "columns": ["rtt_ms"],
+        "from_s": 0.0,
+        "repeats": False,
+    }
+    assert LinkFlags().link.up.shown()["recording"] is None
