@@ -196,6 +196,7 @@ def write_summary(out: Path, played: Played, about: Mapping[str, Any]) -> None:
         "window": scenario.robot.window,
         "decided_by": scenario.decided_by(),
         "tasks": scenario.workload.tasks * scenario.workload.robots,
+        "recordings": scenario.recorded(),
         "software": VERSION,
         **about,
         "exit_codes": dict(played.exit_codes),

@@ -21,13 +21,13 @@ EVERYWHERE = "everywhere"  # stands for the computer where all have the same slo
 @task("hash_rounds", size=float)
 def hash_rounds(rounds: int) -> bytes:
     """PBKDF2-HMAC-SHA256 (RFC 8018) with this many rounds: the time is linear in the size."""
-    return _hashed(rounds)
+    return hashed(rounds)
 
 
 @task("hash_pairs", size=float)
 def hash_pairs(count: int) -> bytes:
     """One round for every thousand pairs of `count` things: the time grows with the square of the size."""
-    return _hashed(count * count // 1000)
+    return hashed(count * count // 1000)
 
 
 @task("hash_rarely_long", size=float)
@@ -36,13 +36,13 @@ def hash_rarely_long(rounds: int) -> bytes:
 
     Each computer has its own slow sizes.
     """
-    return _hashed_in_steps(rounds, rounds_on(os.environ.get(PART, ""), rounds))
+    return hashed_in_steps(rounds, rounds_on(os.environ.get(PART, ""), rounds))
 
 
 @task("hash_rarely_long_everywhere", size=float)
 def hash_rarely_long_everywhere(rounds: int) -> bytes:
     """Like `hash_rarely_long`, but every computer has the same slow sizes."""
-    return _hashed_in_steps(rounds, rounds_on(EVERYWHERE, rounds))
+    return hashed_in_steps(rounds, rounds_on(EVERYWHERE, rounds))
 
 
 def rounds_on(part: str, rounds: int) -> int:
@@ -51,15 +51,15 @@ def rounds_on(part: str, rounds: int) -> int:
     return rounds * MUCH if rare else rounds
 
 
-def _hashed_in_steps(rounds: int, total: int) -> bytes:
+def hashed_in_steps(rounds: int, total: int) -> bytes:
     """The hash of `rounds`, after other hashes until `total` rounds are done."""
     for _ in range(total // max(rounds, 1) - 1):
         check_wanted()
-        _hashed(rounds)
-    return _hashed(rounds)
+        hashed(rounds)
+    return hashed(rounds)
 
 
-def _hashed(rounds: int) -> bytes:
+def hashed(rounds: int) -> bytes:
     """Runs without Python's interpreter lock."""
     if rounds > ROUNDS_MAX:
         raise ValueError(f"{rounds} rounds are over {ROUNDS_MAX}")

@@ -16,8 +16,10 @@ All values were measured on a virtual machine with two cores:
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from random import Random
+from typing import Any
 
 from offboard.common.planning.planner_names import ASTAR, DIJKSTRA, JPS
+from offboard.loadgen.scenario.frame_tasks import frame_rounds, image_rounds
 from offboard.loadgen.scenario.hash_tasks import EVERYWHERE, rounds_on
 from offboard.loadgen.testbed.testbed import CLOUD as CLOUD_PART
 from offboard.loadgen.testbed.testbed import ROBOT
@@ -54,20 +56,24 @@ PLANS: Mapping[str, Cost] = {  # by planner
     JPS: replace(PLAN, s_per_unit=1.3e-6),  # unit: a jump point
 }
 
-# By kind. The work of the kinds in offboard.loadgen.scenario.hash_tasks follows from their argument.
+# By kind. The work of the kinds in hash_tasks and frame_tasks follows from their argument.
 COSTS: Mapping[str, Cost] = {
     "plan_path": PLAN,
     "hash_rounds": HASH,
     "hash_pairs": HASH,
     "hash_rarely_long": HASH,
     "hash_rarely_long_everywhere": HASH,
+    "look_at_frame": HASH,
+    "judge_image": HASH,
 }
 PARTS = {ONBOARD: ROBOT, CLOUD: CLOUD_PART}  # the part of the testbed that runs a site
-ROUNDS: Mapping[str, Callable[[str, int], int]] = {
+ROUNDS: Mapping[str, Callable[[str, Any], int]] = {
     "hash_rounds": lambda _, rounds: rounds,
     "hash_pairs": lambda _, count: count * count // 1000,
     "hash_rarely_long": lambda site, rounds: rounds_on(PARTS[site], rounds),
     "hash_rarely_long_everywhere": lambda _, rounds: rounds_on(EVERYWHERE, rounds),
+    "look_at_frame": lambda _, frame: frame_rounds(frame),
+    "judge_image": lambda site, _: image_rounds(PARTS[site]),
 }
 
 
