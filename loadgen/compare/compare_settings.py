@@ -89,6 +89,15 @@ class CompareConfig(ColumnSettings, RunsConfig):
     heartbeats: bool | None = setting(
         None, "whether the robots send heartbeats (default: as the scenario, or else each policy, says)"
     )
+    recordings: Path | None = setting(
+        None,
+        "play each scenario over every recorded link below this folder (CSV, or NAME.up with NAME.down),"
+        " 300 tasks each, and compare by family, which is the folder of a recording",
+        metavar="FOLDER",
+    )
+    rate: float | None = setting(
+        None, "with --recordings: tasks per second, instead of one at a time", minimum=0.001
+    )
     from_task: int = setting(0, "first task that counts, for example the first one after warm-up", minimum=0)
     stolen_max: float | None = setting(
         None,
@@ -103,6 +112,12 @@ class CompareConfig(ColumnSettings, RunsConfig):
         super().__post_init__()
         if self.simulate and self.stolen_max is not None:
             raise ConfigError(f"--stolen-max: {self.stolen_max:g} cannot be combined with --simulate")
+        if self.recordings is None:
+            if self.rate is not None:
+                raise ConfigError(f"--rate: {self.rate:g} needs --recordings")
+        elif not {ONBOARD, CLOUD} <= set(self.policies):
+            named = ",".join(self.policies)
+            raise ConfigError(f"--policies: {named}: --recordings needs {ONBOARD} and {CLOUD} among them")
 
 
 def split_strategy(name: str) -> tuple[str, str | None]:
