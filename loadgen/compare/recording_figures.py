@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from offboard.common.errors import DataError
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.table.table_two_figures import quantile
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
@@ -55,6 +56,10 @@ class Figures:
 
 
 def figures_of(family: str, recording: str, runs: Mapping[str, Sequence[Outcome]]) -> Figures:
+    """DataError if a policy answered no task, so that nothing can be compared."""
+    for policy, outcomes in runs.items():
+        if not any(run.answered for run in outcomes):
+            raise DataError(f"{family}/{recording}: {policy} answered no task")
     return Figures(family, recording, {policy: _taken(outcomes) for policy, outcomes in runs.items()})
 
 

@@ -13,6 +13,7 @@ from offboard.loadgen.compare.compare_settings import CompareConfig
 from offboard.loadgen.compare.recording_figures import CONSTANTS, MEAN_BEHIND, P99_BEHIND, USABLE, Figures
 from offboard.loadgen.table.confidence_intervals import BOUNDS, Blocks, Picks
 from offboard.loadgen.table.measured_rows import Column
+from offboard.loadgen.table.table_columns import MARKDOWN
 from offboard.loadgen.table.table_formats import Heading, Table
 
 LEVEL = 0.01  # a mean that differs by less is called level
@@ -79,9 +80,9 @@ HEADINGS: dict[str, Heading] = {
     "policy": Heading("policy", "policy", None),
     "bound": Heading("bound", "bound", None),
     "recordings": Heading("recordings", "recordings", 0),
-    "mean_ratio": Heading("mean / better constant", "mean / constant", 3),
+    "mean_ratio": Heading("mean / constant", "mean / constant", 3),
     "worst_mean": Heading("worst", "worst", 3),
-    "p99_ratio": Heading("P99 / its P99", "P99 / its P99", 3),
+    "p99_ratio": Heading("P99 / constant", "P99 / constant", 3),
     "worst_p99": Heading("worst P99", "worst P99", 2),
     "behind": Heading("behind", "behind", 0),
     "over_oracle": Heading("time / oracle", "time / oracle", 3),
@@ -89,14 +90,13 @@ HEADINGS: dict[str, Heading] = {
     "lost": Heading("lost", "lost", 0),
 }
 OF_RECORDINGS: dict[str, Heading] = {
-    "family": Heading("family", "family", None),
     "recording": Heading("recording", "recording", None),
     "policy": Heading("policy", "policy", None),
-    "better": Heading("better constant", "constant", None),
+    "better": Heading("constant", "constant", None),
     "usable": Heading("usable", "usable", None),
+    "mean_ratio": Heading("mean / it", "mean / it", 3),
+    "p99_ratio": Heading("P99 / it", "P99 / it", 3),
     "mean_ms": Heading("mean ms", "mean ms", 1),
-    "mean_ratio": Heading("mean / constant", "mean / constant", 3),
-    "p99_ratio": Heading("P99 / its P99", "P99 / its P99", 3),
     "over_oracle": Heading("time / oracle", "time / oracle", 3),
 }
 
@@ -107,27 +107,28 @@ def tables(compared: Sequence[Comparison], config: CompareConfig) -> str:
     each = [recording_table(one, config) for one in compared]
     if config.format == CSV:  # the tables have different columns
         return config.text(by_family, CSV) + "\n" + config.text(each, CSV)
-    return config.text([*by_family, *(table for table in each if table.lines)], config.format)
+    text = config.text([*by_family, *(table for table in each if table.lines)], config.format)
+    if config.format != MARKDOWN:
+        return text
+    return "\n".join([text, *(line for one in compared for line in sentences(one, config)), ""])
 
 
 def family_table(compared: Comparison, config: CompareConfig) -> Table:
     """One line for each family and policy; the ends of the intervals below it, from 10 recordings on."""
     families = by_family(compared.figures)
-    lines = [
-        line
-        for name, of in families.items()
-        for policy in config.policies
-        for line in _lines(name, of, policy)
-    ]
+    policies = config.policies
+    lines = [line for name, of in families.items() for one in policies for line in _lines(name, of, one)]
     seeds = "1 seed" if config.seeds == 1 else f"{config.seeds} seeds"
     caption = (
         f"Scenario {compared.scenario} over recorded links ({config.where}): {compared.tasks} tasks,"
-        f" {compared.arrivals}, {seeds}. The better constant is onboard or cloud, whichever has the smaller mean on that recording."
-        " Means over recordings are geometric; intervals of 95 % take the recording as the unit."
+        f" {compared.arrivals}, {seeds}. The constant is onboard or cloud, the one with the smaller mean on"
+        " that recording. Means over recordings are geometric, and a recording is the unit of the 95 %"
+        " intervals."
     )
     given = compared.taken_from_link.items()
     notes = [f"{name}: not recorded, and therefore taken from [link]: {text}." for name, text in given]
-    notes += [sentence(policy, families) for policy in config.policies if policy not in CONSTANTS]
+    if config.format != MARKDOWN:  # which ends with them
+        notes += sentences(compared, config)
     about = {"scenario": compared.scenario, "testbed": config.where, "arrivals": compared.arrivals}
     first = ("recordings", "mean_ratio", "worst_mean", "p99_ratio", "behind", "over_oracle")
     return Table(caption, about, HEADINGS, lines, notes=tuple(notes), first=first)
@@ -146,7 +147,8 @@ def recording_table(compared: Comparison, config: CompareConfig) -> Table:
     caption = (
         f"Scenario {compared.scenario}, {compared.arrivals}: recordings where a policy is more than"
         f" {100 * (MEAN_BEHIND - 1):.0f} % behind the mean of the better constant, or"
-        f" {100 * (P99_BEHIND - 1):.0f} % behind its P99. A link is usable if cloud takes at most {USABLE:g} times as long as onboard."
+        f" {100 * (P99_BEHIND - 1):.0f} % behind its P99. A link is usable if cloud takes at most"
+        f" {USABLE:g} times as long as onboard."
     )
     about = {"scenario": compared.scenario, "arrivals": compared.arrivals}
     return Table(caption, about, OF_RECORDINGS, lines)
@@ -159,6 +161,12 @@ def by_family(figures: Iterable[Figures]) -> dict[str, list[Figures]]:
     return found
 
 
+def sentences(compared: Comparison, config: CompareConfig) -> list[str]:
+    """For each policy that decides, how it does in this scenario."""
+    families, deciding = by_family(compared.figures), [one for one in config.policies if one not in CONSTANTS]
+    return [f"{compared.scenario}: {sentence(policy, families)}" for policy in deciding]
+
+
 def sentence(policy: str, families: Mapping[str, Sequence[Figures]]) -> str:
     """How a policy does against the better constant, in words."""
     means = {name: geometric([one.mean_ratio(policy) for one in of]) for name, of in families.items()}
@@ -166,9 +174,7 @@ def sentence(policy: str, families: Mapping[str, Sequence[Figures]]) -> str:
     behind = {name: ratio for name, ratio in means.items() if ratio > 1 + LEVEL}
     parts = []
     if ahead:
-        parts.append(
-            f"ahead of the better constant in {len(ahead)} of {len(means)} families (by {_span(ahead)})"
-        )
+        parts.append(f"ahead in {len(ahead)} (by {_span(ahead)})")
     if level := len(means) - len(ahead) - len(behind):
         parts.append(f"level in {level}")
     if behind:
@@ -177,7 +183,11 @@ def sentence(policy: str, families: Mapping[str, Sequence[Figures]]) -> str:
     worst = max((one for of in families.values() for one in of), key=lambda one: one.mean_ratio(policy))
     ratio = worst.mean_ratio(policy)
     how = f"{100 * (ratio - 1):.0f} % behind" if ratio >= 1 else f"{100 * (1 - ratio):.0f} % ahead"
-    return f"{policy} is {', '.join(parts)}; in its worst recording, {worst.family}/{worst.recording}, it is {how}."
+    of_all = "one family" if len(means) == 1 else f"{len(means)} families"
+    return (
+        f"{policy} against the better constant in {of_all}: {', '.join(parts)};"
+        f" in its worst recording, {worst.family}/{worst.recording}, it is {how}."
+    )
 
 
 def geometric(ratios: Sequence[float]) -> float:
@@ -227,7 +237,7 @@ def _recording_line(one: Figures, policy: str) -> RecordingLine:
     taken = one.taken[policy]
     return RecordingLine(
         family=one.family,
-        recording=one.recording,
+        recording=f"{one.family}/{one.recording}",
         policy=policy,
         better=one.better,
         usable="yes" if one.usable else "no",
