@@ -87,7 +87,9 @@ class CompareConfig(ColumnSettings, RunsConfig):
         minimum=0,
     )
     heartbeats: bool | None = setting(
-        None, "whether the robots send heartbeats (default: as the scenario, or else each policy, says)"
+        None,
+        "whether the robots send heartbeats (default: as the scenario, or else each policy, says)",
+        rare=True,
     )
     recordings: Path | None = setting(
         None,
@@ -96,13 +98,17 @@ class CompareConfig(ColumnSettings, RunsConfig):
         metavar="FOLDER",
     )
     rate: float | None = setting(
-        None, "with --recordings: tasks per second, instead of one at a time", minimum=0.001
+        None,
+        "with --recordings: tasks per second, instead of one at a time",
+        rare=True,
+        minimum=0.001,
     )
     from_task: int = setting(0, "first task that counts, for example the first one after warm-up", minimum=0)
     stolen_max: float | None = setting(
         None,
         "play a run again if the host of this virtual machine took more than this share of its CPU time,"
         f" up to {PLAYS_MAX} times; without it, the table reports the share",
+        rare=True,
         minimum=0,
         maximum=100,
         metavar="PERCENT",

@@ -96,8 +96,12 @@ def find_scenario(name: str) -> Path:
     for path in (Path(name), SHIPPED / f"{name}.toml", LINKS / f"{name}.toml"):
         if path.is_file():
             return path
-    known = (*shipped(), *shipped(LINKS))
-    raise DataError(f"scenario {name!r} is neither a file nor one of {', '.join(known)}")
+    raise DataError(f"scenario {name!r} is neither a file nor one of {', '.join(known_names())}")
+
+
+def known_names() -> tuple[str, ...]:
+    """The names that `find_scenario` knows."""
+    return (*shipped(), *shipped(LINKS))
 
 
 def shipped(folder: Path = SHIPPED) -> tuple[str, ...]:

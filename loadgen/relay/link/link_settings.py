@@ -89,10 +89,18 @@ class LinkFlags:
     up_recording: Path | None = setting(None, f"--recording {UP}", group=RECORDED, rare=True)
     down_recording: Path | None = setting(None, f"--recording {DOWN}", group=RECORDED, rare=True)
     recording_from_s: float = setting(
-        0.0, "second of the recording at which it begins", group=RECORDED, minimum=0.0, maximum=T_S_MAX
+        0.0,
+        "second of the recording at which it begins",
+        group=RECORDED,
+        rare=True,
+        minimum=0.0,
+        maximum=T_S_MAX,
     )
     recording_repeats: bool = setting(
-        True, "start again at the end of the recording; without it, the last row holds", group=RECORDED
+        True,
+        "start again at the end of the recording; without it, the last row holds",
+        group=RECORDED,
+        rare=True,
     )
 
     up_delay_ms: float | None = _up("delay_ms")
