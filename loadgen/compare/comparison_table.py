@@ -124,7 +124,8 @@ def comparison_table(
         f"Scenario {scenario.name} {place}: {_runs_and_seeds(scenario.seed, config.seeds)},"
         f" {scenario.workload.tasks} tasks for each robot{span}."
         " Below each policy are the bounds of its 95 % intervals, from blocks of neighbouring tasks."
-    )
+        f" {scenario.recorded_text()}"
+    ).rstrip()
     about = {"scenario": scenario.name, "testbed": config.where, "seeds": config.seeds}
     columns = FIRST if scenario.robot.objective == MEAN else BY_COST
     return Table(caption=caption, about=about, headings=HEADINGS, lines=lines, first=columns)

@@ -134,16 +134,7 @@ def at_rate(scenario: Scenario, rate: float | None) -> Scenario:
 
 def from_link(scenario: Scenario) -> str:
     """What the recording does not hold, and the scenario says instead."""
-    said = []
-    for way in ("up", "down"):
-        conditions = getattr(LinkFlags(**scenario.link).link, way)
-        replaced = () if conditions.recording is None else conditions.recording.replaced()
-        if "delay_ms" not in replaced:
-            said.append(f"{conditions.delay_ms:g} ms {way}")
-        if "bandwidth_mbps" not in replaced:
-            rate = f"{conditions.bandwidth_mbps:g} Mbit/s" if conditions.bandwidth_mbps else "no limit"
-            said.append(f"{rate} {way}")
-    return ", ".join(said) or "nothing"
+    return str(LinkFlags(**scenario.link).link.told()).partition("recorded: ")[2]
 
 
 def _arrivals(scenario: Scenario) -> str:
@@ -177,13 +168,15 @@ def _simulated(scenario: Scenario, links: Sequence[RecordedLink], config: Compar
 
 def _played(scenario: Scenario, links: Sequence[RecordedLink], config: CompareConfig) -> list[Figures]:
     with progress("runs", len(links) * config.seeds * len(config.policies)) as shown:
-        return [_play(scenario, link, config, shown) for link in links]
+        return [_play(scenario, link, config, shown, turn=n) for n, link in enumerate(links)]
 
 
-def _play(scenario: Scenario, link: RecordedLink, config: CompareConfig, shown: Progress) -> Figures:
-    """Real runs over one recording; each policy comes first equally often."""
+def _play(
+    scenario: Scenario, link: RecordedLink, config: CompareConfig, shown: Progress, *, turn: int
+) -> Figures:
+    """Real runs over one recording; over all recordings each policy comes first equally often."""
     runs: dict[str, list[Outcome]] = {policy: [] for policy in config.policies}
-    for n, (_, unit) in enumerate(_units(scenario, [link], config)):
+    for n, (_, unit) in enumerate(_units(scenario, [link], config), turn):
         first = n % len(config.policies)
         for policy in (*config.policies[first:], *config.policies[:first]):
             out = config.out / unit.name / f"{unit.seed}-{policy}"

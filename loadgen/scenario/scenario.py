@@ -293,6 +293,13 @@ class Scenario:
                 found[name] = {way: played for way, played in shown.items() if played is not None}
         return found
 
+    def recorded_text(self) -> str:
+        """What the links play, for people; empty if they play nothing."""
+        told = {name: LinkFlags(**flags).link.told() for name, flags in self.links().items()}
+        return " ".join(
+            f"The link to {name} plays {text}." for name, text in told.items() if text is not None
+        )
+
     def timeline(self) -> tuple[Event, ...]:
         """All events: those of the file, and the random faults drawn from the seed."""
         if self.chaos is None:

@@ -125,6 +125,24 @@ class Link:
     def recorded(self) -> bool:
         return self.up.recording is not None or self.down.recording is not None
 
+    def told(self) -> str | None:
+        """What is played, and what the conditions say because it is not recorded; None: no recording."""
+        files, others = {}, []
+        for way, conditions in (("up", self.up), ("down", self.down)):
+            played = conditions.recording
+            replaced = () if played is None else played.replaced()
+            if played is not None:
+                files[played.recording.file] = ", ".join(played.recording.columns)
+            if "delay_ms" not in replaced:
+                others.append(f"{conditions.delay_ms:g} ms {way}")
+            if "bandwidth_mbps" not in replaced:
+                rate = f"{conditions.bandwidth_mbps:g} Mbit/s" if conditions.bandwidth_mbps else "no limit"
+                others.append(f"{rate} {way}")
+        if not files:
+            return None
+        names = " and ".join(f"{file} ({columns})" for file, columns in files.items())
+        return f"{names}; from [link], as it is not recorded: {', '.join(others) or 'nothing'}"
+
     def begun(self, at_s: float) -> "Link":
         """The same link, with its recordings beginning then."""
         return Link(self.up.begun(at_s), self.down.begun(at_s))

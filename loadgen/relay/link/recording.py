@@ -16,6 +16,7 @@ from offboard.common.errors import ConfigError
 RTT, MBPS, UP_MBPS, DOWN_MBPS = "rtt_ms", "mbps", "up_mbps", "down_mbps"
 RATES = {"up": (UP_MBPS, MBPS), "down": (DOWN_MBPS, MBPS)}  # the columns that hold the rate of a direction
 BYTES_PER_MBIT = 125_000
+NEVER_S = 1e9  # a finite time, so that it can be written as JSON
 ROUNDING_BYTES = 1e-3  # so that a rounding error does not hold a message until a silence is over
 
 
@@ -103,7 +104,7 @@ class Playback:
         return self.recording.columns[RTT][self._row(self._lap(self._at_s(enters_s))[1])] / 2
 
     def sent_s(self, begins_s: float, size: int) -> float:
-        """When the last of `size` bytes is sent, if the first one begins now; infinite if never."""
+        """When the last of `size` bytes is sent, if the first one begins now; NEVER_S later if never."""
         if self.rate is None or not size:
             return begins_s
         if begins_s < self.begun_s:
@@ -143,7 +144,7 @@ class Playback:
         times, whole = self.recording.times, rate.passed[-1]
         if not self.repeats and count > whole:
             last = rate.bytes_per_s[-1]
-            return times[-1] + (count - whole) / last if last else math.inf
+            return times[-1] + ((count - whole) / last if last else NEVER_S)
         laps, left = divmod(count, whole)
         if not left:  # the end of a round, and not the start of the next one
             laps, left = laps - 1, whole
