@@ -173,3 +173,17 @@ def test_a_link_shows_what_it_plays(tmp_path: Path) -> None:
         "repeats": False,
     }
     assert LinkFlags().link.up.shown()["recording"] is None
+
+
+def test_what_is_not_recorded_is_told(tmp_path: Path) -> None:
+    """Tables name the file with its columns, and the conditions that come from the link."""
+    file = tmp_path / "run.csv"
+    file.write_text("t_s,rtt_ms\n0,30\n")
+    rest = "from [link], as it is not recorded"
+    assert (
+        LinkFlags(recording=file).link.told() == f"run.csv (rtt_ms); {rest}: 400 Mbit/s up, 400 Mbit/s down"
+    )
+    file.write_text("t_s,up_mbps\n0,3\n")
+    told = LinkFlags(recording=file, bandwidth_mbps=0).link.told()
+    assert told == f"run.csv (up_mbps); {rest}: 15 ms up, 15 ms down, no limit down"
+    assert LinkFlags().link.told() is None
