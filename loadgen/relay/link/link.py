@@ -11,7 +11,7 @@ from offboard.common.errors import ConfigError
 from offboard.loadgen.relay.link.delay_samples import DELAY_MS_MAX, SAMPLES, SAMPLES_MAX, Samples
 from offboard.loadgen.relay.link.jitter import DISTRIBUTIONS
 from offboard.loadgen.relay.link.loss import LOSS_BURST_MAX
-from offboard.loadgen.relay.link.recording import Playback
+from offboard.loadgen.relay.link.recorded_link import Playback
 
 SEGMENT_BYTES = 1448  # payload of one TCP segment on Ethernet: 1500 - 20 (IP) - 32 (TCP with timestamps)
 BANDWIDTH_MBPS_MAX = 100_000.0

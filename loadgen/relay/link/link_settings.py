@@ -11,7 +11,7 @@ from typing import Any
 from offboard.common.config import check, setting
 from offboard.loadgen.relay.link.delay_samples import SAMPLES, read_samples
 from offboard.loadgen.relay.link.link import BOUNDS, CONDITIONS, NAMES, Link, LinkConditions
-from offboard.loadgen.relay.link.recording import Playback
+from offboard.loadgen.relay.link.recorded_link import Playback
 from offboard.loadgen.relay.link.recording_file import T_S_MAX, read_recording
 
 LINK, FAULTS, UP, DOWN = "link", "faults", "from robot to cloud only", "from cloud to robot only"

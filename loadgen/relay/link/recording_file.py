@@ -1,6 +1,6 @@
 """Reads recorded links: CSV with a header, or the packet times of mahimahi; errors name file and line.
 
-What a recording does to messages is in `recording.py`.
+What a recording does to messages is in `recorded_link.py`.
 """
 
 import functools
@@ -17,7 +17,7 @@ from statistics import median
 
 from offboard.common.errors import DataError
 from offboard.loadgen.relay.link.delay_samples import DELAY_MS_MAX
-from offboard.loadgen.relay.link.recording import DOWN_MBPS, MBPS, RTT, UP_MBPS, Recording
+from offboard.loadgen.relay.link.recorded_link import DOWN_MBPS, MBPS, RTT, UP_MBPS, Recording
 
 ROWS_MAX = 1_000_000
 BYTES_MAX = 128 << 20

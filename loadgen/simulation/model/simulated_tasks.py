@@ -66,7 +66,8 @@ def find_tasks(workload: Workload, seed: int, count: int) -> RobotTasks:
             answer = work.function(*request)
             units = dict.fromkeys(PARTS, kind.work_of(answer) or 0.0)
         body = wire.encode(list(request), kind.types, blobs=not fresh)
-        tasks.append(_task(kind, request, body, HASH_BYTES if answer is None else answer, units))
+        answer_or_hash = HASH_BYTES if answer is None else answer
+        tasks.append(_task(kind, request, body=body, answer=answer_or_hash, units=units))
         work.advance(answer)
     blob_bytes = sum(raw.nbytes for raw in blobs.values())
     cost = PLANS[workload.planner] if kind.name == "plan_path" else COSTS[kind.name]
@@ -74,7 +75,7 @@ def find_tasks(workload: Workload, seed: int, count: int) -> RobotTasks:
 
 
 def _task(
-    kind: Kind, request: tuple[Any, ...], body: wire.Body, answer: Any, units: Mapping[str, float]
+    kind: Kind, request: tuple[Any, ...], *, body: wire.Body, answer: Any, units: Mapping[str, float]
 ) -> SimulatedTask:
     """The bytes are counted on the messages that a real robot and server would send."""
     frames = wire.pack(wire.Request(1, kind.name, 1.0, blobs=tuple(body.blobs), body=body.frames))

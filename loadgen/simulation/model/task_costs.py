@@ -19,8 +19,7 @@ from random import Random
 from typing import Any
 
 from offboard.common.planning.planner_names import ASTAR, DIJKSTRA, JPS
-from offboard.loadgen.scenario.frame_tasks import frame_rounds, image_rounds
-from offboard.loadgen.scenario.hash_tasks import EVERYWHERE, rounds_on
+from offboard.loadgen.scenario.hash_tasks import EVERYWHERE, frame_rounds, image_rounds, rounds_on
 from offboard.loadgen.testbed.testbed import CLOUD as CLOUD_PART
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
@@ -56,7 +55,7 @@ PLANS: Mapping[str, Cost] = {  # by planner
     JPS: replace(PLAN, s_per_unit=1.3e-6),  # unit: a jump point
 }
 
-# By kind. The work of the kinds in hash_tasks and frame_tasks follows from their argument.
+# By kind. The work of the kinds in offboard.loadgen.scenario.hash_tasks follows from their argument.
 COSTS: Mapping[str, Cost] = {
     "plan_path": PLAN,
     "hash_rounds": HASH,

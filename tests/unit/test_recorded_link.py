@@ -11,7 +11,7 @@ from offboard.common.errors import ConfigError
 from offboard.loadgen.relay.link.link import SEGMENT_BYTES, Link, LinkConditions
 from offboard.loadgen.relay.link.link_settings import LinkFlags
 from offboard.loadgen.relay.link.pipe import Pipe
-from offboard.loadgen.relay.link.recording import NEVER_S, Playback, Recording
+from offboard.loadgen.relay.link.recorded_link import NEVER_S, Playback, Recording
 from offboard.loadgen.relay.link.recording_file import read_recording
 
 TIMES = (0.0, 1.0, 2.0, 4.0, 5.0)
