@@ -79,7 +79,10 @@ def _table(path: Path, lines: Sequence[str], file: str, sha256: str) -> Recordin
     found = columns.pop(TIME)
     times, gaps, cut_s = _without_gaps(found)
     if gaps:
-        log.warning("%s: %d gaps of more than %g s were cut out, %.1f s in all", path, gaps, GAP_S, cut_s)
+        log.warning(
+            "%s: %d gaps of more than %g s were cut out, %.1f s in all; remedy: add rows if it was silent",
+            *(path, gaps, GAP_S, cut_s),
+        )
     return Recording(file, sha256, times, columns, gaps=gaps, cut_s=cut_s)
 
 
