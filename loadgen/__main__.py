@@ -76,12 +76,13 @@ def _run(argv: Sequence[str]) -> int:
     from offboard.loadgen.scenario.scenario_file import (
         check_calls,
         find_scenario,
+        known_names,
         read_scenario,
-        shipped,
     )
 
     parser = _parser("run", "SCENARIO")
-    parser.add_argument("scenario", metavar="SCENARIO", help=f"TOML file, or one of {', '.join(shipped())}")
+    help = f"TOML file, or one of {', '.join(known_names())}"
+    parser.add_argument("scenario", metavar="SCENARIO", help=help)
     add_flags(parser, RunConfig, PREFIX)
     flags = parser.parse_args(argv)
     config = resolve(RunConfig, flags, environ=os.environ, prefix=PREFIX)
@@ -264,10 +265,10 @@ def _file_and_config(name: str, cls: type[C], argv: Sequence[str]) -> tuple[Path
 
 def _scenarios_and_config(name: str, cls: type[C], argv: Sequence[str]) -> tuple[list[str], C]:
     """The scenarios and the settings of a command that plays several of them."""
-    from offboard.loadgen.scenario.scenario_file import shipped
+    from offboard.loadgen.scenario.scenario_file import known_names
 
     parser = _parser(name, "SCENARIO ...")
-    help = f"TOML files, or some of {', '.join(shipped())}"
+    help = f"TOML files, or some of {', '.join(known_names())}"
     parser.add_argument("scenarios", metavar="SCENARIO", nargs="+", help=help)
     add_flags(parser, cls, PREFIX)
     flags = parser.parse_args(argv)

@@ -24,8 +24,9 @@ from offboard.common.planning import maps, planner
 from offboard.common.security import bounded_http, private_files
 from offboard.common.source import covered_files, covers, uncovered
 from offboard.common.wire import channel, item_count, messages, values
+from offboard.loadgen.compare import recordings
 from offboard.loadgen.relay import control_api, link_schedule
-from offboard.loadgen.relay.link import delay_samples
+from offboard.loadgen.relay.link import delay_samples, recording_file
 from offboard.loadgen.relay.tcp import forwarder, link_record
 from offboard.loadgen.relay.toxiproxy import toxiproxy_api
 from offboard.loadgen.relay.wan import WanConfig
@@ -197,6 +198,10 @@ BENCH = {
     "events of a schedule or a scenario; samples of a delay": [
         same(event_timeline.EVENTS_MAX, link_schedule.EVENTS_MAX),
         delay_samples.SAMPLES_MAX,
+    ],
+    "rows of a recorded link; recordings of a comparison": [
+        recording_file.ROWS_MAX,
+        recordings.RECORDINGS_MAX,
     ],
     "the record of the link": [link_record.WAITING_BYTES_MAX],
     "robots of a scenario": [scenario.ROBOTS_MAX],

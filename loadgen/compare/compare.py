@@ -24,6 +24,10 @@ from offboard.loadgen.table.table_formats import Table
 
 def run_compare(names: Sequence[str], config: CompareConfig) -> int:
     """Play all scenarios, then print one table for each to stdout. Progress lines go to stderr."""
+    if config.recordings is not None:
+        from offboard.loadgen.compare.recordings import run_recordings
+
+        return run_recordings(names, config.recordings, config)
     config.check_columns(HEADINGS, config.format)
     paths = [find_scenario(name) for name in names]
     scenarios = [

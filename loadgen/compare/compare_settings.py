@@ -88,13 +88,28 @@ class CompareConfig(ColumnSettings, RunsConfig):
         minimum=0,
     )
     heartbeats: bool | None = setting(
-        None, "whether the robots send heartbeats (default: as the scenario, or else each policy, says)"
+        None,
+        "whether the robots send heartbeats (default: as the scenario, or else each policy, says)",
+        rare=True,
+    )
+    recordings: Path | None = setting(
+        None,
+        "play each scenario over every recorded link below this folder (CSV, or NAME.up with NAME.down),"
+        " 300 tasks each, and compare by family, which is the folder of a recording",
+        metavar="FOLDER",
+    )
+    rate: float | None = setting(
+        None,
+        "with --recordings: tasks per second, instead of one at a time",
+        rare=True,
+        minimum=0.001,
     )
     from_task: int = setting(0, "first task that counts, for example the first one after warm-up", minimum=0)
     stolen_max: float | None = setting(
         None,
         "play a run again if the host of this virtual machine took more than this share of its CPU time,"
         f" up to {PLAYS_MAX} times; without it, the table reports the share",
+        rare=True,
         minimum=0,
         maximum=100,
         metavar="PERCENT",
@@ -104,6 +119,12 @@ class CompareConfig(ColumnSettings, RunsConfig):
         super().__post_init__()
         if self.simulate and self.stolen_max is not None:
             raise ConfigError(f"--stolen-max: {self.stolen_max:g} cannot be combined with --simulate")
+        if self.recordings is None:
+            if self.rate is not None:
+                raise ConfigError(f"--rate: {self.rate:g} needs --recordings")
+        elif not {ONBOARD, CLOUD} <= set(self.policies):
+            named = ",".join(self.policies)
+            raise ConfigError(f"--policies: {named}: --recordings needs {ONBOARD} and {CLOUD} among them")
 
 
 def split_strategy(name: str) -> tuple[str, str | None]:

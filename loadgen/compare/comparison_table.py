@@ -130,7 +130,8 @@ def comparison_table(
         f"Scenario {scenario.name} {place}: {_runs_and_seeds(scenario.seed, config.seeds)},"
         f" {scenario.workload.tasks} tasks for each robot{span}."
         " Below each policy are the bounds of its 95 % intervals, from blocks of neighbouring tasks."
-    )
+        f" {scenario.recorded_text()}"
+    ).rstrip()
     about = {"scenario": scenario.name, "testbed": config.where, "seeds": config.seeds}
     varied = any(line.quality is not None for line in lines)
     by_cost = varied or scenario.robot.objective != MEAN

@@ -30,7 +30,8 @@ def setups(scenario: Scenario, out: Path, *, shown: bool = True) -> dict[str, Se
         flags = {"executor": cloud.executor, "workers": cloud.workers, "tasks": module}
         parts[cloud.name] = Setup(flags, cloud.cpus, site=cloud.site)
         relay, seed = relay_of(cloud.name), scenario.seed + n * ROBOT_SEED_STEP
-        parts[relay] = Setup({**links[cloud.name], "seed": seed, "truth": link_file(out, relay)})
+        waits = {"recording_waits": True} if cloud.name in scenario.recorded() else {}
+        parts[relay] = Setup({**links[cloud.name], **waits, "seed": seed, "truth": link_file(out, relay)})
     for files in RobotFiles.of(scenario, out):
         first = files.robot == ROBOT
         parts[files.robot] = Setup(

@@ -150,6 +150,8 @@ def _servers_of(scenario: Scenario) -> str:
 def _ending(played: Played, out: Path) -> Iterator[str]:
     """What a run says at its end: figures, verdicts and the files that it wrote."""
     yield f"\n{run_table(played.scenario.name, played.outcome)}"
+    if links := played.scenario.recorded_text():
+        yield links
     if len(played.scenario.servers) > 1:
         yield from share_lines(site_shares(played.outcome, played.scenario.sites()))
     yield from _findings(played.outcome)
@@ -197,6 +199,7 @@ def write_summary(out: Path, played: Played, about: Mapping[str, Any]) -> None:
         "window": scenario.robot.window,
         "decided_by": scenario.decided_by(),
         "tasks": scenario.workload.tasks * scenario.workload.robots,
+        "recordings": scenario.recorded(),
         "software": VERSION,
         **about,
         "exit_codes": dict(played.exit_codes),

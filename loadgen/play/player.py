@@ -29,7 +29,7 @@ from offboard.loadgen.scenario.outcome import Reading
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.table.site_disturbance import WAYS
 from offboard.loadgen.testbed.part_process import USAGE_EXIT
-from offboard.loadgen.testbed.testbed import ROBOT, WAN, Testbed, kind_of
+from offboard.loadgen.testbed.testbed import ROBOT, WAN, Testbed, kind_of, relay_of
 
 POLL_S = 0.02
 READ_EVERY_S = 2.0
@@ -67,6 +67,7 @@ class Player:
         self._booting: dict[str, Path] = {}  # starting robots, and the file whose creation ends their start
         self._shown_steps = 0
         self._began_s: float | None = None  # when the first task was due
+        self._recorded = set(scenario.recorded())  # servers whose links do not play their recordings yet
         self._next_sample_s = 0.0  # seconds after that
 
     def play(self) -> dict[str, int]:
@@ -104,6 +105,10 @@ class Player:
         if answered + (alone := self._alone.count()) != self._shown_steps:
             self._shown_steps = answered + alone
             self._shown.to(self._shown_steps)
+        if now_s >= 0:
+            for server in {one for one in self._recorded if relay_of(one) in self._parts}:
+                self._testbed.begin_recording(server)
+                self._recorded.remove(server)
         for event in self._timeline.due(now_s, answered):
             write_event(json.dumps(self._happened(event, self._began_s)) + "\n")
         if now_s >= self._next_sample_s:
@@ -141,6 +146,7 @@ class Player:
         (part,) = event.parts() if event.action in ON_A_PART else (None,)
         if part is not None and kind_of(part) == WAN and event.action in ("start", "restart"):
             self._keep_truth(part)
+            self._recorded |= {one for one in self._scenario.recorded() if relay_of(one) == part}
         if part in self._robots and event.action == "start":
             self._start(part)
         else:

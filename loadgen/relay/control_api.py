@@ -37,6 +37,9 @@ class Relayed(Linked, Protocol):
     def status(self) -> dict[str, Any]:
         """Counts of connections and bytes."""
 
+    def begin_recording(self) -> None:
+        """Play the recording of the link from its beginning; ConfigError if there is none."""
+
 
 class Change(BaseModel):
     """New conditions of the link; a condition that is left out stays as it is."""
@@ -153,6 +156,12 @@ def _add_link(app: FastAPI, relay: Relayed, *, insecure: bool) -> None:
     async def change_link(change: LinkChange) -> dict[str, Any]:
         """Change some conditions, for all bytes that arrive from now on. Returns the whole link."""
         relay.set_link(relay.link.changed(change.model_dump(exclude_none=True)), by="http")
+        return _shown(relay)
+
+    @app.post("/recording")
+    async def begin_recording() -> dict[str, Any]:
+        """Play the recording of the link from its beginning. Returns the whole link."""
+        relay.begin_recording()
         return _shown(relay)
 
     @app.post("/reset")

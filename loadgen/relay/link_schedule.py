@@ -6,17 +6,16 @@ What a change does to bytes is left to the relay.
 import asyncio
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 from offboard.common.errors import ConfigError, DataError
 from offboard.common.toml_file import line_of, read_toml, unknown
-from offboard.loadgen.relay.link.link import Link, LinkConditions
+from offboard.loadgen.relay.link.link import CONDITIONS, Link
 
 EVENTS_MAX = 10_000
 AT_S_MAX = 1e6
-CONDITIONS = tuple(f.name for f in fields(LinkConditions))
 KEYS = ("at_s", "up", "down", "reset", *CONDITIONS)
 
 log = logging.getLogger(__name__)

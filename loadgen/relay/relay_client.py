@@ -26,6 +26,10 @@ class RelayClient:
     def link(self) -> dict[str, Any]:
         return self._ask("GET", "/link")
 
+    def begin_recording(self) -> None:
+        """Play the recording of the link from its beginning; ConfigError if it plays none."""
+        self._ask("POST", "/recording")
+
     def reset(self) -> None:
         self._ask("POST", "/reset")
 

@@ -16,7 +16,7 @@ from offboard.common.security.exposure import LOOPBACK, OPEN_REMEDY, on_loopback
 from offboard.common.security.private_files import read_token
 from offboard.loadgen.relay.control_api import ControlServer, control_app
 from offboard.loadgen.relay.link.bandwidth import CHUNK_BYTES
-from offboard.loadgen.relay.link.link_settings import LinkFlags
+from offboard.loadgen.relay.link.link_settings import RECORDED, LinkFlags
 from offboard.loadgen.relay.link_schedule import Schedule, read_schedule
 from offboard.loadgen.relay.tcp.link_record import LinkRecord
 from offboard.loadgen.relay.tcp.precise_selector import PreciseSelector
@@ -68,6 +68,12 @@ class WanConfig(LinkFlags, AddressFlags):
 
     schedule: Path | None = setting(
         None, "TOML file of changes of the link, such as [[event]] at_s = 5.0, loss = 0.1", group=RUN
+    )
+    recording_waits: bool = setting(
+        False,
+        "hold the first row of the recording, and begin at POST /recording (default: begin at once)",
+        group=RECORDED,
+        rare=True,
     )
     truth: Path | None = setting(
         None, "write what the link did to each chunk to this file, as JSON Lines", group=RUN
@@ -159,6 +165,8 @@ async def _serve(config: WanConfig) -> None:
             loop.add_signal_handler(sent, stop)
         listener = await loop.create_server(relay.accept, sock=listening, backlog=BACKLOG)
         schedule.start(events)
+        if relay.link.recorded and not config.recording_waits:
+            relay.begin_recording()
         print(where, flush=True)
         if config.open_ways:
             warn_each_minute(config.open_ways)

@@ -283,6 +283,23 @@ class Scenario:
         """The conditions of the link to each server."""
         return {server.name: {**self.link, **server.link} for server in self.servers}
 
+    def recorded(self) -> dict[str, dict[str, Any]]:
+        """The servers whose links play a recording; of each the file and its hash, by direction."""
+        found = {}
+        for name, flags in self.links().items():
+            link = LinkFlags(**flags).link
+            if link.recorded:
+                shown = {way: getattr(link, way).shown()["recording"] for way in ("up", "down")}
+                found[name] = {way: played for way, played in shown.items() if played is not None}
+        return found
+
+    def recorded_text(self) -> str:
+        """What the links play, for people; empty if they play nothing."""
+        told = {name: LinkFlags(**flags).link.told() for name, flags in self.links().items()}
+        return " ".join(
+            f"The link to {name} plays {text}." for name, text in told.items() if text is not None
+        )
+
     def timeline(self) -> tuple[Event, ...]:
         """All events: those of the file, and the random faults drawn from the seed."""
         if self.chaos is None:

@@ -13,7 +13,7 @@ from offboard.common.config import from_table
 from offboard.common.errors import ConfigError, DataError, MissingExtra, OffloadError
 from offboard.common.toml_file import line_of, read_toml, unknown_key
 from offboard.loadgen.relay.link.link_settings import LinkFlags
-from offboard.loadgen.scenario.event_timeline import parse_events
+from offboard.loadgen.scenario.event_timeline import ON, parse_events
 from offboard.loadgen.scenario.pass_fail_check import parse_checks
 from offboard.loadgen.scenario.random_faults import Chaos
 from offboard.loadgen.scenario.scenario import (
@@ -27,9 +27,11 @@ from offboard.loadgen.scenario.scenario import (
 from offboard.robot_client.sites.runner import ONBOARD
 
 SHIPPED = Path(__file__).parents[1] / "scenarios"
+LINKS = Path(__file__).parents[1] / "links"  # recordings, and the scenarios that are played over them
 NAME = r"[A-Za-z0-9][A-Za-z0-9_-]*"
 WORKLOAD_FLAG = re.compile(rf"--({'|'.join(f.name.replace('_', '-') for f in fields(Workload))})\b")
 LINK_KEYS = tuple(f.name for f in fields(LinkFlags))
+FILES = ("samples", "recording")  # ends of the names of link conditions that are files
 
 
 def read_scenario(path: Path) -> Scenario:
@@ -49,8 +51,7 @@ def read_scenario(path: Path) -> Scenario:
     if type(seed) is not int or seed < 0:
         raise DataError(f"{path}: seed = {seed!r} is not a whole number of at least 0")
     workload = _workload(_table(table, "workload", path), path)
-    link = _link(_table(table, "link", path), path)
-    servers = _servers(table, path)
+    link, servers = _recorded_on(_table(table, "link", path), _servers(table, path), path)
     links = {one.name: from_table(LinkFlags, {**link, **one.link}, path, "link").link for one in servers}
     found: dict[str, Any] = {
         "name": name,
@@ -92,15 +93,20 @@ def check_calls(scenario: Scenario, path: Path) -> None:
 
 def find_scenario(name: str) -> Path:
     """The path of a scenario: `name` is a file, or the name of a shipped scenario."""
-    for path in (Path(name), SHIPPED / f"{name}.toml"):
+    for path in (Path(name), SHIPPED / f"{name}.toml", LINKS / f"{name}.toml"):
         if path.is_file():
             return path
-    raise DataError(f"scenario {name!r} is neither a file nor one of {', '.join(shipped())}")
+    raise DataError(f"scenario {name!r} is neither a file nor one of {', '.join(known_names())}")
 
 
-def shipped() -> tuple[str, ...]:
-    """The names of the scenarios that come with Offboard."""
-    return tuple(sorted(path.stem for path in SHIPPED.glob("*.toml")))
+def known_names() -> tuple[str, ...]:
+    """The names that `find_scenario` knows."""
+    return (*shipped(), *shipped(LINKS))
+
+
+def shipped(folder: Path = SHIPPED) -> tuple[str, ...]:
+    """The names of the scenarios that come with Offboard, or of those in LINKS."""
+    return tuple(sorted(path.stem for path in folder.glob("*.toml")))
 
 
 def _table(table: Mapping[str, Any], section: str, path: Path) -> Mapping[str, Any]:
@@ -180,12 +186,31 @@ def _chaos(table: Mapping[str, Any], workload: Workload, path: Path, *, servers:
     return from_table(Chaos, _table(table, "chaos", path), path, "chaos")
 
 
+def _recorded_on(
+    table: Mapping[str, Any], servers: tuple[CloudPart, ...], path: Path
+) -> tuple[Mapping[str, Any], tuple[CloudPart, ...]]:
+    """The link of all servers, and the servers; with `on`, that server alone plays the recording."""
+    link = _link({key: value for key, value in table.items() if key != ON}, path)
+    if ON not in table:
+        return link, servers
+    names = [server.name for server in servers]
+    if table[ON] not in names:
+        raise DataError(f"{path}: link.on: {table[ON]!r} is not one of {', '.join(names)}")
+    own = {key: value for key, value in link.items() if "recording" in key}
+    if not own:
+        raise DataError(f"{path}: link.on: {table[ON]!r} needs link.recording")
+    others = {key: value for key, value in link.items() if key not in own}
+    return others, tuple(
+        replace(one, link={**own, **one.link}) if one.name == table[ON] else one for one in servers
+    )
+
+
 def _link(table: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
     for key in table:
         if key not in LINK_KEYS:
             raise unknown_key(path, key, LINK_KEYS)
     table = {
-        key: (path.parent / str(value)).resolve() if key.endswith("samples") else value
+        key: (path.parent / str(value)).resolve() if key.endswith(FILES) else value
         for key, value in table.items()
     }
     from_table(LinkFlags, table, path, "link")

@@ -104,7 +104,9 @@ class _Run:
             seed=scenario.seed,
         )
         heartbeat_s = heartbeat.EVERY_S if settings.beats(policy) else 0.0
-        self._testbed = SimulatedTestbed(scenario, tasks, self._clock, heartbeat_s=heartbeat_s, noise=noise)
+        self._testbed = SimulatedTestbed(
+            scenario, tasks, self._clock, heartbeat_s=heartbeat_s, begins_s=self._zero_s, noise=noise
+        )
         self._own = OwnRecord()
         self.offload = SteppedOffloader(
             [*self._testbed.clouds.values(), self._testbed.onboard],

@@ -14,7 +14,7 @@ from offboard.loadgen.simulation.model.simulated_connection import SimulatedConn
 from offboard.loadgen.simulation.model.simulated_cpu import SimulatedCpu
 from offboard.loadgen.simulation.model.simulated_server import SimulatedServer
 from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks
-from offboard.loadgen.simulation.model.task_costs import DECIDING_CPU_S, Noise
+from offboard.loadgen.simulation.model.task_costs import COSTS, DECIDING_CPU_S, Noise
 from offboard.loadgen.simulation.model.true_costs import TrueCosts
 from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
 from offboard.loadgen.simulation.oracle import Oracle
@@ -33,6 +33,7 @@ class SimulatedTestbed:
 
     - `tasks`: the tasks of every robot, by its name.
     - `heartbeat_s`: time between heartbeats of the first robot; 0 means none.
+    - `begins_s`: when the first task is due, and the recordings of links begin.
     """
 
     def __init__(
@@ -42,10 +43,13 @@ class SimulatedTestbed:
         clock: VirtualClock,
         *,
         heartbeat_s: float,
+        begins_s: float = 0.0,
         noise: float = 1.0,
     ) -> None:
         seed, cpus = scenario.seed, scenario.robot.cpus
-        self._links = {name: LinkFlags(**link).link for name, link in scenario.links().items()}
+        self._links = {
+            name: LinkFlags(**link).link.begun(begins_s) for name, link in scenario.links().items()
+        }
         self._servers = {part.name: SimulatedServer(clock, part) for part in scenario.servers}
         self._cpu = SimulatedCpu(clock, cpus)
         self.costs = TrueCosts(tasks[ROBOT], Noise(seed, noise))
@@ -178,8 +182,9 @@ class SimulatedTestbed:
 def check_simulated(scenario: Scenario) -> None:
     """Raise ConfigError if the scenario has inputs, an event or a link condition that cannot be simulated."""
     prefix = f"scenario {scenario.name} cannot be simulated"
-    if scenario.workload.inputs is not None:
-        raise ConfigError(f"{prefix}: the costs of task {scenario.workload.task} are not known")
+    task = scenario.workload.task
+    if scenario.workload.inputs is not None and str(task).partition(":")[2] not in COSTS:
+        raise ConfigError(f"{prefix}: the costs of task {task} are not known")
     links = {name: LinkFlags(**link).link for name, link in scenario.links().items()}
     for link in links.values():
         _check_link(prefix, link)

@@ -113,7 +113,7 @@ def _wanted(scenario: Scenario) -> dict[str, Wanted]:
 
 def _key(workload: Workload, seed: int) -> Wanted:
     """The same key for all scenarios that have the same tasks."""
-    plain = Workload(map=workload.map, task=workload.task, sizes=workload.sizes)
+    plain = Workload(map=workload.map, task=workload.task, inputs=workload.inputs, sizes=workload.sizes)
     return replace(
         plain,
         resolution=workload.resolution,

@@ -186,6 +186,9 @@ class DockerTestbed:
         first, *_ = [self._link(one).set_link(changes) for one in self._servers(server)]
         return first
 
+    def begin_recording(self, server: str) -> None:
+        self._link(server).begin_recording()
+
     def link(self, server: str = CLOUD) -> dict[str, Any]:
         return self._link(server).link()
 

@@ -226,6 +226,9 @@ class LocalTestbed:
         first, *_ = [self._relays[one].set_link(changes) for one in self._servers(server)]
         return first
 
+    def begin_recording(self, server: str) -> None:
+        self._relays[server].begin_recording()
+
     def link(self, server: str = CLOUD) -> dict[str, Any]:
         return self._relays[server].link()
 

@@ -112,6 +112,9 @@ class Testbed(Protocol):
         Returns the whole link; that of the first server if all were changed.
         """
 
+    def begin_recording(self, server: str) -> None:
+        """Play the recording of the link to a server from its beginning; until then its first row holds."""
+
     def link(self, server: str = CLOUD) -> dict[str, Any]:
         """The link to a server as it is now, with its counts of connections and bytes."""
 

@@ -9,11 +9,12 @@ import pytest
 from offboard.common.command_line import load
 from offboard.common.errors import ConfigError, DataError
 from offboard.loadgen.relay.control_api import Change
-from offboard.loadgen.relay.link.link import Link, LinkConditions
+from offboard.loadgen.relay.link.link import CONDITIONS, Link, LinkConditions
 from offboard.loadgen.relay.link.link_settings import LinkFlags, as_flags
 from offboard.loadgen.scenario.scenario_file import read_scenario
 
-NAMES = {field.name for field in fields(LinkConditions)}
+NAMES = set(CONDITIONS)
+RECORDED = {"recording", "up_recording", "down_recording", "recording_from_s", "recording_repeats"}
 SCENARIO = """
 name = "rough"
 
@@ -33,10 +34,11 @@ def flags(*argv: str) -> LinkFlags:
 
 
 def test_each_condition_has_its_flags() -> None:
-    """All but the outage, which only a running relay has, can be set for both directions and for one."""
+    """For both directions and for one: all but the outage, which only a running relay has."""
     both = NAMES - {"outage"}
     wanted = both | {f"up_{name}" for name in both} | {f"down_{name}" for name in both}
-    assert {field.name for field in fields(LinkFlags)} == wanted
+    assert {field.name for field in fields(LinkFlags)} == wanted | RECORDED
+    assert {field.name for field in fields(LinkConditions)} == NAMES | {"recording"}
     assert set(Change.model_fields) == NAMES
 
 

@@ -98,7 +98,9 @@ FOLDERS: dict[str, set[str]] = {
     "loadgen/compare": {
         "loadgen",
         "loadgen/play",
+        "loadgen/relay/link",
         "loadgen/rivals",
+        "loadgen/robot",
         "loadgen/scenario",
         "loadgen/simulation",
         "loadgen/table",

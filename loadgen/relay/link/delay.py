@@ -14,15 +14,16 @@ class Delay:
     def __init__(self, origin: str) -> None:
         self._jitter = Jitter(origin)
 
-    def at_ms(self, segment: int, conditions: LinkConditions) -> float:
+    def at_ms(self, segment: int, conditions: LinkConditions, recorded_ms: float = 0.0) -> float:
         """How long this segment takes under these conditions, in ms; never less than 0."""
+        fixed_ms = conditions.delay_ms + recorded_ms
         if not varies(conditions):
-            return conditions.delay_ms
+            return fixed_ms
         draw = self._jitter.at(segment, conditions.correlation)
         if conditions.distribution == SAMPLES:
-            return conditions.delay_ms + quantile(conditions.samples, draw)
+            return fixed_ms + quantile(conditions.samples, draw)
         jitter_ms = conditions.jitter_ms * DISTRIBUTIONS[conditions.distribution](draw)
-        return max(0.0, conditions.delay_ms + jitter_ms)
+        return max(0.0, fixed_ms + jitter_ms)
 
 
 def varies(conditions: LinkConditions) -> bool:

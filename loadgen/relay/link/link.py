@@ -11,6 +11,7 @@ from offboard.common.errors import ConfigError
 from offboard.loadgen.relay.link.delay_samples import DELAY_MS_MAX, SAMPLES, SAMPLES_MAX, Samples
 from offboard.loadgen.relay.link.jitter import DISTRIBUTIONS
 from offboard.loadgen.relay.link.loss import LOSS_BURST_MAX
+from offboard.loadgen.relay.link.recorded_link import Playback
 
 SEGMENT_BYTES = 1448  # payload of one TCP segment on Ethernet: 1500 - 20 (IP) - 32 (TCP with timestamps)
 BANDWIDTH_MBPS_MAX = 100_000.0
@@ -43,6 +44,7 @@ class LinkConditions:
     - `outage`: nothing comes out until the outage ends. The link is silent; connections are not reset.
     - `hang`: the receiving side reads everything and answers nothing. What it read is lost, so when it wakes
       up, the connections that lost bytes are reset.
+    - `recording`: its delay and rate are used instead of `delay_ms` and `bandwidth_mbps`, which are 0 then.
     """
 
     delay_ms: float = 0.0
@@ -59,6 +61,7 @@ class LinkConditions:
     reset_after_ms: float = 0.0
     truncate_bytes: int = 0
     slow_close_ms: float = 0.0
+    recording: Playback | None = None
 
     def __post_init__(self) -> None:
         for name, (least, most) in BOUNDS.items():
@@ -86,7 +89,18 @@ class LinkConditions:
 
     def shown(self) -> dict[str, Any]:
         """All conditions by name, for people and files; of the samples only their number."""
-        return {f.name: getattr(self, f.name) for f in fields(self)} | {"samples": len(self.samples)}
+        played = None if self.recording is None else self.recording.shown()
+        values = {name: getattr(self, name) for name in CONDITIONS}
+        return values | {"samples": len(self.samples), "recording": played}
+
+    def begun(self, at_s: float) -> "LinkConditions":
+        """The same conditions, with the recording beginning then."""
+        played = self.recording
+        return self if played is None else replace(self, recording=replace(played, begun_s=at_s))
+
+
+# The conditions that can be changed on a running link.
+CONDITIONS = tuple(f.name for f in fields(LinkConditions) if f.name != "recording")
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,12 +121,42 @@ class Link:
             down=_changed("down", self.down, both | dict(changes.get("down") or {})),
         )
 
+    @property
+    def recorded(self) -> bool:
+        return self.up.recording is not None or self.down.recording is not None
+
+    def told(self) -> str | None:
+        """What is played, and what the conditions say because it is not recorded; None: no recording."""
+        files, others = {}, []
+        for way, conditions in (("up", self.up), ("down", self.down)):
+            played = conditions.recording
+            replaced = () if played is None else played.replaced()
+            if played is not None:
+                files[played.recording.file] = ", ".join(played.recording.columns)
+            if "delay_ms" not in replaced:
+                others.append(f"{conditions.delay_ms:g} ms {way}")
+            if "bandwidth_mbps" not in replaced:
+                rate = f"{conditions.bandwidth_mbps:g} Mbit/s" if conditions.bandwidth_mbps else "no limit"
+                others.append(f"{rate} {way}")
+        if not files:
+            return None
+        names = " and ".join(f"{file} ({columns})" for file, columns in files.items())
+        return f"{names}; from [link], as it is not recorded: {', '.join(others) or 'nothing'}"
+
+    def begun(self, at_s: float) -> "Link":
+        """The same link, with its recordings beginning then."""
+        return Link(self.up.begun(at_s), self.down.begun(at_s))
+
 
 def _changed(direction: str, conditions: LinkConditions, changes: Mapping[str, Any]) -> LinkConditions:
-    known = [f.name for f in fields(LinkConditions)]
+    played = () if conditions.recording is None else conditions.recording.replaced()
     for name in changes:
-        if name not in known:
-            raise ConfigError(f"{name}: unknown condition; known: {', '.join(known)}, up, down")
+        if name not in CONDITIONS:
+            raise ConfigError(f"{name}: unknown condition; known: {', '.join(CONDITIONS)}, up, down")
+        if name in played:
+            assert conditions.recording is not None
+            file = conditions.recording.recording.file
+            raise ConfigError(f"{direction}.{name}: cannot be changed, because it is recorded in {file}")
     try:
         return replace(conditions, **changes)
     except ConfigError as error:

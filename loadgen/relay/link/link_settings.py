@@ -4,15 +4,18 @@ What a condition does to the data is in `link`.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from offboard.common.config import check, setting
 from offboard.loadgen.relay.link.delay_samples import SAMPLES, read_samples
-from offboard.loadgen.relay.link.link import BOUNDS, NAMES, Link, LinkConditions
+from offboard.loadgen.relay.link.link import BOUNDS, CONDITIONS, NAMES, Link, LinkConditions
+from offboard.loadgen.relay.link.recorded_link import Playback
+from offboard.loadgen.relay.link.recording_file import T_S_MAX, read_recording
 
 LINK, FAULTS, UP, DOWN = "link", "faults", "from robot to cloud only", "from cloud to robot only"
+RECORDED = "recorded link"
 
 
 def _both(name: str, default: Any, help: str, *, group: str = LINK, rare: bool = False) -> Any:
@@ -77,6 +80,29 @@ class LinkFlags:
         "slow_close_ms", 0.0, "delay of the end of a stream, in ms", group=FAULTS, rare=True
     )
 
+    recording: Path | None = setting(
+        None,
+        "recorded link to play: CSV with t_s and rtt_ms, mbps, or down_mbps and up_mbps, or the packet times"
+        " of mahimahi; what is recorded replaces the delay or bandwidth",
+        group=RECORDED,
+    )
+    up_recording: Path | None = setting(None, f"--recording {UP}", group=RECORDED, rare=True)
+    down_recording: Path | None = setting(None, f"--recording {DOWN}", group=RECORDED, rare=True)
+    recording_from_s: float = setting(
+        0.0,
+        "second of the recording at which it begins",
+        group=RECORDED,
+        rare=True,
+        minimum=0.0,
+        maximum=T_S_MAX,
+    )
+    recording_repeats: bool = setting(
+        True,
+        "start again at the end of the recording; without it, the last row holds",
+        group=RECORDED,
+        rare=True,
+    )
+
     up_delay_ms: float | None = _up("delay_ms")
     up_jitter_ms: float | None = _up("jitter_ms")
     up_distribution: str | None = _up("distribution")
@@ -111,19 +137,34 @@ class LinkFlags:
 
     @property
     def link(self) -> Link:
-        """The conditions at start; reads the files of --samples."""
+        """The conditions at start; reads the files of --samples and --recording."""
         return Link(self._conditions("up"), self._conditions("down"))
 
     def _conditions(self, direction: str) -> LinkConditions:
         values = {}
-        for name in (field.name for field in fields(LinkConditions) if field.name != "outage"):
+        for name in CONDITIONS:
+            if name == "outage":  # only a running link has one
+                continue
             own = getattr(self, f"{direction}_{name}")
             values[name] = getattr(self, name) if own is None else own
         if values["samples"] is not None:
             values["samples"] = read_samples(values["samples"])
         values["samples"] = values["samples"] or ()
         values["distribution"] = values["distribution"] or (SAMPLES if values["samples"] else "normal")
-        return LinkConditions(**values)
+        played = self._playback(direction)
+        if played is not None:
+            values |= dict.fromkeys(played.replaced(), 0.0)
+        return LinkConditions(**values, recording=played)
+
+    def _playback(self, direction: str) -> Playback | None:
+        """The recording of one direction; None if there is none, or if it says nothing of this direction."""
+        file = getattr(self, f"{direction}_recording") or self.recording
+        if file is None:
+            return None
+        played = Playback(
+            read_recording(file), direction, from_s=self.recording_from_s, repeats=self.recording_repeats
+        )
+        return played if played.replaced() else None
 
 
 def as_flags(settings: Mapping[str, Any]) -> list[str]:

@@ -15,6 +15,7 @@ class Pipe:
     """Computes when the bytes of one direction of one connection are due.
 
     arrived --> [ sent at the bandwidth ] --> [ + delay + jitter + stall ] --> due, in order
+                 or at recorded rates           recorded delay of the time when it began to be sent
 
     Jitter and loss are drawn once for each segment of the byte stream, each from its own random numbers. So
     a draw depends only on seed, connection, direction and segment number: not on how the stream was cut into
@@ -43,9 +44,17 @@ class Pipe:
     @conditions.setter
     def conditions(self, conditions: LinkConditions) -> None:
         self._conditions = conditions
-        self._draws = varies(conditions) or conditions.loss > 0
         self._bandwidth = Bandwidth(conditions.bandwidth_mbps)
-        self.bucket_bytes = SEGMENT_BYTES if self._draws else self._bandwidth.bucket_bytes
+        played = self._recording = conditions.recording
+        draws = varies(conditions) or conditions.loss > 0
+        single = draws or (played is not None and played.rate is not None)
+        self.bucket_bytes = SEGMENT_BYTES if single else self._bandwidth.bucket_bytes
+        self._in_parts = draws or (played is not None and played.delays)  # which have delays of their own
+
+    @property
+    def busy_until_s(self) -> float:
+        """When the last byte so far is sent, before its delay."""
+        return self._busy_until_s
 
     @property
     def segment(self) -> int:
@@ -55,9 +64,9 @@ class Pipe:
     def chunk_bytes(self, size: int) -> int:
         """How many of the next `size` bytes travel together, as one chunk.
 
-        A chunk is one segment where each segment draws its own delay, so that a late segment does not hold
-        those before it. Else a chunk is at most one bucket of the bandwidth. Without a bandwidth limit it is
-        all `size` bytes.
+        A chunk is one segment where the rate is recorded, and where each segment draws its own delay, so that
+        a late segment does not hold those before it. Else a chunk is at most one bucket of the bandwidth.
+        Without a bandwidth limit it is all `size` bytes.
         """
         if self.bucket_bytes is None:
             return size
@@ -82,9 +91,10 @@ class Pipe:
         due_s = self._last_due_s
         left = size
         while left:
-            part = min(left, SEGMENT_BYTES - self.taken % SEGMENT_BYTES) if self._draws else left
-            sent_s += self._bandwidth.sending_s(part)
-            due_s = max(due_s, sent_s + self._late_s())
+            part = self.chunk_bytes(left) if self._in_parts else left
+            began_s = sent_s
+            sent_s = self._sent_s(began_s, part)
+            due_s = max(due_s, sent_s + self._late_s(began_s))
             self.taken += part
             left -= part
         self._busy_until_s, self._last_due_s = sent_s, due_s
@@ -92,13 +102,24 @@ class Pipe:
 
     def _end_due(self, sent_s: float) -> float:
         """When the end of the stream comes out: as late as the last segment, and never lost."""
-        self.drawn_ms = self._delay.at_ms(max(0, self.taken - 1) // SEGMENT_BYTES, self._conditions)
+        self.drawn_ms = self._delay_ms(max(0, self.taken - 1) // SEGMENT_BYTES, sent_s)
         due_s = max(self._last_due_s, sent_s + self.drawn_ms / 1e3)
         return due_s + self._conditions.slow_close_ms / 1e3
 
-    def _late_s(self) -> float:
+    def _sent_s(self, began_s: float, size: int) -> float:
+        """When the next `size` bytes are sent, if the first one begins then."""
+        if self._recording is not None and self._recording.rate is not None:
+            return self._recording.sent_s(began_s, size)
+        return began_s + self._bandwidth.sending_s(size)
+
+    def _delay_ms(self, segment: int, began_s: float) -> float:
+        """Delay and jitter of a segment that began to be sent then."""
+        recorded_ms = 0.0 if self._recording is None else self._recording.delay_ms(began_s)
+        return self._delay.at_ms(segment, self._conditions, recorded_ms)
+
+    def _late_s(self, began_s: float) -> float:
         """Delay, jitter and stall of the next part of a segment."""
-        self.drawn_ms = self._delay.at_ms(self.segment, self._conditions)
+        self.drawn_ms = self._delay_ms(self.segment, began_s)
         if self.taken % SEGMENT_BYTES == 0:
             now = self._conditions
             times = self._loss.times(self.segment, now.loss, now.loss_burst)

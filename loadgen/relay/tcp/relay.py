@@ -9,6 +9,7 @@ import contextlib
 import logging
 from typing import Any
 
+from offboard.common.errors import ConfigError
 from offboard.loadgen.relay.link.link import Link
 from offboard.loadgen.relay.tcp.connection import Connection
 from offboard.loadgen.relay.tcp.forwarder import ReadBuffer
@@ -58,6 +59,12 @@ class Relay:
             self.record.conditions(asyncio.get_running_loop().time(), by, link)
         for connection in tuple(self.connections):
             connection.set_link(link)
+
+    def begin_recording(self) -> None:
+        """Play the recording of the link from its beginning; ConfigError if there is none."""
+        if not self.link.recorded:
+            raise ConfigError("recording: this link plays none; remedy: start the relay with --recording")
+        self.set_link(self.link.begun(asyncio.get_running_loop().time()), by="recording")
 
     def accept(self) -> asyncio.BaseProtocol:
         """The protocol for the socket of a client that was just accepted."""

@@ -68,7 +68,7 @@ class SimulatedConnection:
             pause_ms = min(2 * pause_ms, RECONNECT_MAX_MS)
             self._clock.after(pause_ms / 1e3, partial(self._try, pause_ms, life))
             return
-        trip_ms = self.to_cloud.conditions.delay_ms + self.to_robot.conditions.delay_ms
+        trip_ms = self.to_cloud.delay_ms() + self.to_robot.delay_ms()
         self._clock.after(HANDSHAKE_TRIPS * trip_ms / 1e3, partial(self._say_hello, life))
 
     def _say_hello(self, life: int) -> None:

@@ -39,23 +39,24 @@ class SimulatedDirection:
         self._held: deque[Callable[[], object]] = deque()
         self._swallowed = False
 
-    @property
-    def conditions(self) -> LinkConditions:
-        return self._conditions
-
     def send(self, message: Message, arrive: Callable[[], object]) -> None:
         """Call `arrive` when the last byte of the message comes out."""
-        begins_s = max(self._clock.now_s(), self._free_s)
-        self._last_due_s = max(self._last_due_s, self._comes_out_s(message, begins_s))
-        bandwidth = self._conditions.bandwidth_mbps
-        self._free_s = begins_s + (8e-6 * message.size / bandwidth if bandwidth else 0.0)
+        pipe = self._pipe(message)
+        due_s = pipe.due(max(self._clock.now_s(), self._free_s), message.size)
+        self._last_due_s = max(self._last_due_s, due_s)
+        self._free_s = pipe.busy_until_s
         self._clock.at(self._last_due_s, partial(self._come_out, arrive, self._connection))
 
     def due_s(self, message: Message, sent_s: float) -> float | None:
         """When this message would come out if the link were idle and did not change; None means never."""
         if self._conditions.outage or self._conditions.hang:
             return None
-        return self._comes_out_s(message, sent_s)
+        return self._pipe(message).due(sent_s, message.size)
+
+    def delay_ms(self) -> float:
+        """The delay of a message that enters now, without jitter."""
+        conditions, played = self._conditions, self._conditions.recording
+        return conditions.delay_ms + (played.delay_ms(self._clock.now_s()) if played else 0.0)
 
     def change(self, conditions: LinkConditions) -> bool:
         """Change the conditions, and return whether the connection survives.
@@ -76,9 +77,8 @@ class SimulatedDirection:
         self._swallowed = False
         self._free_s = self._last_due_s = self._clock.now_s()
 
-    def _comes_out_s(self, message: Message, begins_s: float) -> float:
-        direction = f"{self._name}/{message.what}"
-        return Pipe(self._conditions, self._seed, message.number, direction).due(begins_s, message.size)
+    def _pipe(self, message: Message) -> Pipe:
+        return Pipe(self._conditions, self._seed, message.number, f"{self._name}/{message.what}")
 
     def _come_out(self, arrive: Callable[[], object], connection: int) -> None:
         if connection != self._connection:

@@ -55,7 +55,8 @@ def find_tasks(workload: Workload, seed: int, count: int) -> RobotTasks:
         raise ConfigError(f"task {kind.name} cannot be simulated: only the costs of {known} are known")
     if kind.warm is not None:
         kind.warm()
-    blobs = wire.encode(list(work.request()), kind.types, blobs=True).blobs
+    fresh = workload.inputs is not None  # new arrays travel inside the request
+    blobs = wire.encode(list(work.request()), kind.types, blobs=not fresh).blobs
     tasks = []
     for _ in range(count):
         request = work.request()
@@ -64,16 +65,19 @@ def find_tasks(workload: Workload, seed: int, count: int) -> RobotTasks:
         else:
             answer = work.function(*request)
             units = dict.fromkeys(PARTS, kind.work_of(answer) or 0.0)
-        tasks.append(_task(kind, request, HASH_BYTES if answer is None else answer, units))
+        body = wire.encode(list(request), kind.types, blobs=not fresh)
+        answer_or_hash = HASH_BYTES if answer is None else answer
+        tasks.append(_task(kind, request, body=body, answer=answer_or_hash, units=units))
         work.advance(answer)
     blob_bytes = sum(raw.nbytes for raw in blobs.values())
     cost = PLANS[workload.planner] if kind.name == "plan_path" else COSTS[kind.name]
     return RobotTasks(tasks, cost, kind.work is not None, blob_bytes)
 
 
-def _task(kind: Kind, request: tuple[Any, ...], answer: Any, units: Mapping[str, float]) -> SimulatedTask:
+def _task(
+    kind: Kind, request: tuple[Any, ...], *, body: wire.Body, answer: Any, units: Mapping[str, float]
+) -> SimulatedTask:
     """The bytes are counted on the messages that a real robot and server would send."""
-    body = wire.encode(list(request), kind.types, blobs=True)
     frames = wire.pack(wire.Request(1, kind.name, 1.0, blobs=tuple(body.blobs), body=body.frames))
     reply = wire.Reply(1, "ok", run_s=1.0, body=wire.encode(answer, kind.types).frames, cpu_s=1.0)
     size = kind.size_of(kind.bind(request, {}))

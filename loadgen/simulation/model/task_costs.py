@@ -16,9 +16,10 @@ All values were measured on a virtual machine with two cores:
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from random import Random
+from typing import Any
 
 from offboard.common.planning.planner_names import ASTAR, DIJKSTRA, JPS
-from offboard.loadgen.scenario.hash_tasks import EVERYWHERE, rounds_on
+from offboard.loadgen.scenario.hash_tasks import EVERYWHERE, frame_rounds, image_rounds, rounds_on
 from offboard.loadgen.testbed.testbed import CLOUD as CLOUD_PART
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
@@ -61,13 +62,17 @@ COSTS: Mapping[str, Cost] = {
     "hash_pairs": HASH,
     "hash_rarely_long": HASH,
     "hash_rarely_long_everywhere": HASH,
+    "look_at_frame": replace(HASH, sending_s=0.9e-3),  # 0.9 ms more for each MB
+    "judge_image": replace(HASH, sending_s=1.2e-3),
 }
 PARTS = {ONBOARD: ROBOT, CLOUD: CLOUD_PART}  # the part of the testbed that runs a site
-ROUNDS: Mapping[str, Callable[[str, int], int]] = {
+ROUNDS: Mapping[str, Callable[[str, Any], int]] = {
     "hash_rounds": lambda _, rounds: rounds,
     "hash_pairs": lambda _, count: count * count // 1000,
     "hash_rarely_long": lambda site, rounds: rounds_on(PARTS[site], rounds),
     "hash_rarely_long_everywhere": lambda _, rounds: rounds_on(EVERYWHERE, rounds),
+    "look_at_frame": lambda _, frame: frame_rounds(frame),
+    "judge_image": lambda site, _: image_rounds(PARTS[site]),
 }
 
 
