@@ -115,8 +115,11 @@ class Race:
     def _wait_for_answer(self, plan: Plan) -> Generator[Wait, None, str | None]:
         """Start the later runs when they are due; the site of the first answer, None if all runs failed."""
         began_s, call = self._clock.now_s(), plan.call
-        # The next one to start comes last.
-        later = sorted(filter(None, (plan.second, plan.latest)), key=_due_s, reverse=True)
+        later: list[Probe | Hedge] = []  # the next one to start comes last
+        for one in (plan.second, plan.latest):
+            if one is not None:
+                later.append(one)
+        later.sort(key=_due_s, reverse=True)
         while later and _due_s(later[-1]) <= 0:
             self._start_later(later.pop(), plan)
         while True:
