@@ -159,6 +159,51 @@ def test_the_end_of_an_overtaken_run_is_reported_once(course: Course) -> None:
     assert [(site, one.seconds, one.ok) for site, one in course.late] == [(ONBOARD, pytest.approx(0.9), True)]
 
 
+def test_the_latest_run_starts_without_being_allowed(course: Course) -> None:
+    """It is a fallback that does not wait for the failure; the first answer counts."""
+    course.allowed = False
+    course.take(cloud=1.0, onboard=0.1)
+    executions = course.run(Plan((CLOUD,), latest=Hedge(ONBOARD, 0.3)))
+    assert course.begun == [(CLOUD, 0.0), (ONBOARD, 0.3)]
+    assert told(executions) == [(CLOUD, "Overtaken"), (ONBOARD, None)]
+    assert course.clock.now_s() == pytest.approx(0.4)
+    assert course.sites[CLOUD].hurried_s == [0.3]
+
+
+@pytest.mark.parametrize(
+    ("cloud_s", "begun"), [(0.2, [CLOUD]), (0.35, [CLOUD, EDGE]), (1.0, [CLOUD, EDGE, ONBOARD])]
+)
+def test_a_hedge_and_the_latest_run_each_start_in_time(
+    course: Course, cloud_s: float, begun: list[str]
+) -> None:
+    """The hedge to a third site does not replace the run that must answer before a deadline."""
+    course.take(cloud=cloud_s, edge=2.0, onboard=0.1)
+    course.run(Plan((CLOUD,), Hedge(EDGE, 0.3), latest=Hedge(ONBOARD, 0.5)))
+    assert [site for site, _ in course.begun] == begun
+
+
+def test_a_latest_run_that_is_overdue_starts_at_once(course: Course) -> None:
+    """Nothing is left of the time until it, and an earlier second run of the same site counts as it."""
+    course.take(cloud=1.0, onboard=0.1)
+    course.run(Plan((CLOUD,), latest=Hedge(ONBOARD, -0.1)))
+    assert course.begun == [(CLOUD, 0.0), (ONBOARD, 0.0)]
+    course.begun.clear()
+    course.run(Plan((CLOUD,), Hedge(ONBOARD, 0.05), latest=Hedge(ONBOARD, 0.08)))
+    assert [site for site, _ in course.begun] == [CLOUD, ONBOARD]
+
+
+@pytest.mark.parametrize(("cloud_fails_s", "used"), [(0.1, ONBOARD), (0.5, ONBOARD)])
+def test_a_failed_task_ends_a_warm_up_only_if_it_failed_on_both_sites(
+    course: Course, cloud_fails_s: float, used: str
+) -> None:
+    """The site that is not known may lack a file; the other one runs the task anyway."""
+    course.take(cloud=cloud_fails_s, onboard=0.3)
+    course.sites[CLOUD].failure = TaskFailed("no")
+    executions = course.run(Plan((ONBOARD, CLOUD), keep=True))
+    assert answer_of(executions, ECHO).site == used
+    assert course.clock.now_s() == pytest.approx(0.3)
+
+
 def test_a_probe_starts_at_once_and_runs_on(course: Course) -> None:
     """The slower run of a probe is not cancelled, and its time is reported when it ends."""
     course.take(onboard=0.1, cloud=0.7)
