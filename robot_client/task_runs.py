@@ -73,6 +73,8 @@ class TaskRuns:
         )
         hurried = pending.deadline_s is not None
         plan = plan_of(decision, pending.forecast, pending.call, hurried=hurried)
+        if plan.latest is not None and plan.latest.after_s <= 0 and not self._take_duplicate():
+            plan.latest = None
         if plan.latest is not None:  # it counts from the beginning of the call
             left_s = plan.latest.after_s - (self._clock.now_s() - pending.started_s)
             plan.latest = Hedge(plan.latest.site, left_s)

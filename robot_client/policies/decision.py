@@ -42,8 +42,8 @@ class Decision(NamedTuple):
 
     The first good answer is used, and the other runs go on; with `waits`, the caller gets its answer when all
     runs have ended.
-    `latest`: a run that starts at the latest then, if no answer has come, outside of the allowance: a call
-    with a deadline must not wait for a remote site alone.
+    `latest`: a run that starts at the latest then, if no answer has come, outside of the allowance unless it
+    starts at once: a call with a deadline must not wait for a remote site alone.
     `why` is the reason for people, or a function that makes it: few reasons are ever read.
     `policy` names who decided: the rule, or the whole policy once it is `Named`. `second` is a second run on
     another site. `advised` is where the policy would send a task that `Observe` runs onboard.

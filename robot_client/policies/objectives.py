@@ -112,9 +112,10 @@ def by_deadline(forecast: Forecast, deadline_s: float, *, slowest_s: float | Non
     alone, latest_s, rescue = Deadline(deadline_s), None, 0.0
     onboard = forecast.sites.get(ONBOARD)
     if slowest_s is not None and onboard is not None and (onboard.predicted_s or 0.0) < deadline_s:
-        latest_s = max(0.0, deadline_s - _longest_s(onboard, slowest_s))
-        missed = _missed(onboard, deadline_s - latest_s)
-        rescue = 0.0 if missed is None else 1.0 - missed  # by an unknown onboard, nothing is promised
+        start_s = max(0.0, deadline_s - _longest_s(onboard, slowest_s))
+        if start_s > 0.0 or forecast.duplicates >= 1:  # a second run from the start is no fallback
+            latest_s, missed = start_s, _missed(onboard, deadline_s - start_s)
+            rescue = 0.0 if missed is None else 1.0 - missed  # by an unknown onboard, nothing is promised
     sites = {}
     for site, one in forecast.sites.items():
         quality = one.quality if one.quality is WHOLE else Quality(one.quality.value)
