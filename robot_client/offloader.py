@@ -364,7 +364,7 @@ class Offloader:
 
     def _end(self, pending: PendingTask, executions: tuple[Execution, ...]) -> tuple[Execution, Record]:
         task, answer = pending.task, answer_of(executions, pending.task.kind)
-        answered_s = self._clock.now_s()
+        answered_s = None if pending.answered is None else self._clock.now_s()
         with self._lock:
             self._runs.learn(pending, executions)
             if not self._life.closed and self._memories.due(self._clock.now_s()):
@@ -376,7 +376,7 @@ class Offloader:
         record = self.last = record_of(
             pending, executions, answer, ended_s=ended_s, late=late, regret=regret, savings=saved
         )
-        if pending.answered is not None:  # the caller does not wait for observers
+        if pending.answered is not None and answered_s is not None:  # its caller waits for no observer
             pending.answered.set_result((answer, answered_s))
         tell(self._observers, record)
         if len(executions) > 1:

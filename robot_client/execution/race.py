@@ -6,6 +6,7 @@ The sites are chosen in `policies`; what comes of the runs is learnt in `learnin
 from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import Any, TypeAlias
 
 from offboard.common.errors import CloudError, Overtaken, SiteClosed, TaskError
@@ -14,6 +15,8 @@ from offboard.robot_client.policies import Hedge, Probe
 from offboard.robot_client.sites.clock import Clock
 from offboard.robot_client.sites.onboard import OnboardAnswer
 from offboard.robot_client.sites.runner import ONBOARD, Execution, Runner
+
+ROUNDING_S = 1e-6  # a wait for less than this may end without the clock having moved
 
 Wait: TypeAlias = tuple[Sequence[Future[Any]], float | None]  # for one to be done, in seconds
 Steps: TypeAlias = Generator[Wait, None, tuple[Execution, ...]]
@@ -114,14 +117,11 @@ class Race:
 
     def _wait_for_answer(self, plan: Plan) -> Generator[Wait, None, str | None]:
         """Start the later runs when they are due; the site of the first answer, None if all runs failed."""
-        began_s, call = self._clock.now_s(), plan.call
-        later: list[Probe | Hedge] = []  # the next one to start comes last
-        for one in (plan.second, plan.latest):
-            if one is not None:
-                later.append(one)
-        later.sort(key=_due_s, reverse=True)
-        while later and _due_s(later[-1]) <= 0:
-            self._start_later(later.pop(), plan)
+        call, later = plan.call, _later(plan)
+        _, began_s = self._runs[plan.first[0]]
+        elapsed_s = 0.0
+        while later and later[-1][0] <= 0:
+            self._start_later(later.pop()[1], plan)
         while True:
             pending: list[Future[Any]] = []
             for site, (run, _) in self._runs.items():
@@ -131,14 +131,16 @@ class Race:
                     return site
             if not pending:
                 return None
-            wait_s = _due_s(later[-1]) + began_s - self._clock.now_s() if later else None
-            if wait_s is not None and wait_s <= 0:
-                self._start_later(later.pop(), plan)
+            if later and later[-1][0] <= elapsed_s + ROUNDING_S:
+                self._start_later(later.pop()[1], plan)
             elif call is not None and call.done():
                 self._answer_call(call.result())
                 call = None
             else:
+                wait_s = later[-1][0] - elapsed_s if later else None
                 yield pending if call is None else [*pending, call], wait_s
+                if later:
+                    elapsed_s = self._clock.now_s() - began_s
 
     def _start_later(self, later: Probe | Hedge, plan: Plan) -> None:
         late = [site for site, (run, _) in self._runs.items() if not run.done()]
@@ -178,9 +180,15 @@ class Race:
         return Execution(site, self._clock.now_s() - began_s - setup_s, failure=failure, censored=True)
 
 
-def _due_s(later: Probe | Hedge) -> float:
-    """When a later run starts, in seconds after the start of the race."""
-    return later.after_s if isinstance(later, Hedge) else 0.0
+def _later(plan: Plan) -> list[tuple[float, Probe | Hedge]]:
+    """The later runs, with the seconds until they are due; the next one comes last."""
+    later: list[tuple[float, Probe | Hedge]] = []
+    if plan.latest is not None:
+        later.append((plan.latest.after_s, plan.latest))
+    if plan.second is not None:
+        later.append((plan.second.after_s if isinstance(plan.second, Hedge) else 0.0, plan.second))
+        later.sort(key=itemgetter(0), reverse=True)
+    return later
 
 
 def answer_of(executions: tuple[Execution, ...], kind: Kind) -> Execution:

@@ -46,7 +46,10 @@ class PredictionErrors:
             latest, longer = self._late
             if unit * longer > worth_s:
                 score = latest
-        return max(0.0, predicted_s + widened_s(unit * score, error_s))
+        beyond_s = unit * score
+        if error_s:
+            beyond_s = widened_s(beyond_s, error_s)
+        return max(0.0, predicted_s + beyond_s)
 
     def share_above(
         self, predicted_s: float, limit_s: float, spread_s: float | None = None, error_s: float = 0.0

@@ -27,7 +27,7 @@ class Greedy:
             if outlook.observations < WARM_UP and (warming := self._warm_up(forecast)) is not None:
                 return warming
         known = [site for site, one in forecast.sites.items() if one.predicted_s is not None]
-        site = cheapest(costs_of(forecast.only(known) if known else forecast))
+        site = cheapest(costs_of(forecast.only(known) if 0 < len(known) < len(forecast.sites) else forecast))
         return Decision(site, partial(explain, forecast, site), "greedy")
 
     def _warm_up(self, forecast: Forecast) -> Decision | None:

@@ -49,7 +49,8 @@ class WithHedges:
             return decision
         if forecast.deadline_s is not None and after_s >= forecast.deadline_s:
             return decision
-        return decision._replace(second=Hedge(second, after_s))
+        hedge = Hedge(second, after_s)
+        return Decision(decision.site, decision.why, decision.policy, second=hedge, latest=decision.latest)
 
 
 def _first(decision: Decision, sites: Mapping[str, Outlook]) -> set[str]:

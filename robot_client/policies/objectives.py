@@ -22,6 +22,7 @@ from offboard.robot_client.sites.runner import ONBOARD
 S_PER_QUALITY = 1.0  # seconds that the whole quality is worth
 FEW_TIMES = 3.0  # predicted times that a task onboard may take before a deadline, by few runs
 LONGEST = 1.1  # of its slowest run, by enough runs
+HANDOVER_S = 0.005  # for the start and the answer to pass through three threads of a busy robot
 
 
 class Expected(NamedTuple):
@@ -112,7 +113,7 @@ def by_deadline(forecast: Forecast, deadline_s: float, *, slowest_s: float | Non
     alone, latest_s, rescue = Deadline(deadline_s), None, 0.0
     onboard = forecast.sites.get(ONBOARD)
     if slowest_s is not None and onboard is not None and (onboard.predicted_s or 0.0) < deadline_s:
-        start_s = max(0.0, deadline_s - _longest_s(onboard, slowest_s))
+        start_s = max(0.0, deadline_s - _longest_s(onboard, slowest_s) - HANDOVER_S)
         if start_s > 0.0 or forecast.duplicates >= 1:  # a second run from the start is no fallback
             latest_s, missed = start_s, _missed(onboard, deadline_s - start_s)
             rescue = 0.0 if missed is None else 1.0 - missed  # by an unknown onboard, nothing is promised

@@ -59,7 +59,7 @@ class Line:
 
     def error(self, x: float) -> float:
         """The standard error of the seconds for this amount; it grows with the distance from past amounts."""
-        variance = self._variance(x)
+        variance = self._paa + 2.0 * x * self._pab + x * x * self._pbb
         return math.sqrt(variance) if variance > 0.0 else 0.0
 
     def learn(self, x: float, y: float, known: float = 0.0) -> None:
@@ -124,13 +124,9 @@ class Line:
             self._paa += share * (max(0.0, self.a) + known) ** 2
             self._pbb += share * self.b * self.b
 
-    def _variance(self, x: float) -> float:
-        """The variance of the line at `x`."""
-        return self._paa + 2.0 * x * self._pab + x * x * self._pbb
-
     def _reach(self, x: float, unit: float) -> tuple[float, float]:
         """The variance of the line at `x`, and the distance from which a time is an outlier."""
-        variance = self._variance(x)
+        variance = self._paa + 2.0 * x * self._pab + x * x * self._pbb
         return variance, ODD * math.sqrt(max(0.0, variance) + self._noise * unit * unit)
 
     def _correct(self, x: float, error: float, unit: float) -> None:

@@ -15,7 +15,7 @@ from offboard.robot_client.learning.conformal import Conformal
 from offboard.robot_client.policies import Decision, Forecast, Hedge, Outlook
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.policies.forecast import NO_ERRORS, PredictionErrors, Quality
-from offboard.robot_client.policies.objectives import Deadline, Expected, by_deadline
+from offboard.robot_client.policies.objectives import HANDOVER_S, Deadline, Expected, by_deadline
 from offboard.robot_client.records.trace import Record
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition
@@ -64,7 +64,7 @@ def test_onboard_starts_when_its_slowest_run_and_a_tenth_still_fit() -> None:
     """It starts at the deadline minus 1.1 times the slowest of its last runs, with an empty allowance too."""
     decision = decided(two_sites(quality=0.7))
     assert (decision.site, decision.second) == (CLOUD, None)
-    assert decision.latest == Hedge(ONBOARD, pytest.approx(DEADLINE_S - 1.1 * SLOWEST_S))
+    assert decision.latest == Hedge(ONBOARD, pytest.approx(DEADLINE_S - 1.1 * SLOWEST_S - HANDOVER_S))
 
 
 def test_by_few_runs_onboard_may_take_three_times_as_long() -> None:
@@ -72,7 +72,7 @@ def test_by_few_runs_onboard_may_take_three_times_as_long() -> None:
     forecast = two_sites(quality=0.7)
     sites = {**forecast.sites, ONBOARD: forecast.sites[ONBOARD]._replace(errors=NO_ERRORS)}
     decision = decided(forecast._replace(sites=sites))
-    assert decision.latest == Hedge(ONBOARD, pytest.approx(DEADLINE_S - 3 * 0.01))
+    assert decision.latest == Hedge(ONBOARD, pytest.approx(DEADLINE_S - 3 * 0.01 - HANDOVER_S))
 
 
 def test_a_larger_task_may_take_longer_than_the_slowest_smaller_one() -> None:
@@ -80,7 +80,7 @@ def test_a_larger_task_may_take_longer_than_the_slowest_smaller_one() -> None:
     forecast = two_sites(onboard_s=0.1, quality=0.5)
     decision = decided(forecast, slowest_s=SLOWEST_S)
     assert decision.latest is not None
-    assert decision.latest.after_s == pytest.approx(DEADLINE_S - 1.1 * 0.1)
+    assert decision.latest.after_s == pytest.approx(DEADLINE_S - 1.1 * 0.1 - HANDOVER_S)
 
 
 @pytest.mark.parametrize("policy", ["paper", "greedy", "probe:greedy", ONBOARD, CLOUD])
