@@ -71,7 +71,7 @@ def test_200_goals_get_the_paths_of_the_planner(
         check_paths(grid, goals, results)
         time.sleep(1.0)  # the trace is written twice a second
         show(f"{release}, {name}, {GOALS} goals", results, trace)
-    runs = [run for record in read_trace(trace) for run in record["executions"]]
+    runs = [run for record in read_trace(trace) for run in (*record["executions"], *record["late"])]
     assert {run["site"] for run in runs if run["ok"]} == {"onboard", "cloud"}, process.log()
 
 
