@@ -99,7 +99,7 @@ def test_a_scenario_measures_plans_alone(tmp_path: Path) -> None:
     print("\n".join(found.lines()))
     assert (found.plans, found.skipped) == (6, 0)
     for record in run + alone:
-        for one in record["executions"]:
+        for one in (run for run in record["executions"] if run["ok"]):  # a warm-up waits for one of two
             assert 0 < one["cpu_s"] <= one["seconds"] + CPU_TOLERANCE_S
 
 
