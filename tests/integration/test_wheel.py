@@ -37,7 +37,11 @@ from mytasks import count_primes, where_am_i
 
 with Offloader.connect(sys.argv[1], settings=Settings(window=5)) as offload:
     assert offload.wait_for_sites(count_primes, 20.0) == {}
-    print([offload(count_primes, 1000) for _ in range(8)][-1], offload.last.decision.reason)
+    for _ in range(100):
+        answer = offload(count_primes, 1000)
+        if not offload.last.decision.reason.startswith("warm-up"):
+            break
+    print(answer, offload.last.decision.reason)
     print(*[offload(where_am_i, where=site) == os.getpid() for site in ("onboard", "cloud")])
     print(asyncio.run(offload.run(count_primes, 100)))
 """
@@ -157,7 +161,7 @@ def test_a_ten_line_program_offloads_its_own_task(installed: Path, server: str, 
     (tmp_path / "program.py").write_text(PROGRAM)
     first, second, third = run(installed / "python", "program.py", server, cwd=tmp_path).splitlines()
     assert first.startswith("168 ")
-    assert re.search(r" m?s .*against .* m?s", first)
+    assert re.search(r" m?s .*against .* m?s", first), first
     assert second == "True False"
     assert third == "25"
 
