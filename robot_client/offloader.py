@@ -264,9 +264,11 @@ class Offloader:
         """Wait until every site can take this task, and onboard has run its setup, for at most `timeout_s`.
 
         Returns why some sites still cannot: a dictionary by site, which is empty if all can. It returns at
-        once if waiting changes nothing, as for a server that has other source.
+        once if waiting changes nothing, as for a server that has other source. With 0 it only looks.
         """
         self._life.refuse_in_fork()
+        if timeout_s != 0:
+            timeout_s = checked_timeout(timeout_s)
         return wait_for_sites(self._sites, kind_in_use(function), timeout_s, self._sites.awaited)
 
     def show_on(self, live: RobotLive[Record]) -> None:

@@ -228,11 +228,11 @@ def _findings(outcome: Outcome) -> Iterator[str]:
         share = f"{rounded(percent, 2)} % of the mean time of a task"
         yield f"overhead of Offboard itself: {duration(overhead_ms / 1e3)} per task (median), {share}"
     yield from _by_quality(outcome)
-    for field, said in (("wrong", "are wrong"), ("unverified", "are not verified")):
+    for field, said in (("wrong", "wrong"), ("unverified", "not verified")):
         found = [one for one in outcome.answered if getattr(one, field) is not None]
         if found:
             first = f"the first is that of task {found[0].i} from {found[0].used}"
-            yield f"warning: {len(found)} answers {said}; {first}: {getattr(found[0], field)}"
+            yield f"warning: answers that are {said}: {len(found)}; {first}: {getattr(found[0], field)}"
 
 
 def _by_quality(outcome: Outcome) -> Iterator[str]:

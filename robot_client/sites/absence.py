@@ -77,7 +77,7 @@ def wait_for_sites(runners: Mapping[str, Runner], kind: Kind, timeout_s: float, 
         absent = Absent(awaited | absent_sites(runners, kind))
         waits = [site for site, why in absent.items() if not isinstance(why, Lasting)]
         waits += [site for site, setup in setups.items() if not setup.done()]
-        if not waits or not time.monotonic() < until_s:  # also if `timeout_s` is no number
+        if not waits or time.monotonic() >= until_s:
             break
         time.sleep(POLL_S)
     for site, setup in setups.items():

@@ -162,7 +162,7 @@ def test_packing_that_loses_detail_needs_same(tmp_path: Path) -> None:
     done = run(tmp_path, "clouds.toml")
     assert done.returncode == 1, done.stdout + done.stderr
     (said,) = [line for line in done.stdout.splitlines() if line.startswith("warning: ")]
-    assert re.match(r"warning: \d answers are wrong; the first is that of task \d from cloud: ", said)
+    assert re.match(r"warning: answers that are wrong: \d; the first is that of task \d from cloud: ", said)
     assert said.endswith(NEEDS_SAME)
     (tmp_path / "halves.py").write_text(module + INPUTS)
     done = run(tmp_path, "clouds.toml")

@@ -155,12 +155,15 @@ def test_an_unavailable_site_gets_no_task(make: Make) -> None:
     assert len(cloud.tasks) == 1
 
 
-def test_a_wait_for_sites_that_is_no_number_ends_at_once(make: Make) -> None:
-    """It says why a site is absent, and does not wait for ever."""
+@pytest.mark.parametrize("timeout_s", [-1.0, float("nan"), float("inf"), "5", True])
+def test_a_wait_for_sites_lasts_a_time_that_is_possible(make: Make, timeout_s: float) -> None:
+    """It does not wait for ever. With 0 it says at once why a site is absent."""
     cloud = cloud_answers()
     cloud.absent = "not connected"
     with make(cloud, OnboardRunner()) as offload:
-        assert offload.wait_for_sites(add_one, float("nan"))[CLOUD] == "not connected"
+        with pytest.raises(ConfigError, match="must be a number above 0"):
+            offload.wait_for_sites(add_one, timeout_s)
+        assert offload.wait_for_sites(add_one, 0)[CLOUD] == "not connected"
 
 
 def test_where_pins_a_call(make: Make) -> None:
