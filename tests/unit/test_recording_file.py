@@ -39,7 +39,7 @@ def test_a_long_gap_is_cut_out(tmp_path: Path, caplog: pytest.LogCaptureFixture)
     assert list(found.times) == pytest.approx([0, 0.5, 1.0, 1.5, 1.5 + GAP_S, 2.0 + GAP_S])
     assert (found.gaps, found.cut_s) == (1, pytest.approx(29.5))
     assert caplog.messages == [
-        f"{file}: gaps of more than 10 s that were cut out: 1, of 29.5 s in all; remedy: add rows if it was silent"
+        f"{file}: gaps of more than 10 s that were cut out: 1, of 29.5 s; remedy: add rows if it was silent"
     ]
 
 

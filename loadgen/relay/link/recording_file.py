@@ -80,7 +80,7 @@ def _table(path: Path, lines: Sequence[str], file: str, sha256: str) -> Recordin
     times, gaps, cut_s = _without_gaps(found)
     if gaps:
         log.warning(
-            "%s: gaps of more than %g s that were cut out: %d, of %.1f s in all; remedy: add rows if it was silent",
+            "%s: gaps of more than %g s that were cut out: %d, of %.1f s; remedy: add rows if it was silent",
             *(path, GAP_S, gaps, cut_s),
         )
     return Recording(file, sha256, times, columns, gaps=gaps, cut_s=cut_s)
