@@ -7,7 +7,6 @@ import math
 from bisect import bisect_left
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 from offboard.common.tasks import Size
@@ -16,8 +15,6 @@ from offboard.robot_client.sites.runner import NOTHING, ONBOARD, UNMEASURED, Con
 
 ERRORS_MIN = 10  # with fewer errors, they are taken to be normal, and the spread counts as one of them
 SPREADS_90 = 1.645  # standard deviations on each side that hold 90 % of the times, and above which 5 % are
-TAIL_SHARE = 0.2  # of the errors, the largest ones: they say how much longer a late task may take
-BEYOND = 0.25  # of the distance from the median to the largest error: later than that, no task has ended
 
 
 @dataclass
@@ -32,24 +29,6 @@ class PredictionErrors:
     scores: tuple[float, ...] = ()
     usual_s: float = 0.0
     stopped: tuple[float, ...] = ()
-
-    def overdue(self, predicted_s: float, worth_s: float, error_s: float = 0.0) -> float | None:
-        """How old, in seconds, a running task is when it should still need more than `worth_s`."""
-        scores, count = self.scores, len(self.scores)
-        if count < ERRORS_MIN:
-            return None
-        unit, largest = unit_s(predicted_s, self.usual_s), scores[-1]
-        first = count - round(TAIL_SHARE * count)
-        score = largest + BEYOND * (largest - scores[count // 2])  # a later task may never end
-        # Otherwise no task in the tail took so much longer than another one.
-        if unit * (largest - scores[first]) > worth_s:
-            latest, longer = self._late
-            if unit * longer > worth_s:
-                score = latest
-        beyond_s = unit * score
-        if error_s:
-            beyond_s = widened_s(beyond_s, error_s)
-        return max(0.0, predicted_s + beyond_s)
 
     def share_above(
         self, predicted_s: float, limit_s: float, spread_s: float | None = None, error_s: float = 0.0
@@ -109,19 +88,6 @@ class PredictionErrors:
         unit = unit_s(predicted_s, self.usual_s)
         squares = math.fsum((unit * score) ** 2 for score in self.scores)
         return math.sqrt((squares + spread_s * spread_s) / (len(self.scores) + 1))
-
-    @cached_property
-    def _late(self) -> tuple[float, float]:
-        """The score in the tail after which tasks took longest in the mean, and how much longer that was."""
-        first = len(self.scores) - round(TAIL_SHARE * len(self.scores))
-        latest = total = self.scores[-1]
-        longest = -math.inf
-        for n, score in enumerate(reversed(self.scores[first:-1]), 1):
-            longer = total / n - score
-            if longer >= longest:
-                latest, longest = score, longer
-            total += score
-        return latest, longest
 
 
 NO_ERRORS = PredictionErrors()
@@ -195,15 +161,6 @@ class Outlook(NamedTuple):
     def given_up(self) -> bool:
         """Whether all that is known of the site is that its runs fail, as many as a warm-up has."""
         return self.predicted_s is None and self.failures >= WARM_UP
-
-    def overdue_s(self, worth_s: float) -> float | None:
-        """How old, in seconds, a running task is when it should still need more than `worth_s`."""
-        if self.predicted_s is None:
-            return None
-        after_s = self.errors.overdue(self.predicted_s, worth_s, self.error_s or 0.0)
-        if after_s is not None:
-            return after_s
-        return None if self.spread_s is None else self.predicted_s + SPREADS_90 * self.spread_s
 
 
 class Forecast(NamedTuple):

@@ -8,6 +8,8 @@ import pytest
 
 from offboard.robot_client.learning.conformal import COVERAGE, ERRORS_MAX, Conformal
 from offboard.robot_client.policies.forecast import ERRORS_MIN, NO_ERRORS, student_90
+from offboard.robot_client.policies.hedge import late_after_s
+from tests.outlooks import known
 
 TASKS = 6_000
 
@@ -92,7 +94,7 @@ def test_a_stopped_task_counts_in_the_tail_and_not_in_the_hedge() -> None:
     assert whole.errors.below(1.0, 0.95) == pytest.approx(1.05, abs=0.01)
     assert hedged.errors.below(1.0, 0.95) == pytest.approx(2.0, abs=0.1)
     assert len(hedged.errors.stopped) == 12  # those since the oldest of the 100 errors
-    due_s = hedged.errors.overdue(1.0, 0.5)
+    due_s = late_after_s(known(1.0, errors=hedged.errors), 0.5)
     assert due_s is not None
     assert due_s < 1.2
 
@@ -214,20 +216,6 @@ def test_the_share_above_a_limit_is_that_of_the_errors() -> None:
     for limit, share in ((0.3, 1.0), (0.5, 0.5), (0.55, 0.25), (0.7, 0.0)):
         assert errors.share_above(0.5, limit) == pytest.approx(share, abs=0.1)
     assert 0 < (errors.share_above(0.5, 50.0) or 0) < 0.01, "nothing is certain"
-
-
-def test_a_task_is_overdue_when_waiting_costs_more_than_the_other_site() -> None:
-    """Most tasks take about 1 s, some 20 s: a task is overdue soon after 1 s, unless 60 s are at stake."""
-    conformal, random = Conformal(), Random(1)
-    for n in range(100):
-        conformal.learn(1.0, 20.0 if n % 25 == 24 else random.uniform(0.8, 1.2))
-    after_s = conformal.errors.overdue(1.0, worth_s=2.0)
-    assert after_s is not None
-    assert 1.15 < after_s < 1.5
-    at_last_s = conformal.errors.overdue(1.0, worth_s=60.0)
-    assert at_last_s is not None
-    assert at_last_s > 20.0, "no known task needed 60 s more"
-    assert NO_ERRORS.overdue(1.0, 2.0) is None
 
 
 def test_units_do_not_matter() -> None:

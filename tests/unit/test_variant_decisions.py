@@ -20,6 +20,7 @@ from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Decision, Forecast, Hedge, Outlook, Probe, objectives
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.forecast import WHOLE, PredictionErrors, Quality
+from offboard.robot_client.policies.hedge import late_after_s
 from offboard.robot_client.policies.objectives import Deadline, Expected, Mean, Tail, TimeAndSpending
 from offboard.robot_client.records.trace import Record, as_dict
 from offboard.robot_client.settings import Settings
@@ -163,7 +164,7 @@ def test_a_hedge_with_a_worse_variant_starts_later() -> None:
         }
         second = decide("hedge:cloud", sites, duplicates=5.0).second
         assert isinstance(second, Hedge)
-        assert second.after_s == sites[CLOUD].overdue_s(0.35 + lost_s - 0.1)
+        assert second.after_s == late_after_s(sites[CLOUD], 0.35 + lost_s - 0.1)
         due_s.append(second.after_s)
     assert due_s[0] < due_s[1]
 
