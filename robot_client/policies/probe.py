@@ -6,6 +6,7 @@
 from offboard.common.variants import group_of
 from offboard.robot_client.policies.decision import Decision, Policy, Probe, pairs
 from offboard.robot_client.policies.forecast import Forecast
+from offboard.robot_client.sites.runner import ONBOARD
 
 PROBE_EVERY = 20  # tasks that a site has not run
 
@@ -16,6 +17,9 @@ class WithProbes:
     Equal servers of a group take turns, so that together they are not probed more often than one server.
     A probe makes no caller wait: the first answer is used, and both times are learnt. A silent site is not
     probed, because its first answered heartbeat says more.
+
+    Onboard is probed only once the tasks since then have also taken PROBE_EVERY times as long as it needs:
+    its run slows the answers of the others down.
     """
 
     def __init__(self, inner: Policy) -> None:
@@ -27,9 +31,12 @@ class WithProbes:
         if decision.both or decision.second or forecast.duplicates < 2:  # one is left for a hedge
             return decision
         turns = 1 + len(forecast.sites) - len({group_of(site) for site in forecast.sites})
-        stalest, age = None, turns * PROBE_EVERY - 1
+        chosen, due = forecast.sites[decision.site], turns * PROBE_EVERY
+        stalest, age = None, due - 1
         for site, one in forecast.sites.items():
-            if one.age > age and site != decision.site and not (one.in_flight or one.condition.silent):
+            if one.age <= age or site == decision.site or one.in_flight or one.condition.silent:
+                continue
+            if site != ONBOARD or one.age * (chosen.predicted_s or 0.0) >= due * (one.predicted_s or 0.0):
                 stalest, age = site, one.age
         if stalest is None:
             return decision
