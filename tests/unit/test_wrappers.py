@@ -23,11 +23,16 @@ def test_a_site_without_tasks_is_probed(age: int, probed: bool) -> None:
     assert ("cloud is probed" in decision.reason) == probed
 
 
-def test_a_slow_robot_is_probed_as_often_as_a_server() -> None:
-    """This holds however slow onboard is."""
-    for age, probed in ((PROBE_EVERY - 1, False), (PROBE_EVERY, True)):
-        sites = {ONBOARD: known(2.0, age=age), CLOUD: known(0.1)}
+@pytest.mark.parametrize("slower", [0.5, 1.0, 4.0])
+def test_a_slow_robot_is_probed_as_often_as_it_has_the_time(slower: float) -> None:
+    """Onboard runs at most a twentieth of the time for probes; of a server, only tasks are counted."""
+    due = max(PROBE_EVERY, round(slower * PROBE_EVERY))
+    for age, probed in ((due - 1, False), (due, True)):
+        sites = {ONBOARD: known(0.5 * slower, age=age), CLOUD: known(0.5, cost=0.0)}
         assert (decide("probe:greedy", sites).second == Probe(ONBOARD)) == probed
+    for age, probed in ((PROBE_EVERY - 1, False), (PROBE_EVERY, True)):
+        sites = {ONBOARD: known(0.1), CLOUD: known(0.1 + slower, age=age)}
+        assert (decide("probe:greedy", sites).second == Probe(CLOUD)) == probed
 
 
 def test_a_probe_leaves_one_second_run_for_hedges() -> None:
@@ -70,7 +75,7 @@ def test_a_task_is_not_hedged_with_too_little_knowledge(sites: dict[str, Outlook
 
 def test_a_probe_goes_before_a_hedge() -> None:
     """If a site is due for a probe, it starts at once and is not planned as a hedge."""
-    sites = {ONBOARD: known(0.5, age=PROBE_EVERY), CLOUD: known(0.2)}
+    sites = {ONBOARD: known(0.4, age=2 * PROBE_EVERY), CLOUD: known(0.2)}
     assert decide("hedge:probe:greedy", sites).second == Probe(ONBOARD)
     second = decide("probe:hedge:greedy", sites).second
     assert second is not None
