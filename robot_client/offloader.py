@@ -211,7 +211,7 @@ class Offloader:
         batch = Batch(
             tasks,
             self._sites if where is None else (*sites_at(where, runners), ONBOARD)[:1],
-            predict=partial(self._expect_in_batch, budget_s, runners),
+            predict=partial(self._expect_in_batch, runners),
             run=partial(self._answer, where, budget_s),
             clock=self._clock,
             timeout_s=budget_s,
@@ -248,7 +248,7 @@ class Offloader:
         with self._lock:
             memory, now_s = self._memories.of(kind, runners), self._clock.now_s()
             sites = present_sites(runners, absent)
-            forecast = self._forecaster.forecast(memory, task, sites, timeout_s=self._timeout_s, now_s=now_s)
+            forecast = self._forecaster.forecast(memory, task, sites, now_s=now_s)
             if deadline_s is not None:
                 slowest_s = memory.slowest_onboard_s(task.size) if self._pairs else None
                 forecast = by_deadline(forecast, deadline_s, slowest_s=slowest_s)
@@ -326,7 +326,7 @@ class Offloader:
             self._allowance.begin(started_s)
             memory = self._memories.of(task.kind, runners)
             sites = present_sites(runners, absent)
-            forecast = self._forecaster.forecast(memory, task, sites, timeout_s=budget_s, now_s=started_s)
+            forecast = self._forecaster.forecast(memory, task, sites, now_s=started_s)
             if self._sites.changing:
                 self._sites.count_task(finishes_of(forecast), started_s)
             within_s = self._memories.deadline_s if deadline_s is None else deadline_s
@@ -389,13 +389,11 @@ class Offloader:
                 self._life.call_beside(partial(self._runs.measure, pending, site))
         return answer, record
 
-    def _expect_in_batch(
-        self, timeout_s: float, runners: Mapping[str, Runner], task: Task, own: Mapping[str, int]
-    ) -> Forecast:
+    def _expect_in_batch(self, runners: Mapping[str, Runner], task: Task, own: Mapping[str, int]) -> Forecast:
         """What a batch is placed by; `own` holds how many of its tasks each site has."""
         runners = {**runners, **self._sites.now}  # a batch may be pinned to a site that has left
         absent = absent_sites(runners, task.kind) if len(own) > 1 else {}
         counts = {runners[one]: n for one, n in own.items() if one in runners and one not in absent}
         with self._lock:
             memory = self._memories.of(task.kind, runners)
-            return self._forecaster.forecast_in_batch(memory, task, counts, timeout_s=timeout_s)
+            return self._forecaster.forecast_in_batch(memory, task, counts)

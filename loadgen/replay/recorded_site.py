@@ -102,5 +102,8 @@ class RecordedSite:
         """A robot that gets no answer looks whether the site still answers heartbeats."""
         del self._runs[task_id]
         if not execution.ok:
-            self._condition = self._condition._replace(silent=run.recorded.held_up, wait_s=0.0)
+            silent = run.recorded.held_up  # for as long as the run took, at least
+            self._condition = self._condition._replace(
+                silent=silent, wait_s=run.recorded.seconds if silent else 0.0
+            )
         run.future.set_result(execution)

@@ -177,6 +177,6 @@ def predict(rows: Rows, length: int, *, predictor: str, feedback: str, seed: int
 
 
 def _seconds(memory: SiteMemory, size: float) -> float:
-    outlook = memory.outlook(size, UNMEASURED, in_flight=0, timeout_s=0.0, sending=NOTHING)
+    outlook = memory.outlook(size, UNMEASURED, in_flight=0, sending=NOTHING)
     assert outlook.predicted_s is not None, "a predictor that has learnt something can predict"
     return outlook.predicted_s

@@ -21,7 +21,7 @@ class Forecaster:
         self._allowance = allowance
 
     def forecast(
-        self, memory: KindMemory, task: Task, sites: Mapping[str, Runner], *, timeout_s: float, now_s: float
+        self, memory: KindMemory, task: Task, sites: Mapping[str, Runner], *, now_s: float
     ) -> Forecast:
         """The forecast of one task on these sites, behind all runs that are under way."""
         amount, outlooks, packs = memory.amount(task.size), {}, task.kind.pack is not None
@@ -33,16 +33,13 @@ class Forecaster:
                 self._behind(runner, in_flight, now_s) if known.measured else UNMEASURED,
                 in_flight=in_flight,
                 under_way=in_flight > 0 and self._flights.has(site, task.kind.name),
-                timeout_s=timeout_s,
                 sending=sending,
                 # Most tasks have nothing to make smaller, so that is asked first.
                 packing=memory.packing.plan(sending, known.link_s) if packs or sending.large else None,
             )
         return self._with_allowance(memory, task.size, outlooks)
 
-    def forecast_in_batch(
-        self, memory: KindMemory, task: Task, own: Mapping[Runner, int], *, timeout_s: float
-    ) -> Forecast:
+    def forecast_in_batch(self, memory: KindMemory, task: Task, own: Mapping[Runner, int]) -> Forecast:
         """The forecast of a task in a batch, without the wait for the batch's own tasks.
 
         `own` holds the runners that may be used, and how many tasks of the batch each of them has.
@@ -55,7 +52,6 @@ class Forecaster:
                 _apart_from(runner, count) if known.measured else UNMEASURED,
                 in_flight=count,
                 under_way=count > 0,
-                timeout_s=timeout_s,
                 sending=sending,
                 packing=memory.packing.plan(sending, known.link_s) if packs or sending.large else None,
             )

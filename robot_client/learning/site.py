@@ -94,7 +94,6 @@ class SiteMemory:
         *,
         in_flight: int,
         under_way: bool = False,
-        timeout_s: float,
         sending: Sending,
         packing: Packing | None = None,
     ) -> Outlook:
@@ -120,8 +119,6 @@ class SiteMemory:
         seconds = found.seconds + condition.wait_s
         if packing is not None and self._parts is not None:  # all others learn it with the rest of the time
             seconds += packing.seconds
-        if condition.silent:
-            seconds = max(seconds, timeout_s)
         spread_s, error_s = found.spread_s, found.error_s or 0.0
         low_s, high_s = self._conformal.interval(seconds, spread_s, error_s) or (None, None)
         energy, errors, quality = self._energy, self._conformal.errors, self._quality

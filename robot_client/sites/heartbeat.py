@@ -134,8 +134,9 @@ class Heartbeat:
         if self._oldest_s > now_s:
             return self._usual
         unheard_s = self._unheard_s(now_s)
-        late = self._smooth_s > 0 and unheard_s > max(self._smooth_s + SLACK_S, self._limit_s)
-        return self._condition(silent=self._silent(now_s), wait_s=unheard_s if late else 0.0)
+        silent = self._silent(now_s)
+        late = silent or (self._smooth_s > 0 and unheard_s > max(self._smooth_s + SLACK_S, self._limit_s))
+        return self._condition(silent=silent, wait_s=unheard_s if late else 0.0)
 
     def _condition(self, *, silent: bool = False, wait_s: float = 0.0) -> Condition:
         queue, load, capacity = self._report

@@ -48,7 +48,7 @@ class Workload:
         return self._fixed_s + self._unit_s * size * (math.log(size) if self._with_log else 1.0)
 
     def outlook(self, size: float) -> Outlook:
-        return self._memory.outlook(size, UNMEASURED, in_flight=0, timeout_s=2.0, sending=NOTHING)
+        return self._memory.outlook(size, UNMEASURED, in_flight=0, sending=NOTHING)
 
     def learn(self, tasks: int) -> None:
         for _ in range(tasks):

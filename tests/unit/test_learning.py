@@ -78,7 +78,7 @@ class Scene:
 
     def predicted_s(self) -> float:
         """What the cloud is expected to take, while nothing is measured of it."""
-        found = self.site().outlook(1.0, UNMEASURED, in_flight=0, timeout_s=2.0, sending=Sending(1000))
+        found = self.site().outlook(1.0, UNMEASURED, in_flight=0, sending=Sending(1000))
         assert found.predicted_s is not None
         return found.predicted_s
 

@@ -139,9 +139,7 @@ def memory(predictor: str) -> KindMemory:
 
 
 def outlook(of: KindMemory, packing: Packing | None) -> Outlook:
-    return of.site(CLOUD).outlook(
-        1.0, UNMEASURED, in_flight=0, timeout_s=2.0, sending=Sending(SIZE), packing=packing
-    )
+    return of.site(CLOUD).outlook(1.0, UNMEASURED, in_flight=0, sending=Sending(SIZE), packing=packing)
 
 
 def taught(predictor: str, pack_s: float) -> KindMemory:

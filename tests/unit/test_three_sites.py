@@ -61,7 +61,8 @@ def test_the_best_living_site_is_used_soon_after_each_change(
         for fail, _ in PHASES:
             failing = set(fail)
             for one in servers:
-                one.measured = Condition(SITES[one.site][0], silent=heartbeats and one.site in failing)
+                silent = heartbeats and one.site in failing
+                one.measured = Condition(SITES[one.site][0], silent=silent, wait_s=float(silent))
             for _ in range(TASKS):
                 offload(sized, random.uniform(0.8, 1.2))
     check(records, within)
