@@ -23,7 +23,7 @@ STEPS = FOLDER / "steps.toml"
 PART = "{part}"  # in a command: the name of the part
 OUT = "{out}"  # in a command: the folder that belongs to the step or part
 WORK = Path("out/figures/work")
-SCENARIOS = Path("loadgen/scenarios")
+SCENARIOS = (Path("loadgen/scenarios"), Path("loadgen/links"))
 DATASETS = ("paper", "congested", "apriltags")  # in the order of the page
 SOAK = "soak"  # half an hour: `make chaos` plays it
 
@@ -114,7 +114,7 @@ class Unit:
 
     def _scenarios(self, root: Path) -> Iterator[str]:
         for pattern in map(self._named, self.step.scenarios):
-            paths = sorted((root / SCENARIOS).glob(f"{pattern}.toml"))
+            paths = sorted(path for folder in SCENARIOS for path in (root / folder).glob(f"{pattern}.toml"))
             if not paths:
                 raise OffloadError(f"{STEPS}: {self.name}: there is no scenario {pattern}")
             yield from (path.relative_to(root).as_posix() for path in paths)
