@@ -109,9 +109,9 @@ class Condition(NamedTuple):
     round_trip_s: of its heartbeats; None if it has none.
     silent: its heartbeats go unanswered.
     queue: tasks that wait there, in the server's last report.
-    load: share of the robot's CPU that other programs take, 0 to 1. For a server it is set only while the
-        robot's load is so high that it changes the times measured for that server.
-    wait_s: how long until the site can begin, because of the robot's own tasks or a link that stalls.
+    load: share of the robot's CPU that other programs take, 0 to 1; 0 for a server.
+    wait_s: how long until the site can begin, because of the robot's own tasks, or of a link that stalls or
+        is silent: as long again as it has been so far.
     capacity: share of one CPU at full clock that a task may use there, above 0 to 1.
     server_load: share of the server's CPU that other programs take, in its last report.
     """
