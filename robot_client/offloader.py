@@ -87,8 +87,8 @@ class Offloader:
         self._clock = clock or SystemClock()
         self._flights = Flights()
         sites.in_flight = self._flights.count
-        self._forecaster = Forecaster(self._flights, self._allowance)
-        self._learner = Learner(self._allowance)
+        self._forecaster = Forecaster(self._flights, self._allowance, memories.weighing)
+        self._learner = Learner(self._allowance, memories.weighing)
         self._crossing = CrossingCheck()
         self._lock = threading.Lock()
         self._life = Lifetime(sites, memories, self._lock)

@@ -10,15 +10,17 @@ from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.runs_in_flight import Flights
 from offboard.robot_client.policies import Forecast, Outlook
 from offboard.robot_client.policies.allowance import Allowance
+from offboard.robot_client.policies.objectives import Weighing
 from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Runner
 
 
 class Forecaster:
     """Makes forecasts. Called under the offloader's lock."""
 
-    def __init__(self, flights: Flights, allowance: Allowance) -> None:
+    def __init__(self, flights: Flights, allowance: Allowance, weighing: Weighing) -> None:
         self._flights = flights
         self._allowance = allowance
+        self._weighing = weighing
 
     def forecast(
         self, memory: KindMemory, task: Task, sites: Mapping[str, Runner], *, now_s: float
@@ -37,7 +39,7 @@ class Forecaster:
                 # Most tasks have nothing to make smaller, so that is asked first.
                 packing=memory.packing.plan(sending, known.link_s) if packs or sending.large else None,
             )
-        return self._with_allowance(memory, task.size, outlooks)
+        return self._finished(memory, task.size, outlooks)
 
     def forecast_in_batch(self, memory: KindMemory, task: Task, own: Mapping[Runner, int]) -> Forecast:
         """The forecast of a task in a batch, without the wait for the batch's own tasks.
@@ -55,15 +57,15 @@ class Forecaster:
                 sending=sending,
                 packing=memory.packing.plan(sending, known.link_s) if packs or sending.large else None,
             )
-        return self._with_allowance(memory, task.size, outlooks)
+        return self._finished(memory, task.size, outlooks)
 
-    def _with_allowance(self, memory: KindMemory, size: Size, outlooks: Mapping[str, Outlook]) -> Forecast:
+    def _finished(self, memory: KindMemory, size: Size, outlooks: Mapping[str, Outlook]) -> Forecast:
         allowance = self._allowance
         duplicates = allowance.duplicates if memory.kind.duplicate else 0.0
-        forecast = Forecast(size, outlooks, memory.last_site, duplicates)
-        if not allowance.capped:
-            return forecast
-        return forecast._replace(bytes_left=allowance.bytes_left, joules_left=allowance.joules_left)
+        forecast = Forecast(
+            size, outlooks, memory.last_site, duplicates, allowance.bytes_left, allowance.joules_left
+        )
+        return self._weighing.weighed(forecast, capped=allowance.capped)
 
     def _behind(self, runner: Runner, in_flight: int, now_s: float) -> Condition:
         """The condition of a site behind the runs under way there.

@@ -13,9 +13,7 @@ from offboard.common.variants import IN_GROUP, group_of
 from offboard.robot_client.learning.packing import PackingMemory
 from offboard.robot_client.learning.shared_work import SharedWork
 from offboard.robot_client.learning.site import SiteMemory
-from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.forecast import ERRORS_MIN, WHOLE, Quality
-from offboard.robot_client.policies.objectives import Objective
 from offboard.robot_client.predictors import Predictor
 from offboard.robot_client.predictors.base import REMEMBERED, WARM_UP
 from offboard.robot_client.sites.runner import ONBOARD, Execution
@@ -36,8 +34,6 @@ class KindMemory:
         kind: Kind,
         make: Callable[[], Predictor],
         *,
-        objective: Objective,
-        energy: Energy,
         shared_work: bool,
         measured: bool,
         s_per_quality: float,
@@ -48,8 +44,6 @@ class KindMemory:
         self.kind = kind
         self.packing = PackingMemory(packs=kind.pack is not None)
         self._make = make
-        self._objective = objective
-        self._energy = energy
         self._measured = measured
         self._s_per_quality = s_per_quality
         self._work = SharedWork() if shared_work and kind.work is not None else None
@@ -69,8 +63,6 @@ class KindMemory:
             found = self.sites[name] = SiteMemory(
                 name,
                 self._make,
-                self._objective,
-                self._energy,
                 measured=self._measured,
                 quality=self._quality(name),
             )

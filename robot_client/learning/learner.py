@@ -15,6 +15,7 @@ from offboard.robot_client.learning.regret import RegretEstimate
 from offboard.robot_client.learning.savings import Savings, SavingsEstimate
 from offboard.robot_client.policies import ALONE, Decision, Forecast, Probe
 from offboard.robot_client.policies.allowance import Allowance
+from offboard.robot_client.policies.objectives import Weighing
 from offboard.robot_client.sites.runner import ONBOARD, Execution, Runner
 
 
@@ -58,10 +59,11 @@ class PendingTask:
 class Learner:
     """Teaches the memories of all kinds. Called under the offloader's lock."""
 
-    def __init__(self, allowance: Allowance) -> None:
+    def __init__(self, allowance: Allowance, weighing: Weighing) -> None:
         self.regret = RegretEstimate()
         self._savings: dict[str, SavingsEstimate] = {}  # by kind; empty unless the policy only observes
         self._allowance = allowance
+        self._weighing = weighing
 
     def learn(self, pending: PendingTask, executions: Sequence[Execution]) -> None:
         """Learn what had ended when the task was answered."""
@@ -83,7 +85,7 @@ class Learner:
     def _learn_one(
         self, pending: PendingTask, execution: Execution, work: float | None, *, beside: bool | None = None
     ) -> None:
-        self._spend(pending, execution)
+        self._spend(execution)
         site, decision = execution.site, pending.decision
         memory = pending.memory.site(site)
         if beside is None:
@@ -141,11 +143,11 @@ class Learner:
         """The present estimate for each kind."""
         return {kind: one.estimate() for kind, one in self._savings.items()}
 
-    def _spend(self, pending: PendingTask, execution: Execution) -> None:
+    def _spend(self, execution: Execution) -> None:
         if self._allowance.capped:
             site = execution.site
             moved = 0 if site == ONBOARD else execution.bytes_out + execution.bytes_in
-            self._allowance.spend(moved, pending.memory.site(site).joules(execution))
+            self._allowance.spend(moved, self._weighing.joules(execution))
 
 
 def _held_up(runner: Runner) -> bool:

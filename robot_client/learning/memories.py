@@ -11,7 +11,7 @@ from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.memory_file import KeptKind
 from offboard.robot_client.learning.store import Store
 from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.objectives import S_PER_QUALITY, Deadline, Mean, Objective
+from offboard.robot_client.policies.objectives import S_PER_QUALITY, Deadline, Mean, Objective, Weighing
 from offboard.robot_client.predictors import Predictor
 
 Snapshot = dict[str, KeptKind]
@@ -44,8 +44,7 @@ class Memories:
         self._predictor = predictor
         self._measured = measured
         self._shared_work = shared_work
-        self._objective = objective or Mean()
-        self._energy = energy or Energy()
+        self.weighing = Weighing(objective or Mean(), energy or Energy())
         # The objective `deadline` weighs quality against the chance to miss it, not against seconds.
         self._s_per_quality = 0.0 if isinstance(objective, Deadline) else s_per_quality
         self.deadline_s = objective.deadline_s if isinstance(objective, Deadline) else None
@@ -59,8 +58,6 @@ class Memories:
             found = self._kinds[kind.name] = KindMemory(
                 kind,
                 self._predictor,
-                objective=self._objective,
-                energy=self._energy,
                 shared_work=self._shared_work,
                 measured=self._measured,
                 s_per_quality=self._s_per_quality,

@@ -12,9 +12,7 @@ from dataclasses import dataclass
 from offboard.common.errors import CannotCross, Overtaken, SiteClosed, TaskError
 from offboard.common.tasks import Size, first_number
 from offboard.robot_client.learning.conformal import ERRORS_MAX, Conformal
-from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.forecast import Outlook, Packing, Quality
-from offboard.robot_client.policies.objectives import Expected, Objective
 from offboard.robot_client.predictors import Prediction, Predictor
 from offboard.robot_client.predictors.base import REMEMBERED
 from offboard.robot_client.predictors.least_squares import LeastSquares
@@ -64,8 +62,6 @@ class SiteMemory:
         self,
         site: str,
         make: Callable[[], Predictor],
-        objective: Objective,
-        energy: Energy,
         *,
         measured: bool,
         quality: Quality,
@@ -81,8 +77,6 @@ class SiteMemory:
         self._site = site
         self._failures = 0
         self._conformal = Conformal()
-        self._objective = objective
-        self._energy = energy
         self._quality = quality
         self._bytes_in = RunningMean()
         self._cpu_share = RunningMean()  # CPU seconds in each second of a run
@@ -121,16 +115,11 @@ class SiteMemory:
             seconds += packing.seconds
         spread_s, error_s = found.spread_s, found.error_s or 0.0
         low_s, high_s = self._conformal.interval(seconds, spread_s, error_s) or (None, None)
-        energy, errors, quality = self._energy, self._conformal.errors, self._quality
-        onboard_s = found.seconds * (self._cpu_share.value or 1.0)
-        joules = energy.onboard_j(onboard_s) if self._site == ONBOARD else energy.remote_j(seconds, moved)
-        expected = Expected(seconds, spread_s, joules, quality, bytes=moved, error_s=error_s)
-        cost = self._objective.cost(expected, errors)
         # All fields in their order: with keywords, it takes three times as long.
         return Outlook._make((
             seconds, spread_s, predictor.full, self.age, self._failures, len(predictor),
-            low_s, high_s, found.error_s, cost, in_flight, moved, joules, condition,
-            errors, quality, packing, sending, under_way, None,
+            low_s, high_s, found.error_s, in_flight, moved, self._cpu_share.value or 1.0, condition,
+            self._conformal.errors, self._quality, packing, sending, under_way, None, 0.0, None,
         ))  # fmt: skip
 
     def slowest_s(self, amount: Size | None) -> float:
@@ -204,12 +193,6 @@ class SiteMemory:
             self._failures = 0 if one.ok else self._failures + 1
             self._take(one)
         self.age = age
-
-    def joules(self, execution: Execution) -> float:
-        """What an execution took from the battery, in joules."""
-        if self._site == ONBOARD:
-            return self._energy.onboard_j(execution.cpu_s or execution.run_s or execution.seconds)
-        return self._energy.remote_j(execution.seconds, execution.bytes_out + execution.bytes_in)
 
     def _predict(self, amount: Size, moved: float, condition: Condition) -> Prediction | None:
         if self._parts is not None:

@@ -124,13 +124,14 @@ class Outlook(NamedTuple):
     `error_s`: the standard error of the prediction itself. `low_s`, `high_s`: its 90 % interval.
     `full`: the warm-up of the predictor is over. `observations`: how many the prediction rests on.
     `age`: tasks of this kind since the site last ran one. `failures`: failed runs in a row.
-    `cost`: what the objective makes of the outlook; less is better.
     `in_flight`: tasks of any kind that run there now. `under_way`: one of this kind is among them.
-    `bytes`, `joules`: what running the task there should take.
+    `bytes`: what running the task there should move. `cpu_share`: CPU seconds in each second of a run there.
     `condition`: what was measured of the site. `errors`: how wrong its past predictions were.
     `quality`: of the variant that the site runs; WHOLE for a task without variants.
     `sending`: what a run there would send, and `packing`: what of it should be made smaller; None: nothing.
     `in_time`: the probability that a call sent there is answered by its deadline; None: it has none.
+    `joules`: what running the task there should take from the battery, if an objective or a cap asks for it.
+    `cost`: what the objective makes of all this; less is better. None: it is the expected time.
 
     Build it with keywords. It is a named tuple because every task needs one for each site, and a frozen
     dataclass takes twice as long to build.
@@ -145,10 +146,9 @@ class Outlook(NamedTuple):
     low_s: float | None = None
     high_s: float | None = None
     error_s: float | None = None
-    cost: float | None = None
     in_flight: int = 0
     bytes: float = 0.0
-    joules: float = 0.0
+    cpu_share: float = 1.0
     condition: Condition = UNMEASURED
     errors: PredictionErrors = NO_ERRORS
     quality: Quality = WHOLE
@@ -156,6 +156,8 @@ class Outlook(NamedTuple):
     sending: Sending = NOTHING
     under_way: bool = False
     in_time: float | None = None
+    joules: float = 0.0
+    cost: float | None = None
 
     @property
     def given_up(self) -> bool:
@@ -224,8 +226,7 @@ def cheapest(costs: Mapping[str, float]) -> str:
 def costs_of(forecast: Forecast) -> dict[str, float]:
     """The cost of each site."""
     return {
-        site: _cost_without_objective(one) if one.cost is None else one.cost
-        for site, one in forecast.sites.items()
+        site: _expected_cost(one) if one.cost is None else one.cost for site, one in forecast.sites.items()
     }
 
 
@@ -243,8 +244,11 @@ def home(forecast: Forecast) -> str:
     return ONBOARD if ONBOARD in forecast.sites else cheapest(costs_of(forecast))
 
 
-def _cost_without_objective(outlook: Outlook) -> float:
-    """An unknown site costs nothing, so that it is tried, unless it is silent or was given up."""
+def _expected_cost(outlook: Outlook) -> float:
+    """The expected time and the worth of the lost quality, in seconds.
+
+    An unknown site costs nothing, so that it is tried, unless it is silent or was given up.
+    """
     if outlook.predicted_s is None:
         return math.inf if outlook.condition.silent or outlook.given_up else 0.0
-    return outlook.predicted_s
+    return outlook.predicted_s + outlook.quality.lost_s

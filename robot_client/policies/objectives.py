@@ -1,6 +1,6 @@
 """Objectives: what a policy makes small, as a cost for each site. Less is better.
 
-The joules that an objective weighs are estimated in `energy`.
+The energy that joules are estimated with is in `energy`.
 """
 
 import math
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from offboard.common.errors import ConfigError
+from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.forecast import (
     SPREADS_90,
     WHOLE,
@@ -17,7 +18,7 @@ from offboard.robot_client.policies.forecast import (
     Quality,
     widened_s,
 )
-from offboard.robot_client.sites.runner import ONBOARD
+from offboard.robot_client.sites.runner import ONBOARD, Execution
 
 S_PER_QUALITY = 1.0  # seconds that the whole quality is worth
 FEW_TIMES = 3.0  # predicted times that a task onboard may take before a deadline, by few runs
@@ -103,6 +104,41 @@ class TimeAndSpending:
         return expected.seconds + spent_s + expected.quality.lost_s
 
 
+class Weighing:
+    """What tasks take from the battery, and what the objective makes of a forecast."""
+
+    def __init__(self, objective: Objective, energy: Energy) -> None:
+        self.energy = energy
+        self._objective = None if isinstance(objective, Mean) else objective  # a cost of None means the same
+
+    def weighed(self, forecast: Forecast, *, capped: bool) -> Forecast:
+        """The same forecast with the cost of each site, and with its joules if the tasks are `capped`."""
+        objective = self._objective
+        if objective is None and not capped:
+            return forecast
+        sites = {}
+        for site, one in forecast.sites.items():
+            if one.predicted_s is None:
+                sites[site] = one
+                continue
+            known = one._replace(joules=self._expected_j(site, one))
+            cost = None if objective is None else objective.cost(_expected(known), known.errors)
+            sites[site] = known._replace(cost=cost)
+        return forecast._replace(sites=sites)
+
+    def joules(self, execution: Execution) -> float:
+        """What an execution took, in joules."""
+        if execution.site == ONBOARD:
+            return self.energy.onboard_j(execution.cpu_s or execution.run_s or execution.seconds)
+        return self.energy.remote_j(execution.seconds, execution.bytes_out + execution.bytes_in)
+
+    def _expected_j(self, site: str, one: Outlook) -> float:
+        assert one.predicted_s is not None
+        if site == ONBOARD:
+            return self.energy.onboard_j((one.predicted_s - one.condition.wait_s) * one.cpu_share)
+        return self.energy.remote_j(one.predicted_s, one.bytes)
+
+
 def by_deadline(forecast: Forecast, deadline_s: float, *, slowest_s: float | None) -> Forecast:
     """The same forecast, in which the costs are those of a call with a deadline.
 
@@ -148,7 +184,7 @@ def _missed(one: Outlook, within_s: float) -> float | None:
 
 def _expected(one: Outlook) -> Expected:
     assert one.predicted_s is not None
-    return Expected(one.predicted_s, one.spread_s, one.joules, one.quality, error_s=one.error_s or 0.0)
+    return Expected(one.predicted_s, one.spread_s, one.joules, one.quality, one.bytes, one.error_s or 0.0)
 
 
 OBJECTIVES = (MEAN := "mean", "p95", "deadline", "energy", "metered")

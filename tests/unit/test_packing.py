@@ -8,8 +8,7 @@ from offboard.common.tasks import kind_of, task
 from offboard.robot_client import predictors
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.packing import PackingMemory
-from offboard.robot_client.policies import Outlook, objectives
-from offboard.robot_client.policies.energy import Energy
+from offboard.robot_client.policies import Outlook
 from offboard.robot_client.policies.forecast import Packing
 from offboard.robot_client.policies.probe import PROBE_EVERY
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Execution, Packed, Sending
@@ -130,8 +129,6 @@ def memory(predictor: str) -> KindMemory:
     return KindMemory(
         kind_of(packing_plain),
         lambda: predictors.make(predictor, 50),
-        objective=objectives.Mean(),
-        energy=Energy(),
         shared_work=False,
         measured=predictor == predictors.PARTS,
         s_per_quality=1.0,

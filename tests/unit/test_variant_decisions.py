@@ -18,7 +18,6 @@ from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.store import Store
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Decision, Forecast, Hedge, Outlook, Probe, objectives
-from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.forecast import WHOLE, PredictionErrors, Quality
 from offboard.robot_client.policies.hedge import late_after_s
 from offboard.robot_client.policies.objectives import Deadline, Expected, Mean, Tail, TimeAndSpending
@@ -248,8 +247,6 @@ def remembered(path: Path, kind: Kind) -> tuple[KindMemory, Store]:
     memory = KindMemory(
         kind,
         lambda: predictors.make(predictors.LEAST_SQUARES, 50),
-        objective=Mean(),
-        energy=Energy(),
         shared_work=False,
         measured=False,
         s_per_quality=1.0,
