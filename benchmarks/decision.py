@@ -13,6 +13,8 @@ from offboard.robot_client import policies, predictors
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Policy, Probe
+from offboard.robot_client.predictors.base import Call, Run
+from offboard.robot_client.predictors.plain import model_of
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution, Sending
 
 CALLS = 2_000
@@ -167,19 +169,19 @@ def _predictors() -> Table:
     from river import linear_model
     from sklearn.linear_model import LinearRegression
 
-    least = predictors.make(predictors.LEAST_SQUARES, WINDOW)
-    parts = predictors.make(predictors.PARTS, WINDOW)
+    least = model_of(predictors.make(predictors.LEAST_SQUARES, WINDOW), remote=False)
+    parts = model_of(predictors.make(predictors.PARTS, WINDOW), remote=False)
     streaming = linear_model.LinearRegression()
     sizes, seconds = np.array(SIZES[:WINDOW]), np.array(SIZES[:WINDOW]) * 0.04
     for size in SIZES[:WINDOW]:
-        least.learn(size, 0.04 * size)
-        parts.learn(size, 0.04 * size)
+        for one in (least, parts):
+            one.learn(Call(size), Run(0.04 * size))
 
-    def ours(one: predictors.Predictor) -> Callable[[int], None]:
+    def ours(one: predictors.Model) -> Callable[[int], None]:
         def run(count: int) -> None:
             for size in SIZES[:count]:
-                one.learn(size, 0.04 * size)
-                one.predict(size)
+                one.learn(Call(size), Run(0.04 * size))
+                one.predict(Call(size))
 
         return run
 

@@ -5,9 +5,9 @@ Each class is the name of a predictor, as in `loadgen run calm --predictor bench
 """
 
 import math
-from typing import Any
 
-from offboard.robot_client.predictors.base import Prediction
+from offboard.common.tasks import first_number
+from offboard.robot_client.predictors.base import Call, Prediction, Run
 from offboard.robot_client.predictors.line import (
     ODD,
     PACE,
@@ -16,7 +16,7 @@ from offboard.robot_client.predictors.line import (
     Line,
 )
 from offboard.robot_client.predictors.parts import Parts
-from offboard.robot_client.sites.runner import UNMEASURED, Condition
+from offboard.robot_client.sites.runner import Condition
 
 
 class Switched(Line):
@@ -167,15 +167,16 @@ class Load(Parts):
 class Bound(Parts):
     """An answer that the robot may have read late counts as any other one."""
 
-    def learn(self, size: float, seconds: float, **more: Any) -> None:
-        super().learn(size, seconds, **{**more, "bound": False})
+    def learn(self, call: Call, run: Run) -> None:
+        super().learn(call, run._replace(bound=False))
 
 
 class Late(Parts):
     """A run that was given up after its predicted time says nothing."""
 
-    def learn_late(self, size: float, seconds: float, **more: Any) -> None:
-        pass
+    def learn(self, call: Call, run: Run) -> None:
+        if run.ended:
+            super().learn(call, run)
 
 
 class Work(Parts):
@@ -187,32 +188,29 @@ class Work(Parts):
 class _Without(Parts):
     """Parts that does not get some of what is told of a task; `_told` says what is left of it."""
 
-    def _told(self, **more: Any) -> dict[str, Any]:
+    def _told(self, call: Call) -> Call:
         raise NotImplementedError
 
-    def predict(self, size: float, ahead: int = 1, **more: Any) -> Prediction | None:
-        return super().predict(size, ahead, **self._told(**more))
+    def predict(self, call: Call) -> Prediction | None:
+        return super().predict(self._told(call))
 
-    def learn(self, size: float, seconds: float, **more: Any) -> None:
-        super().learn(size, seconds, **self._told(**more))
-
-    def learn_late(self, size: float, seconds: float, **more: Any) -> None:
-        super().learn_late(size, seconds, **self._told(**more))
+    def learn(self, call: Call, run: Run) -> None:
+        super().learn(self._told(call), run)
 
 
 class Payload(_Without):
     """All tasks move the same bytes."""
 
-    def _told(self, **more: Any) -> dict[str, Any]:
-        return {**more, "moved": 0.0}
+    def _told(self, call: Call) -> Call:
+        return call._replace(moved=0.0)
 
 
 class _WithoutCondition(_Without):
     def _seen(self, condition: Condition) -> Condition:
         raise NotImplementedError
 
-    def _told(self, **more: Any) -> dict[str, Any]:
-        return {**more, "condition": self._seen(more.get("condition", UNMEASURED))}
+    def _told(self, call: Call) -> Call:
+        return call._replace(condition=self._seen(call.condition))
 
 
 class Capacity(_WithoutCondition):
@@ -239,29 +237,23 @@ class RoundTrip(_WithoutCondition):
 class NetworkLine(Parts):
     """One line for all that a task takes beyond its queue and the round trip: run and network together."""
 
-    def learn(self, size: float, seconds: float, **more: Any) -> None:
-        alone_s = max(0.0, seconds - (more.get("queue_s") or 0.0)) if self.remote else seconds
-        super().learn(size, alone_s, condition=more["condition"])
-
-    def learn_late(self, size: float, seconds: float, **more: Any) -> None:
-        condition: Condition = more["condition"]
+    def learn(self, call: Call, run: Run) -> None:
+        if run.ended:
+            alone_s = max(0.0, run.seconds - (run.queue_s or 0.0)) if self.remote else run.seconds
+            super().learn(call, Run(alone_s))
+            return
+        condition, seconds = call.condition, run.seconds
         if self.remote:
             waited_s = condition.queue * self._usual_run.value + (condition.round_trip_s or 0.0)
             seconds = max(0.0, seconds - waited_s)
-        self._learn_run(size, seconds, condition)
+        self._learn_run(first_number(call.amount), seconds, condition)
 
 
-class AllParts(Parts):
+class AllParts(_Without):
     """One line on the total seconds: no network, no queue and no round trip."""
 
-    def predict(self, size: float, ahead: int = 1, **more: Any) -> Prediction | None:
-        return super().predict(size, ahead, condition=self._alone(more["condition"]))
+    def learn(self, call: Call, run: Run) -> None:
+        super().learn(call, run._replace(run_s=None))
 
-    def learn(self, size: float, seconds: float, **more: Any) -> None:
-        super().learn(size, seconds, condition=self._alone(more["condition"]))
-
-    def learn_late(self, size: float, seconds: float, **more: Any) -> None:
-        self._learn_run(size, seconds, self._alone(more["condition"]))
-
-    def _alone(self, condition: Condition) -> Condition:
-        return condition._replace(round_trip_s=None, queue=0)
+    def _told(self, call: Call) -> Call:
+        return call._replace(moved=0.0, condition=call.condition._replace(round_trip_s=None, queue=0))

@@ -10,7 +10,9 @@ from offboard.loadgen import rivals
 from offboard.loadgen.claims.claim import ABOVE_ONE, Claim, Figure, claim, unknown
 from offboard.loadgen.claims.claims_settings import ClaimsConfig
 from offboard.loadgen.table.measured_rows import Rows
-from offboard.robot_client.predictors import LEAST_SQUARES, Predictor
+from offboard.robot_client.predictors import LEAST_SQUARES, Model
+from offboard.robot_client.predictors.base import Call, Run
+from offboard.robot_client.predictors.plain import model_of
 
 CLAIM = 6
 # The median of six rounds lies between the least and the greatest with a probability of 1 - 2 / 2^6 = 97 %.
@@ -71,11 +73,11 @@ def measured(
             if name in missing:
                 continue
             try:
-                predictor = rivals.make(name, split, config.seed)
+                model = model_of(rivals.make(name, split, config.seed), remote=False)
             except MissingExtra as error:
                 missing[name] = str(error)
                 continue
-            training_s, prediction_s = _timed(predictor, rows, split)
+            training_s, prediction_s = _timed(model, rows, split)
             if turn:
                 times[name].training_s.append(training_s)
                 times[name].prediction_s.append(prediction_s)
@@ -85,16 +87,16 @@ def measured(
     return times, missing
 
 
-def _timed(predictor: Predictor, rows: Rows, split: int) -> tuple[float, float]:
+def _timed(model: Model, rows: Rows, split: int) -> tuple[float, float]:
     """The seconds of training, and of one prediction: the mean over the rows after the split."""
     sizes, seconds = rows.size.tolist(), rows.onboard_s.tolist()
     began = time.process_time()
     for size, second in zip(sizes[:split], seconds[:split], strict=True):
-        predictor.learn(size, second)
-    predictor.predict(sizes[split])
+        model.learn(Call(size), Run(second))
+    model.predict(Call(sizes[split]))
     trained = time.process_time()
     for size in sizes[split:]:
-        predictor.predict(size)
+        model.predict(Call(size))
     return trained - began, (time.process_time() - trained) / (len(sizes) - split)
 
 

@@ -7,7 +7,7 @@ from offboard.common.class_path import MODULE_CLASS
 from offboard.common.errors import ConfigError
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.policies.objectives import OBJECTIVES
-from offboard.robot_client.predictors import Predictor
+from offboard.robot_client.predictors import Model, Predictor
 
 _HOME = "offboard.loadgen.rivals"
 _RIVER = "river:"  # before the package and class of a regressor of river
@@ -66,7 +66,7 @@ def split_objective(name: str, where: str) -> tuple[str, str | None]:
     return chosen, objective
 
 
-def make(name: str, window: int, seed: int = 0) -> Predictor:
+def make(name: str, window: int, seed: int = 0) -> Predictor | Model:
     """A new predictor; MissingExtra if its library is not installed."""
     return predictors.make(predictor(name), window, seed)
 

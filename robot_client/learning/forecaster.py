@@ -37,7 +37,7 @@ class Forecaster:
                 under_way=in_flight > 0 and self._flights.has(site, task.kind.name),
                 sending=sending,
                 # Most tasks have nothing to make smaller, so that is asked first.
-                packing=memory.packing.plan(sending, known.link_s) if packs or sending.large else None,
+                packing=memory.packing.plan(sending, known.model.byte_s) if packs or sending.large else None,
             )
         return self._finished(memory, task.size, outlooks)
 
@@ -55,16 +55,16 @@ class Forecaster:
                 in_flight=count,
                 under_way=count > 0,
                 sending=sending,
-                packing=memory.packing.plan(sending, known.link_s) if packs or sending.large else None,
+                packing=memory.packing.plan(sending, known.model.byte_s) if packs or sending.large else None,
             )
         return self._finished(memory, task.size, outlooks)
 
     def _finished(self, memory: KindMemory, size: Size, outlooks: Mapping[str, Outlook]) -> Forecast:
         allowance = self._allowance
         duplicates = allowance.duplicates if memory.kind.duplicate else 0.0
-        forecast = Forecast(
-            size, outlooks, memory.last_site, duplicates, allowance.bytes_left, allowance.joules_left
-        )
+        forecast = Forecast(size, outlooks, memory.last_site, duplicates)
+        if allowance.capped:
+            forecast = forecast._replace(bytes_left=allowance.bytes_left, joules_left=allowance.joules_left)
         return self._weighing.weighed(forecast, capped=allowance.capped)
 
     def _behind(self, runner: Runner, in_flight: int, now_s: float) -> Condition:

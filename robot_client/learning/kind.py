@@ -14,7 +14,7 @@ from offboard.robot_client.learning.packing import PackingMemory
 from offboard.robot_client.learning.shared_work import SharedWork
 from offboard.robot_client.learning.site import SiteMemory
 from offboard.robot_client.policies.forecast import ERRORS_MIN, WHOLE, Quality
-from offboard.robot_client.predictors import Predictor
+from offboard.robot_client.predictors import Model, Predictor
 from offboard.robot_client.predictors.base import REMEMBERED, WARM_UP
 from offboard.robot_client.sites.runner import ONBOARD, Execution
 
@@ -32,7 +32,7 @@ class KindMemory:
     def __init__(
         self,
         kind: Kind,
-        make: Callable[[], Predictor],
+        make: Callable[[], Predictor | Model],
         *,
         shared_work: bool,
         measured: bool,
@@ -90,7 +90,7 @@ class KindMemory:
 
     def observations(self, site: str) -> int:
         """How many observations the predictor of a site rests on."""
-        return len(self.site(site).predictor)
+        return len(self.site(site).model)
 
     def amount(self, size: Size) -> Size | None:
         """What the predictors are asked for: the expected work of this size, or the size itself."""

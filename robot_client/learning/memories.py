@@ -12,7 +12,7 @@ from offboard.robot_client.learning.memory_file import KeptKind
 from offboard.robot_client.learning.store import Store
 from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.objectives import S_PER_QUALITY, Deadline, Mean, Objective, Weighing
-from offboard.robot_client.predictors import Predictor
+from offboard.robot_client.predictors import Model, Predictor
 
 Snapshot = dict[str, KeptKind]
 
@@ -32,7 +32,7 @@ class Memories:
 
     def __init__(
         self,
-        predictor: Callable[[], Predictor],
+        predictor: Callable[[], Predictor | Model],
         *,
         measured: bool = False,
         shared_work: bool = False,

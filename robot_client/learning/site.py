@@ -13,11 +13,10 @@ from offboard.common.errors import CannotCross, Overtaken, SiteClosed, TaskError
 from offboard.common.tasks import Size, first_number
 from offboard.robot_client.learning.conformal import ERRORS_MAX, Conformal
 from offboard.robot_client.policies.forecast import Outlook, Packing, Quality
-from offboard.robot_client.predictors import Prediction, Predictor
-from offboard.robot_client.predictors.base import REMEMBERED
-from offboard.robot_client.predictors.least_squares import LeastSquares
+from offboard.robot_client.predictors import Model, Predictor
+from offboard.robot_client.predictors.base import REMEMBERED, Call, Run
 from offboard.robot_client.predictors.line import RunningMean
-from offboard.robot_client.predictors.parts import Parts
+from offboard.robot_client.predictors.plain import model_of
 from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Execution, Sending
 
 NOT_OF_THE_SITE = (TaskError, CannotCross, SiteClosed)  # failures that say nothing of the site
@@ -61,19 +60,15 @@ class SiteMemory:
     def __init__(
         self,
         site: str,
-        make: Callable[[], Predictor],
+        make: Callable[[], Predictor | Model],
         *,
         measured: bool,
         quality: Quality,
     ) -> None:
-        predictor = self.predictor = make()
+        self.model = model_of(make(), remote=site != ONBOARD)
         self.age = 0  # tasks since the site last ran one
         self.observations: deque[Observation] = deque(maxlen=REMEMBERED)
         self.measured = measured
-        self._parts = predictor if isinstance(predictor, Parts) else None
-        if self._parts is not None:
-            self._parts.remote = site != ONBOARD
-        self._least_squares = predictor if isinstance(predictor, LeastSquares) else None
         self._site = site
         self._failures = 0
         self._conformal = Conformal()
@@ -95,12 +90,14 @@ class SiteMemory:
 
         An amount of None is unknown.
         """
-        predictor = self.predictor
+        model = self.model
         moved = (sending.bytes if packing is None else packing.bytes) + self._bytes_in.value
-        found = None if amount is None else self._predict(amount, moved, condition)
+        pack_s = 0.0 if packing is None else packing.seconds
+        call = None if amount is None else Call(amount, moved, condition, pack_s, ahead=self.age + 1)
+        found = None if call is None else model.predict(call)
         if found is None:
             return Outlook(
-                full=predictor.full,
+                full=model.full,
                 age=self.age,
                 failures=self._failures,
                 in_flight=in_flight,
@@ -111,13 +108,11 @@ class SiteMemory:
                 sending=sending,
             )
         seconds = found.seconds + condition.wait_s
-        if packing is not None and self._parts is not None:  # all others learn it with the rest of the time
-            seconds += packing.seconds
         spread_s, error_s = found.spread_s, found.error_s or 0.0
         low_s, high_s = self._conformal.interval(seconds, spread_s, error_s) or (None, None)
         # All fields in their order: with keywords, it takes three times as long.
         return Outlook._make((
-            seconds, spread_s, predictor.full, self.age, self._failures, len(predictor),
+            seconds, spread_s, model.full, self.age, self._failures, len(model),
             low_s, high_s, found.error_s, in_flight, moved, self._cpu_share.value or 1.0, condition,
             self._conformal.errors, self._quality, packing, sending, under_way, None, 0.0, None,
         ))  # fmt: skip
@@ -129,11 +124,6 @@ class SiteMemory:
         return max(
             (one.seconds + one.waited_s for one in last if first_number(one.amount) <= most), default=0.0
         )
-
-    @property
-    def link_s(self) -> float | None:
-        """The seconds that each byte takes on the way to this site; None if nothing says so."""
-        return None if self._parts is None or self._site == ONBOARD else self._parts.byte_s
 
     def learn(
         self,
@@ -148,10 +138,10 @@ class SiteMemory:
     ) -> None:
         """Learn from an execution; `outlook` is what was expected of it, and `amount` what it was asked for.
 
-        A failed run is learned as the time until it was given up: the one addition to Algorithm 1. For the
-        parts model such a time only means that the true time is longer. A run that failed before its
-        predicted time says nothing to that model, and a run that failed while the site is `silent` says
-        nothing to any. With `beside`, the robot ran the same task itself.
+        A failed run is learned as the time until it was given up: the one addition to Algorithm 1. If the
+        model learns no failures, such a time only means that the true time is longer, and a run that failed
+        before its predicted time says nothing. A run that failed while the site is `silent` never says
+        anything. With `beside`, the robot ran the same task itself.
         """
         expected_s, ok = outlook.predicted_s if outlook else None, execution.ok
         overtaken = not ok and isinstance(execution.failure, Overtaken)
@@ -194,16 +184,9 @@ class SiteMemory:
             self._take(one)
         self.age = age
 
-    def _predict(self, amount: Size, moved: float, condition: Condition) -> Prediction | None:
-        if self._parts is not None:
-            return self._parts.predict(first_number(amount), moved=moved, condition=condition)
-        if self._least_squares is not None:
-            return self._least_squares.predict(amount)
-        return self.predictor.predict(first_number(amount), self.age + 1)
-
     def _is_longer(self, execution: Execution, expected_s: float | None, *, silent: bool) -> bool:
         """Whether a failed run shows that the site takes longer than predicted."""
-        if silent or self._parts is None:
+        if silent or self.model.learns_failures:
             return not silent
         return execution.censored and expected_s is not None and execution.seconds >= expected_s
 
@@ -213,7 +196,7 @@ class SiteMemory:
         Onboard, it waited for other tasks of the robot; on the way to a server, for the packing.
         """
         if execution.packed:
-            return 0.0 if self._parts is None else execution.pack_s
+            return execution.pack_s
         behind = self.measured and self._site == ONBOARD and outlook is not None and outlook.in_flight > 0
         return (execution.queue_s or 0.0) if behind else 0.0
 
@@ -237,23 +220,7 @@ class SiteMemory:
             self._conformal.learn(one.predicted_s, one.seconds + one.waited_s)
         elif one.predicted_s is not None:
             self._conformal.miss(one.predicted_s, one.seconds + one.waited_s)
-        self._teach(one)
-
-    def _teach(self, one: Observation) -> None:
-        model, moved, number = self._parts, one.bytes_out + one.bytes_in, first_number(one.amount)
-        if self._least_squares is not None:
-            self._least_squares.learn(one.amount, one.seconds)
-        elif model is None:
-            self.predictor.learn(number, one.seconds)
-        elif one.ok:
-            model.learn(
-                number,
-                one.seconds,
-                run_s=one.run_s,
-                queue_s=one.queue_s,
-                moved=moved,
-                bound=one.bound,
-                condition=one.condition,
-            )
-        else:
-            model.learn_late(number, one.seconds, moved=moved, condition=one.condition)
+        run = Run(one.seconds, one.ok, one.run_s, one.queue_s, bound=one.bound)
+        if self._site != ONBOARD:
+            run = run._replace(pack_s=one.waited_s)
+        self.model.learn(Call(one.amount, one.bytes_out + one.bytes_in, one.condition), run)

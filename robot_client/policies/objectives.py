@@ -184,7 +184,14 @@ def _missed(one: Outlook, within_s: float) -> float | None:
 
 def _expected(one: Outlook) -> Expected:
     assert one.predicted_s is not None
-    return Expected(one.predicted_s, one.spread_s, one.joules, one.quality, one.bytes, one.error_s or 0.0)
+    return Expected(
+        one.predicted_s,
+        one.spread_s,
+        one.joules,
+        one.quality,
+        bytes=one.bytes,
+        error_s=one.error_s or 0.0,
+    )
 
 
 OBJECTIVES = (MEAN := "mean", "p95", "deadline", "energy", "metered")

@@ -2,9 +2,9 @@
 
 from offboard.common.class_path import MODULE_CLASS, find_class
 from offboard.common.errors import ConfigError
-from offboard.robot_client.predictors.base import Prediction, Predictor
+from offboard.robot_client.predictors.base import Model, Prediction, Predictor
 
-__all__ = ["LEAST_SQUARES", "PARTS", "Prediction", "Predictor", "check_name", "make", "names"]
+__all__ = ["LEAST_SQUARES", "PARTS", "Model", "Prediction", "Predictor", "check_name", "make", "names"]
 
 LEAST_SQUARES = "least-squares"
 PARTS = "parts"
@@ -18,10 +18,10 @@ def names() -> tuple[str, ...]:
     return tuple(_CLASSES)
 
 
-def make(name: str, window: int, seed: int = 0) -> Predictor:
+def make(name: str, window: int, seed: int = 0) -> Predictor | Model:
     """A new predictor that remembers the last `window` executions. The same seed gives the same answers."""
     check_name(name)
-    made: Predictor = find_class(_CLASSES.get(name, name), "predictor")(window, seed=seed)
+    made: Predictor | Model = find_class(_CLASSES.get(name, name), "predictor")(window, seed=seed)
     return made
 
 

@@ -19,6 +19,8 @@ class LeastSquares:
     The standard error of p is that of the fitted line: s sqrt(1 / N + (d - mean d)^2 / sum((d - mean d)^2)).
     """
 
+    several_numbers = True  # sizes may be tuples
+
     def __init__(self, window: int, seed: int = 0) -> None:  # noqa: ARG002 - nothing is random
         self.window = Window(window)
         self._plane = Plane(window)  # empty, or the window is

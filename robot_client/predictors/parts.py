@@ -7,9 +7,10 @@ part is learned with; `learning/site.py` decides which executions say anything.
 import math
 
 from offboard.common.host.load import LOADED
-from offboard.robot_client.predictors.base import WARM_UP, Prediction, check_observation
+from offboard.common.tasks import first_number
+from offboard.robot_client.predictors.base import WARM_UP, Call, Prediction, Run, check_observation
 from offboard.robot_client.predictors.line import Line, RunningMean
-from offboard.robot_client.sites.runner import UNMEASURED, Condition
+from offboard.robot_client.sites.runner import Condition
 
 LEAST = 0.25  # of its standard error: no run is predicted to be shorter, so that it is never a certain 0
 FIRST_BYTES_S = 12.5e6  # bytes a second of a link, until its first answers tell: 100 Mbit/s
@@ -25,15 +26,21 @@ class Parts:
     """
 
     LINE = Line  # what learns each part
+    learns_failures = False
     per_work = True  # amounts are the work of tasks, of kinds whose results tell it
 
-    def __init__(self, window: int = 0, seed: int = 0, *, remote: bool = False) -> None:  # noqa: ARG002
+    def __init__(self, window: int = 0, seed: int = 0, *, remote: bool = False) -> None:  # noqa: ARG002 - no window
         self.remote = remote
         self._run = self.LINE(together=True)
         self._network = self.LINE(together=False)
         self._loaded = self.LINE(together=True)  # runs while other programs take the CPU
         self._usual_run = RunningMean()
         self._amount = self._bytes = 0.0  # the units
+
+    def at_site(self, *, remote: bool) -> "Parts":
+        """The same model, for a site behind a network, or for onboard."""
+        self.remote = remote
+        return self
 
     @property
     def full(self) -> bool:
@@ -43,68 +50,52 @@ class Parts:
         return self._run.count
 
     @property
-    def byte_s(self) -> float:
-        """The most seconds, by what is known, that each byte takes on the link.
+    def byte_s(self) -> float | None:
+        """The most seconds, by what is known, that each byte takes on the link; None onboard.
 
         The upper end makes the robot try to send less: equal tasks do not tell what their bytes take.
         """
+        if not self.remote:
+            return None
         if not (self._bytes and self._network.count):
             return 1.0 / FIRST_BYTES_S
         return self._network.steepest / self._bytes
 
-    def predict(
-        self,
-        size: float,
-        ahead: int = 1,  # noqa: ARG002 - the lines do not drift, they only become less certain
-        *,
-        moved: float = 0.0,
-        condition: Condition = UNMEASURED,
-    ) -> Prediction | None:
-        """The time of a task that moves this many bytes; None before the first run."""
+    def predict(self, call: Call) -> Prediction | None:
         if not self._run.count:
             return None
-        run_s, error_s = self._run_s(size, condition)
+        condition = call.condition
+        run_s, error_s = self._run_s(first_number(call.amount), condition)
         seconds, spread_s = run_s * (1.0 + self._run.tail), self._run.deviation * run_s
         if not self.remote:
             return Prediction(seconds, spread_s, error_s)
-        x = moved / self._bytes if self._bytes else 0.0
+        x = call.moved / self._bytes if self._bytes else 0.0
         network_s = (condition.round_trip_s or 0.0) + self._network.at(x)
         seconds += network_s * (1.0 + self._network.tail) + condition.queue * self._usual_run.value
         spread_s = math.hypot(spread_s, self._network.deviation * network_s)
-        return Prediction(seconds, spread_s, math.hypot(error_s, self._network.error(x)))
+        return Prediction(seconds + call.pack_s, spread_s, math.hypot(error_s, self._network.error(x)))
 
-    def learn(
-        self,
-        size: float,
-        seconds: float,
-        *,
-        run_s: float | None = None,
-        queue_s: float | None = None,
-        moved: float = 0.0,
-        bound: bool = False,
-        condition: Condition = UNMEASURED,
-    ) -> None:
-        """A task took `seconds`, of which it waited `queue_s` and ran `run_s` (None: the site did not say).
+    def learn(self, call: Call, run: Run) -> None:
+        """A reply says how long the task waited and ran; of one that did not end, only that it took longer.
 
-        With `bound` the robot may have read the answer late, so the network took at most the rest.
+        With `run.bound` the robot may have read the answer late, so the network took at most the rest.
         """
+        size, condition, seconds, run_s = first_number(call.amount), call.condition, run.seconds, run.run_s
         check_observation(size, seconds)
         rtt_s = condition.round_trip_s or 0.0
+        if not run.ended:
+            if not (self.remote and self._network.count):  # onboard, or a server that does not tell the parts
+                self._learn_run(size, seconds, condition)
+                return
+            expected_s = self._run_s(size, condition)[0] + condition.queue * self._usual_run.value
+            self._learn_network(call.moved, max(0.0, seconds - expected_s - rtt_s), rtt_s, bound=False)
+            return
         if run_s is None or not self.remote:  # onboard, a busy CPU also makes the run begin late
             run_s = max(0.0, seconds - rtt_s)
         else:
-            rest_s = seconds - (queue_s or 0.0) - run_s - rtt_s
-            self._learn_network(moved, max(0.0, rest_s), rtt_s, bound=bound)
+            rest_s = seconds - (run.queue_s or 0.0) - run_s - rtt_s
+            self._learn_network(call.moved, max(0.0, rest_s), rtt_s, bound=run.bound)
         self._learn_run(size, run_s, condition)
-
-    def learn_late(self, size: float, seconds: float, *, moved: float, condition: Condition) -> None:
-        """A run was given up after these seconds, which are more than predicted."""
-        if not (self.remote and self._network.count):  # onboard, or a server that does not tell the parts
-            self._learn_run(size, seconds, condition)
-            return
-        rtt_s = condition.round_trip_s or 0.0
-        expected_s = self._run_s(size, condition)[0] + condition.queue * self._usual_run.value
-        self._learn_network(moved, max(0.0, seconds - expected_s - rtt_s), rtt_s, bound=False)
 
     def _run_s(self, size: float, condition: Condition) -> tuple[float, float]:
         """The seconds of a run, and their standard error, which alone is known where the line is below 0."""

@@ -7,9 +7,7 @@ import pytest
 
 from offboard.robot_client import predictors
 from offboard.robot_client.learning.site import SiteMemory
-from offboard.robot_client.policies.energy import Energy
 from offboard.robot_client.policies.forecast import WHOLE, Outlook
-from offboard.robot_client.policies.objectives import Mean
 from offboard.robot_client.sites.runner import NOTHING, ONBOARD, UNMEASURED, Execution
 
 WORKLOADS = 200
@@ -31,8 +29,6 @@ class Workload:
         self._memory = SiteMemory(
             ONBOARD,
             lambda: predictors.make(predictor, 50),
-            Mean(),
-            Energy(),
             measured=True,
             quality=WHOLE,
         )

@@ -16,6 +16,7 @@ from offboard.robot_client.predictors.line import Line
 from offboard.robot_client.predictors.parts import Parts
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import Condition
+from tests.models import learn, predict
 
 CLASSES = [
     one
@@ -35,14 +36,15 @@ def predictions(model: Parts) -> Iterator[float]:
         condition = Condition(
             round_trip_s=rtt_s, queue=rng.randrange(2), capacity=rng.choice([0.5, 1.0]), server_load=load
         )
-        found = model.predict(size, moved=moved, condition=condition)
+        found = predict(model, size, moved=moved, condition=condition)
         yield found.seconds if found else 0.0
         run_s = 0.1 * size * odd * slow * (1.0 + load) * rng.lognormvariate(0.0, 0.1) / condition.capacity
         seconds = rtt_s + 0.03 + moved / 4e6 * odd * slow + run_s
         if n % 30 == 29:
-            model.learn_late(size, 2.0 * seconds, moved=moved, condition=condition)
+            learn(model, size, 2.0 * seconds, ended=False, moved=moved, condition=condition)
             continue
-        model.learn(
+        learn(
+            model,
             size,
             seconds,
             run_s=run_s,

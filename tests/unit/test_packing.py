@@ -175,7 +175,7 @@ def test_a_plain_predictor_learns_the_whole_time() -> None:
 
 def test_only_the_parts_model_knows_what_a_byte_takes() -> None:
     """Onboard there is no link, and other predictors do not tell it from the rest."""
-    assert memory(predictors.LEAST_SQUARES).site(CLOUD).link_s is None
+    assert memory(predictors.LEAST_SQUARES).site(CLOUD).model.byte_s is None
     one = taught(predictors.PARTS, pack_s=0.0)
-    assert one.site(ONBOARD).link_s is None
-    assert one.site(CLOUD).link_s == pytest.approx(SLOW_S, rel=0.1)
+    assert one.site(ONBOARD).model.byte_s is None
+    assert one.site(CLOUD).model.byte_s == pytest.approx(SLOW_S, rel=0.1)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from offboard.robot_client.predictors.base import WARM_UP
 from offboard.robot_client.predictors.parts import FIRST_BYTES_S, Parts
 from offboard.robot_client.sites.runner import UNMEASURED, Condition
+from tests.models import learn, predict
 
 RUN_S, REST_S, RTT_S = 0.2, 0.05, 0.03  # of a task of size 1 and of 1000 bytes
 NEAR = Condition(round_trip_s=RTT_S)
@@ -42,7 +43,7 @@ def answer(
 ) -> None:
     """A server answers a task; `slow` is how many times as long it runs."""
     run_s, rtt_s = slow * run_of(size), condition.round_trip_s or 0.0
-    model.learn(size, rtt_s + rest_s + run_s, run_s=run_s, queue_s=0.0, moved=moved, condition=condition)
+    learn(model, size, rtt_s + rest_s + run_s, run_s=run_s, queue_s=0.0, moved=moved, condition=condition)
 
 
 def onboard(times: int = 30, condition: Condition = UNMEASURED, seconds: float | None = None) -> Parts:
@@ -50,12 +51,12 @@ def onboard(times: int = 30, condition: Condition = UNMEASURED, seconds: float |
     rng, model = Random(1), Parts()
     for _ in range(times):
         size = rng.uniform(0.5, 2.0)
-        model.learn(size, run_of(size) if seconds is None else seconds, condition=condition)
+        learn(model, size, run_of(size) if seconds is None else seconds, condition=condition)
     return model
 
 
 def predicted_s(model: Parts, size: float = 1.0, condition: Condition = NEAR, moved: float = BYTES) -> float:
-    found = model.predict(size, moved=moved, condition=condition)
+    found = predict(model, size, moved=moved, condition=condition)
     assert found is not None
     return found.seconds
 
@@ -63,9 +64,9 @@ def predicted_s(model: Parts, size: float = 1.0, condition: Condition = NEAR, mo
 def test_nothing_is_known_before_the_first_run() -> None:
     """There is no prediction, and the warm-up needs WARM_UP runs."""
     model = Parts()
-    assert model.predict(1.0) is None
+    assert predict(model, 1.0) is None
     for n in range(1, WARM_UP + 1):
-        model.learn(1.0, RUN_S)
+        learn(model, 1.0, RUN_S)
         assert (model.full, len(model)) == (n >= WARM_UP, n)
 
 
@@ -115,7 +116,8 @@ def test_what_a_server_waited_is_not_learned() -> None:
     model = server()
     before_s = predicted_s(model)
     for _ in range(10):
-        model.learn(
+        learn(
+            model,
             1.0,
             RTT_S + REST_S + 0.5 + RUN_S,
             run_s=RUN_S,
@@ -135,7 +137,7 @@ def test_half_of_the_cpu_doubles_the_run_and_nothing_else(remote: bool) -> None:
     slow_model, fast_model = Parts(remote=remote), Parts(remote=remote)
     for _ in range(20):
         for model, condition, run_s in ((slow_model, half, 2 * RUN_S), (fast_model, whole, RUN_S)):
-            model.learn(1.0, network_s + run_s, run_s=run_s, queue_s=0.0, moved=BYTES, condition=condition)
+            learn(model, 1.0, network_s + run_s, run_s=run_s, queue_s=0.0, moved=BYTES, condition=condition)
     for model in (slow_model, fast_model):
         assert predicted_s(model, condition=whole) == pytest.approx(network_s + RUN_S, rel=0.02)
         assert predicted_s(model, condition=half) == pytest.approx(network_s + 2 * RUN_S, rel=0.02)
@@ -150,7 +152,7 @@ def test_load_slows_a_run_by_the_factor_that_was_learned(remote: bool) -> None:
     assert predicted_s(model, condition=loaded) == pytest.approx(network_s + 1.6 * RUN_S, rel=0.03)
     for _ in range(8):
         run_s = 2.5 * RUN_S
-        model.learn(1.0, network_s + run_s, run_s=run_s, queue_s=0.0, moved=BYTES, condition=loaded)
+        learn(model, 1.0, network_s + run_s, run_s=run_s, queue_s=0.0, moved=BYTES, condition=loaded)
     assert predicted_s(model, condition=loaded) == pytest.approx(network_s + 2.5 * RUN_S, rel=0.05)
     assert predicted_s(model, condition=alone) == pytest.approx(network_s + RUN_S, rel=0.03)
 
@@ -161,7 +163,7 @@ def test_runs_under_load_have_a_line_of_their_own() -> None:
     for condition, added_s in ((UNMEASURED, 0.0), (loaded, 2 * RUN_S)):
         for _ in range(30):
             size = rng.uniform(0.5, 2.0)
-            model.learn(size, run_of(size) + added_s, condition=condition)
+            learn(model, size, run_of(size) + added_s, condition=condition)
     for size in (0.5, 2.0):
         assert predicted_s(model, size) == pytest.approx(run_of(size), rel=0.03)
         assert predicted_s(model, size, loaded) == pytest.approx(run_of(size) + 2 * RUN_S, rel=0.1)
@@ -220,7 +222,7 @@ def test_without_parts_everything_beyond_the_round_trip_is_the_run(rtt_s: float)
     """A server that says no run time is predicted by the time of its answers."""
     model, condition = Parts(remote=True), Condition(round_trip_s=rtt_s or None)
     for _ in range(20):
-        model.learn(1.0, 0.3, moved=BYTES, condition=condition)
+        learn(model, 1.0, 0.3, moved=BYTES, condition=condition)
     assert predicted_s(model, condition=condition) == pytest.approx(0.3, rel=0.01)
     assert predicted_s(model, 3.0, condition) > 0.5
 
@@ -229,7 +231,7 @@ def test_onboard_the_wait_for_the_cpu_is_part_of_the_run() -> None:
     """A busy CPU begins a run late; the prediction is the whole time, and not only that of the run."""
     model = Parts()
     for _ in range(20):
-        model.learn(1.0, 0.5, run_s=0.4, queue_s=0.1)
+        learn(model, 1.0, 0.5, run_s=0.4, queue_s=0.1)
     assert predicted_s(model) == pytest.approx(0.5, rel=0.01)
 
 
@@ -238,7 +240,7 @@ def test_a_server_given_up_late_has_a_slower_network() -> None:
     model = server()
     before = predicted_s(model), predicted_s(model, condition=Condition(round_trip_s=RTT_S, queue=1))
     for _ in range(6):
-        model.learn_late(1.0, 2.0, moved=BYTES, condition=NEAR)
+        learn(model, 1.0, 2.0, ended=False, moved=BYTES, condition=NEAR)
     after = predicted_s(model), predicted_s(model, condition=Condition(round_trip_s=RTT_S, queue=1))
     assert after[0] > 1.5
     assert after[1] - after[0] == pytest.approx(before[1] - before[0], rel=0.01)
@@ -248,7 +250,7 @@ def test_a_run_given_up_late_onboard_takes_longer() -> None:
     """Onboard there is no network, so the run itself takes at least as long."""
     model = onboard()
     for _ in range(6):
-        model.learn_late(1.0, 2.0, moved=0.0, condition=UNMEASURED)
+        learn(model, 1.0, 2.0, ended=False, moved=0.0, condition=UNMEASURED)
     assert predicted_s(model) == pytest.approx(2.0, rel=0.1)
 
 
@@ -256,10 +258,10 @@ def test_a_server_that_does_not_tell_its_parts_is_learned_as_a_whole() -> None:
     """Without parts, all of a time counts as the run; one run that was given up late is not added to that."""
     model = Parts(remote=True)
     for _ in range(20):
-        model.learn(1.0, 0.2)
-    model.learn_late(1.0, 0.4, moved=0.0, condition=UNMEASURED)
+        learn(model, 1.0, 0.2)
+    learn(model, 1.0, 0.4, ended=False, moved=0.0, condition=UNMEASURED)
     for _ in range(20):
-        model.learn(1.0, 0.2)
+        learn(model, 1.0, 0.2)
     assert predicted_s(model) == pytest.approx(0.2, rel=0.2)
 
 
@@ -269,7 +271,8 @@ def test_an_answer_that_may_have_been_received_late_only_lowers_the_network() ->
     before_s = predicted_s(model)
     for rest_s, expected_s in ((0.5, before_s), (0.01, RTT_S + 0.01 + RUN_S)):
         for _ in range(5):
-            model.learn(
+            learn(
+                model,
                 1.0,
                 RTT_S + rest_s + RUN_S,
                 run_s=RUN_S,
@@ -290,7 +293,7 @@ def test_noise_of_run_and_network_gives_the_spread() -> None:
         answer(model, rest_s=rest_s, slow=slow)
     mean = sum(times) / len(times)
     true_s = math.sqrt(sum((one - mean) ** 2 for one in times) / len(times))
-    found = model.predict(1.0, moved=BYTES, condition=NEAR)
+    found = predict(model, 1.0, moved=BYTES, condition=NEAR)
     assert found is not None
     assert 0.5 * true_s < found.spread_s < 2.0 * true_s
 
@@ -304,8 +307,8 @@ def test_a_copy_knows_everything(make) -> None:  # type: ignore[no-untyped-def]
     loaded = Condition(round_trip_s=RTT_S, queue=1, server_load=0.7)
     for _ in range(3):
         for condition in (NEAR, loaded):
-            assert twin.predict(1.3, moved=BYTES, condition=condition) == model.predict(
-                1.3, moved=BYTES, condition=condition
+            assert predict(twin, 1.3, moved=BYTES, condition=condition) == predict(
+                model, 1.3, moved=BYTES, condition=condition
             )
         answer(model, slow=1.5), answer(twin, slow=1.5)
     assert twin.full
@@ -336,12 +339,19 @@ def test_no_task_breaks_the_model(
     model = Parts(remote=remote)
     for size, seconds, run_s, moved, condition, way in tasks:
         if way == "c":
-            model.learn_late(size, seconds, moved=moved, condition=condition)
+            learn(model, size, seconds, ended=False, moved=moved, condition=condition)
         else:
-            model.learn(
-                size, seconds, run_s=run_s, queue_s=run_s, moved=moved, bound=way == "b", condition=condition
+            learn(
+                model,
+                size,
+                seconds,
+                run_s=run_s,
+                queue_s=run_s,
+                moved=moved,
+                bound=way == "b",
+                condition=condition,
             )
-        found = model.predict(size, moved=moved, condition=condition)
+        found = predict(model, size, moved=moved, condition=condition)
         if found is not None:
             assert math.isfinite(found.seconds)
             assert found.seconds >= 0

@@ -12,6 +12,7 @@ from offboard.loadgen import rivals
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.predictors import Predictor
 from tests import checks
+from tests.models import sized
 from tests.table_loops import section
 
 ROOT = Path(__file__).parents[2]
@@ -51,7 +52,7 @@ def name(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def make(name: str) -> Callable[[], Predictor]:
-    return lambda: rivals.make(name, checks.WINDOW, seed=3)
+    return lambda: sized(rivals.make(name, checks.WINDOW, seed=3))
 
 
 @pytest.mark.timeout(60)  # the LSTMs are fitted up to ten times
@@ -136,11 +137,13 @@ def test_the_base_predictors_load_no_heavy_library() -> None:
     said = python(
         "import sys\n"
         "from offboard.loadgen import rivals\n"
+        "from offboard.robot_client.predictors.base import Call, Run\n"
+        "from offboard.robot_client.predictors.plain import model_of\n"
         f"for name in {BASE!r}:\n"
-        "    predictor = rivals.make(name, 5)\n"
+        "    model = model_of(rivals.make(name, 5), remote=True)\n"
         "    for i in range(6):\n"
-        "        predictor.learn(i, i * i)\n"
-        "    assert predictor.predict(3.0)\n"
+        "        model.learn(Call(i), Run(i * i))\n"
+        "    assert model.predict(Call(3.0))\n"
         f"print([name for name in {HEAVY!r} if name in sys.modules])\n"
     )
     assert said == "[]\n"
