@@ -34,8 +34,7 @@ def test_a_restart_at_once_predicts_the_same(robot: Robot, name: str) -> None:
             "low_s",
             "high_s",
             "bytes",
-            "joules",
-            "cost",
+            "cpu_share",
             "observations",
             "full",
         ):
