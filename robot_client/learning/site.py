@@ -220,7 +220,6 @@ class SiteMemory:
             self._conformal.learn(one.predicted_s, one.seconds + one.waited_s)
         elif one.predicted_s is not None:
             self._conformal.miss(one.predicted_s, one.seconds + one.waited_s)
-        run = Run(one.seconds, one.ok, one.run_s, one.queue_s, bound=one.bound)
-        if self._site != ONBOARD:
-            run = run._replace(pack_s=one.waited_s)
+        pack_s = 0.0 if self._site == ONBOARD else one.waited_s
+        run = Run(one.seconds, one.ok, one.run_s, one.queue_s, pack_s=pack_s, bound=one.bound)
         self.model.learn(Call(one.amount, one.bytes_out + one.bytes_in, one.condition), run)

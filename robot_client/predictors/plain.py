@@ -1,6 +1,8 @@
 """The model of a plain predictor, which learns pairs of size and seconds and knows nothing else of a task."""
 
-from offboard.common.tasks import Size, first_number
+from typing import Any
+
+from offboard.common.tasks import first_number
 from offboard.robot_client.predictors.base import Call, Model, Prediction, Predictor, Run
 
 
@@ -13,22 +15,19 @@ class Plain:
     def __init__(self, predictor: Predictor) -> None:
         self._predictor = predictor
         self._several = getattr(predictor, "several_numbers", False)
-
-    @property
-    def full(self) -> bool:
-        return self._predictor.full
+        self.full = predictor.full
 
     def __len__(self) -> int:
         return len(self._predictor)
 
     def predict(self, call: Call) -> Prediction | None:
-        return self._predictor.predict(self._size(call.amount), call.ahead)
+        size: Any = call.amount if self._several else first_number(call.amount)
+        return self._predictor.predict(size, call.ahead)
 
     def learn(self, call: Call, run: Run) -> None:
-        self._predictor.learn(self._size(call.amount), run.seconds + run.pack_s)
-
-    def _size(self, amount: Size) -> float:
-        return amount if self._several else first_number(amount)  # type: ignore[return-value] # see `LeastSquares`
+        size: Any = call.amount if self._several else first_number(call.amount)
+        self._predictor.learn(size, run.seconds + run.pack_s)
+        self.full = self._predictor.full
 
 
 def model_of(predictor: Predictor | Model, *, remote: bool) -> Model:

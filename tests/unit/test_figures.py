@@ -17,6 +17,7 @@ from benchmarks.figures.page import doubled_titles, filled, pages, results
 from benchmarks.figures.step import FOLDER, ROOT, STEPS, Section, Step, Unit, read_sections, units_of
 from offboard.common.errors import DataError, OffloadError
 from offboard.loadgen.__main__ import COMMANDS
+from offboard.loadgen.scenario.scenario_file import find_scenario
 from tests.loose_figures import ALLOWED, loose_figures
 from tests.loose_figures import pages as pages_of_docs
 
@@ -247,7 +248,8 @@ def test_a_changed_scenario_makes_a_figure_old(tmp_path: Path) -> None:
 def test_a_step_that_plays_scenarios_reads_them(unit: Unit) -> None:
     """No step with `loadgen compare`, `checks` or `dataset` was forgotten."""
     if any(command.split()[1] in ("compare", "checks", "dataset") for command in unit.commands()):
-        assert f"loadgen/scenarios/{unit.part}.toml" in unit.reads(ROOT)
+        played = [find_scenario(word) for command in unit.commands() for word in command.split()[2:3]]
+        assert {path.relative_to(ROOT).as_posix() for path in played} <= unit.reads(ROOT).keys()
 
 
 def test_a_step_whose_text_is_a_number_is_one_line(tmp_path: Path) -> None:
