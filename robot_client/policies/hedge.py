@@ -3,6 +3,7 @@
 When onboard must start for a deadline is in `objectives`. `execution/race.py` starts the second run.
 """
 
+import math
 from collections.abc import Mapping
 from functools import partial
 
@@ -26,7 +27,8 @@ BEYOND = 0.25  # of the distance from the median to the largest error: later tha
 class WithHedges:
     """Adds a hedge: if the chosen site has not answered after some time, the task starts on a second one too.
 
-    - Which site: of those that are known and not silent, the one that should take the least time.
+    - Which site: of those that are known and not silent, the one that should take the least time. If there is
+      none, onboard, of which nothing is known yet: a first call must not wait for a server alone.
     - When: `late_after_s` says it, from the past errors of the chosen site.
     - Whether: if a second run is left, and before the deadline, if there is one.
 
@@ -110,6 +112,9 @@ def _planned(first: str, forecast: Forecast) -> Hedge | str:
         for site, one in forecast.sites.items()
         if site != first and one.predicted_s is not None and not one.condition.silent
     }
+    onboard = forecast.sites.get(ONBOARD)
+    if not others and first != ONBOARD and onboard is not None and onboard.predicted_s is None:
+        others = {ONBOARD: math.inf}  # its first run may still be under way
     if forecast.deadline_s is not None:
         others = {site: s for site, s in others.items() if not _is_worse(forecast.sites[site], chosen)}
     if not others:

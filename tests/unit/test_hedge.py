@@ -84,3 +84,15 @@ def test_the_reason_says_when_a_second_run_starts_or_why_none_does(
     decision = decide("hedge:greedy", sites, **fields)
     assert decision.reason.endswith(f"; {said}")
     assert isinstance(decision.second, Hedge) is (" too after " in said)
+
+
+def test_a_first_call_does_not_wait_for_a_server_alone() -> None:
+    """While the first run onboard is under way, a call to a server that is hardly known starts there too."""
+    sites = {ONBOARD: Outlook(in_flight=1, under_way=True), CLOUD: known(0.1, observations=1)}
+    decision = decide("hedge:greedy", sites)
+    assert (decision.site, decision.both) == (CLOUD, False)
+    assert decision.second == Hedge(ONBOARD, pytest.approx(0.1 + 1.645 * 0.01))
+    many = known(1.0, errors=LATE)
+    assert decide("hedge:greedy", sites | {CLOUD: many}).second == Hedge(ONBOARD, 12.25), "later than any"
+    failing = {ONBOARD: Outlook(failures=6), CLOUD: many}
+    assert decide("hedge:greedy", failing).second == Hedge(ONBOARD, 12.25), "it may work again"
