@@ -235,7 +235,7 @@ def test_a_value_too_large_for_the_server_stays_onboard(testbed: Beds, connect: 
 def test_a_blob_that_many_tasks_need_is_uploaded_once(testbed: Beds, connect: Connect) -> None:
     """Eight simultaneous tasks with the same new array of 2 MB send it once."""
     offload = connect(testbed(delay_ms=20.0), policy=CLOUD, timeout_s=5.0, observers=[(sent := []).append])
-    numbers = np.random.default_rng(1).random(250_000)  # which no compression makes smaller
+    numbers = np.frombuffer(np.random.default_rng(1).bytes(2_000_000), np.uint64)  # cannot be compressed
     numbers.flags.writeable = False
     threads = [threading.Thread(target=offload, args=(total, numbers)) for _ in range(8)]
     for thread in threads:
