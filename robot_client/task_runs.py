@@ -91,8 +91,8 @@ class TaskRuns:
         self._begun(pending, site)
         run = pending.runners[site].submit(pending.task_for(site), pending.timeout_s)
         self._clock.wait([run])
-        beside = busy or self._begun_onboard != before
-        self._ended_late(pending, site, result_of(site, run), beside=beside)
+        bound = busy or self._begun_onboard != before
+        self._ended_late(pending, site, result_of(site, run), bound=bound)
 
     def learn(self, pending: PendingTask, executions: Sequence[Execution]) -> None:
         """Learn the runs that have ended by now. Called under the lock."""
@@ -134,11 +134,11 @@ class TaskRuns:
             return self._allowance.take_duplicate()
 
     def _ended_late(
-        self, pending: PendingTask, site: str, execution: Execution, *, beside: bool | None = None
+        self, pending: PendingTask, site: str, execution: Execution, *, bound: bool | None = None
     ) -> None:
         """A run has ended after its task was answered; called in any thread."""
         with self._lock:
             self._flights.end(site, pending.task.id, now_s=self._clock.now_s())
             if execution.started and not self._life.closed:
-                self._learner.learn_late(pending, execution, beside=beside)
+                self._learner.learn_late(pending, execution, bound=bound)
             self.late.append(Late(pending.id, execution.without_value()))

@@ -75,22 +75,22 @@ class Learner:
         for execution in ended:
             self._learn_one(pending, execution, work)
 
-    def learn_late(self, pending: PendingTask, execution: Execution, *, beside: bool | None = None) -> None:
+    def learn_late(self, pending: PendingTask, execution: Execution, *, bound: bool | None = None) -> None:
         """Learn a run that ended after another site had answered.
 
-        `beside`: the robot ran tasks itself meanwhile (None: by the decision).
+        `bound`: the robot ran tasks itself meanwhile (None: the decision says it).
         """
-        self._learn_one(pending, execution, pending.memory.work_of(execution), beside=beside)
+        self._learn_one(pending, execution, pending.memory.work_of(execution), bound=bound)
 
     def _learn_one(
-        self, pending: PendingTask, execution: Execution, work: float | None, *, beside: bool | None = None
+        self, pending: PendingTask, execution: Execution, work: float | None, *, bound: bool | None = None
     ) -> None:
         self._spend(execution)
         site, decision = execution.site, pending.decision
         memory = pending.memory.site(site)
-        if beside is None:
+        if bound is None:
             second_here = decision.second is not None and decision.second.site == site
-            beside = site != ONBOARD and decision.site == ONBOARD and (decision.both or second_here)
+            bound = site != ONBOARD and decision.site == ONBOARD and (decision.both or second_here)
         if site != ONBOARD:
             pending.memory.packing.learn(execution)
         execution.held_up = not execution.ok and memory.measured and _held_up(pending.runners[site])
@@ -101,7 +101,7 @@ class Learner:
             silent=execution.held_up,
             size=pending.task.size,
             work=work,
-            beside=beside,
+            bound=bound,
         )
         if isinstance(decision.second, Probe) and site in (decision.site, decision.second.site):
             pending.ended[site] = execution

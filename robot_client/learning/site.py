@@ -134,14 +134,14 @@ class SiteMemory:
         silent: bool,
         size: Size,
         work: float | None = None,
-        beside: bool = False,
+        bound: bool = False,
     ) -> None:
         """Learn from an execution; `outlook` is what was expected of it, and `amount` what it was asked for.
 
         A failed run is learned as the time until it was given up: the one addition to Algorithm 1. If the
         model learns no failures, such a time only means that the true time is longer, and a run that failed
         before its predicted time says nothing. A run that failed while the site is `silent` never says
-        anything. With `beside`, the robot ran the same task itself.
+        anything. `bound`: as in `Run`.
         """
         expected_s, ok = outlook.predicted_s if outlook else None, execution.ok
         overtaken = not ok and isinstance(execution.failure, Overtaken)
@@ -157,7 +157,7 @@ class SiteMemory:
         if amount is None or (not ok and not self._is_longer(execution, expected_s, silent=silent)):
             return
         waited_s = self._waited_s(execution, outlook)
-        to_interval = not beside and self._tells_of_the_interval(execution, outlook)
+        to_interval = not bound and self._tells_of_the_interval(execution, outlook)
         self._take(
             Observation(
                 size=size,
@@ -173,7 +173,7 @@ class SiteMemory:
                 cpu_s=execution.cpu_s,
                 run_s=execution.run_s,
                 queue_s=execution.queue_s,
-                bound=beside,
+                bound=bound,
             )
         )
 

@@ -108,7 +108,7 @@ class Weighing:
     """What tasks take from the battery, and what the objective makes of a forecast."""
 
     def __init__(self, objective: Objective, energy: Energy) -> None:
-        self.energy = energy
+        self._energy = energy
         self._objective = None if isinstance(objective, Mean) else objective  # a cost of None means the same
 
     def weighed(self, forecast: Forecast, *, capped: bool) -> Forecast:
@@ -129,14 +129,14 @@ class Weighing:
     def joules(self, execution: Execution) -> float:
         """What an execution took, in joules."""
         if execution.site == ONBOARD:
-            return self.energy.onboard_j(execution.cpu_s or execution.run_s or execution.seconds)
-        return self.energy.remote_j(execution.seconds, execution.bytes_out + execution.bytes_in)
+            return self._energy.onboard_j(execution.cpu_s or execution.run_s or execution.seconds)
+        return self._energy.remote_j(execution.seconds, execution.bytes_out + execution.bytes_in)
 
     def _expected_j(self, site: str, one: Outlook) -> float:
         assert one.predicted_s is not None
         if site == ONBOARD:
-            return self.energy.onboard_j((one.predicted_s - one.condition.wait_s) * one.cpu_share)
-        return self.energy.remote_j(one.predicted_s, one.bytes)
+            return self._energy.onboard_j((one.predicted_s - one.condition.wait_s) * one.cpu_share)
+        return self._energy.remote_j(one.predicted_s, one.bytes)
 
 
 def by_deadline(forecast: Forecast, deadline_s: float, *, slowest_s: float | None) -> Forecast:

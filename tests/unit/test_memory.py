@@ -63,12 +63,12 @@ def learn(
     silent: bool = False,
     condition: Condition = UNMEASURED,
     in_flight: int = 0,
-    beside: bool = False,
+    bound: bool = False,
 ) -> None:
     site = of.site(execution.site)
     expected = outlook(of, execution.site, condition, in_flight=in_flight)
     of.count_task()
-    site.learn(1.0, execution, expected, silent=silent, size=1.0, beside=beside)
+    site.learn(1.0, execution, expected, silent=silent, size=1.0, bound=bound)
 
 
 def known(predictor: str = predictors.PARTS) -> KindMemory:
@@ -174,7 +174,7 @@ def test_the_time_of_a_server_during_an_onboard_run_is_an_upper_bound(
     """The network took at most the rest of the time; the age of the site starts anew in any case."""
     one = known(predictor)
     for _ in range(100):
-        learn(one, Execution(CLOUD, seconds, queue_s=0.0, run_s=run_s, bytes_out=100), beside=True)
+        learn(one, Execution(CLOUD, seconds, queue_s=0.0, run_s=run_s, bytes_out=100), bound=True)
         assert one.site(CLOUD).age == 0
     assert outlook(one).predicted_s == pytest.approx(learnt_s, rel=0.05)
 
@@ -184,7 +184,7 @@ def test_a_time_that_was_perhaps_received_late_is_no_error_of_the_interval() -> 
     one = known()
     before = outlook(one)
     for _ in range(20):
-        learn(one, Execution(CLOUD, 0.6, queue_s=0.0, run_s=RUN_S, bytes_out=100), beside=True)
+        learn(one, Execution(CLOUD, 0.6, queue_s=0.0, run_s=RUN_S, bytes_out=100), bound=True)
     assert outlook(one).high_s == pytest.approx(before.high_s, rel=0.05)
 
 
