@@ -103,7 +103,7 @@ def _compared(one: Answered, work: Calls, expected: dict[str, Any]) -> Answered:
     found, wanted = work.restore(one.answer), work.restore(expected)
     assert work.same is not None
     try:
-        same = work.same(found, wanted)
+        same = bool(work.same(found, wanted))  # of an array, this raises
     except Exception as error:  # noqa: BLE001 - a wrong answer may be of a type that `same` does not expect
         return replace(one, wrong=f"{found!r:.200} cannot be compared: {describe(error)}")
     return one if same else replace(one, wrong=f"{found!r:.200}, but {wanted!r:.200} was expected")

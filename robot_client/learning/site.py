@@ -108,13 +108,13 @@ class SiteMemory:
                 sending=sending,
             )
         seconds = found.seconds + condition.wait_s
-        spread_s, error_s = found.spread_s, found.error_s or 0.0
+        spread_s, error_s, quality = found.spread_s, found.error_s or 0.0, self._quality
         low_s, high_s = self._conformal.interval(seconds, spread_s, error_s) or (None, None)
         # All fields in their order: with keywords, it takes three times as long.
         return Outlook._make((
             seconds, spread_s, model.full, self.age, self._failures, len(model),
             low_s, high_s, found.error_s, in_flight, moved, self._cpu_share.value or 1.0, condition,
-            self._conformal.errors, self._quality, packing, sending, under_way, None, 0.0, None,
+            self._conformal.errors, quality, packing, sending, under_way, None, 0.0, seconds + quality.lost_s,
         ))  # fmt: skip
 
     def slowest_s(self, amount: Size | None) -> float:

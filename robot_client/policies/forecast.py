@@ -131,7 +131,7 @@ class Outlook(NamedTuple):
     `sending`: what a run there would send, and `packing`: what of it should be made smaller; None: nothing.
     `in_time`: the probability that a call sent there is answered by its deadline; None: it has none.
     `joules`: what running the task there should take from the battery, if an objective or a cap asks for it.
-    `cost`: what the objective makes of all this; less is better. None: it is the expected time.
+    `cost`: what the objective makes of all this; less is better.
 
     Build it with keywords. It is a named tuple because every task needs one for each site, and a frozen
     dataclass takes twice as long to build.
@@ -226,7 +226,8 @@ def cheapest(costs: Mapping[str, float]) -> str:
 def costs_of(forecast: Forecast) -> dict[str, float]:
     """The cost of each site."""
     return {
-        site: _expected_cost(one) if one.cost is None else one.cost for site, one in forecast.sites.items()
+        site: _cost_without_objective(one) if one.cost is None else one.cost
+        for site, one in forecast.sites.items()
     }
 
 
@@ -244,11 +245,8 @@ def home(forecast: Forecast) -> str:
     return ONBOARD if ONBOARD in forecast.sites else cheapest(costs_of(forecast))
 
 
-def _expected_cost(outlook: Outlook) -> float:
-    """The expected time and the worth of the lost quality, in seconds.
-
-    An unknown site costs nothing, so that it is tried, unless it is silent or was given up.
-    """
+def _cost_without_objective(outlook: Outlook) -> float:
+    """An unknown site costs nothing, so that it is tried, unless it is silent or was given up."""
     if outlook.predicted_s is None:
         return math.inf if outlook.condition.silent or outlook.given_up else 0.0
-    return outlook.predicted_s + outlook.quality.lost_s
+    return outlook.predicted_s

@@ -109,10 +109,10 @@ class Weighing:
 
     def __init__(self, objective: Objective, energy: Energy) -> None:
         self._energy = energy
-        self._objective = None if isinstance(objective, Mean) else objective  # a cost of None means the same
+        self._objective = None if isinstance(objective, Mean) else objective  # every outlook has that cost
 
     def weighed(self, forecast: Forecast, *, capped: bool) -> Forecast:
-        """The same forecast with the cost of each site, and with its joules if the tasks are `capped`."""
+        """The same forecast with the cost and the joules of each site, if an objective or a cap asks."""
         objective = self._objective
         if objective is None and not capped:
             return forecast
@@ -121,9 +121,9 @@ class Weighing:
             if one.predicted_s is None:
                 sites[site] = one
                 continue
-            known = one._replace(joules=self._expected_j(site, one))
-            cost = None if objective is None else objective.cost(_expected(known), known.errors)
-            sites[site] = known._replace(cost=cost)
+            known = sites[site] = one._replace(joules=self._expected_j(site, one))
+            if objective is not None:
+                sites[site] = known._replace(cost=objective.cost(_expected(known), known.errors))
         return forecast._replace(sites=sites)
 
     def joules(self, execution: Execution) -> float:

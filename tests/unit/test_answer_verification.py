@@ -74,6 +74,7 @@ def test_an_answer_is_compared_with_that_of_the_variant_that_gave_it() -> None:
         (lambda right: right + 0.9 * frames.BRIGHTER, None),
         (lambda right: right + 1.1 * frames.BRIGHTER, "{'mean': .*}, but {'mean': .*} was expected"),
         (lambda _: "bright", "{'mean': 'bright'} cannot be compared: TypeError: "),
+        (lambda right: np.array([right, right]), r"{'mean': array\(.*\)} cannot be compared: ValueError: "),
     ],
 )
 def test_answers_may_differ_within_the_tolerance_of_their_task(mean: Any, wrong: str | None) -> None:

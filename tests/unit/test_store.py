@@ -21,7 +21,7 @@ def robot(tmp_path: Path) -> Robot:
 
 @pytest.mark.parametrize("name", [LEAST_SQUARES, PARTS])
 def test_a_restart_at_once_predicts_the_same(robot: Robot, name: str) -> None:
-    """Predictions, intervals, bytes and shares of a CPU are equal to 1e-9, with every predictor."""
+    """Predictions, intervals, bytes, shares of a CPU and costs are equal to 1e-9, with every predictor."""
     with robot.started(name) as offload:
         robot.ask(offload, 150, store_worked)
         before = robot.outlooks(offload, store_worked)
@@ -35,6 +35,7 @@ def test_a_restart_at_once_predicts_the_same(robot: Robot, name: str) -> None:
             "high_s",
             "bytes",
             "cpu_share",
+            "cost",
             "observations",
             "full",
         ):
