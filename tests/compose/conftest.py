@@ -85,7 +85,7 @@ class Compose:
 
 def docker(*args: str) -> str:
     done = subprocess.run(["docker", *args], cwd=ROOT, capture_output=True, text=True, timeout=COMMAND_S)
-    assert done.returncode == 0, f"docker {' '.join(args)}:\n{done.stderr[-3000:]}"
+    assert done.returncode == 0, f"docker {' '.join(args)}:\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}"
     return done.stdout.strip()
 
 
