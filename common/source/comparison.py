@@ -23,7 +23,7 @@ def difference(kind: Kind, site: str, there: Mapping[str, str], software: str = 
         return f"the server has no task {name}"
     if _other_source(kind, there[name]):
         if not kind.variants:
-            return f"the source of task {name} differs on the server{versions(software)}"
+            return f"{source_of(kind)} differs on the server{versions(software)}"
         if not any(one.name in there for one in kind.variants.values()):
             return f"task {name} has no variants on the server"
         shared = "the parameters, dataclasses, packing, version or covered functions"
@@ -39,6 +39,12 @@ def difference(kind: Kind, site: str, there: Mapping[str, str], software: str = 
         what = f"the source of {variant.name}, a variant of task {name},"
         return f"{what} differs on the server{versions(software)}"
     return _other_files(variant, known)
+
+
+def source_of(kind: Kind) -> str:
+    """What the source hash of a kind covers, in words."""
+    covered = " or the code that it covers" if kind.covers.code else ""
+    return f"the source of task {kind.name}{covered}"
 
 
 def versions(software: str) -> str:
@@ -72,5 +78,7 @@ def _other_files(one: Kind, known: str) -> str | None:
     if not files.digest:
         return f"the files that {one.name} covers are being read"
     if known[HASH_LENGTH:] != files.digest:
-        return f"a file that {one.name} covers differs on the server"
+        names = [path.name for path in files.paths]
+        which = names[0] if len(names) == 1 else f"one of the files {', '.join(names)}"
+        return f"{which}, which {one.name} covers, differs on the server"
     return None

@@ -31,6 +31,8 @@ NEEDS_SAME = (
     "module of the task needs a function same(a, b) that compares them (docs/own_task.md, Send less)"
 )
 
+RETURNS_NOTHING = "same(a, b) returned None, and must return whether they are equal"
+
 
 def verified(answered: Sequence[Answered], workload: Workload, seed: int) -> list[Answered]:
     """The same tasks with `wrong` and `unverified` filled in; unchanged if the tasks cannot be made again.
@@ -103,7 +105,10 @@ def _compared(one: Answered, work: Calls, expected: dict[str, Any]) -> Answered:
     found, wanted = work.restore(one.answer), work.restore(expected)
     assert work.same is not None
     try:
-        same = bool(work.same(found, wanted))  # of an array, this raises
+        said = work.same(found, wanted)
+        if said is None:
+            raise TypeError(RETURNS_NOTHING)
+        same = bool(said)  # of an array, this raises
     except Exception as error:  # noqa: BLE001 - a wrong answer may be of a type that `same` does not expect
         return replace(one, wrong=f"{found!r:.200} cannot be compared: {describe(error)}")
     return one if same else replace(one, wrong=f"{found!r:.200}, but {wanted!r:.200} was expected")

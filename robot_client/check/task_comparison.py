@@ -59,7 +59,8 @@ def compare(
             continue
         if not kind.variants and other_sources({kind.name: kind.source_hash}, there):
             hashes = f"{_short(kind.source_hash)} here, {_short(there[kind.name])} on the server"
-            why = f"{kind.name} differs: its source is {hashes}{versions(software)}"
+            what = "its source, with the code that it covers," if kind.covers.code else "its source"
+            why = f"{kind.name} differs: {what} is {hashes}{versions(software)}"
         what = module if software == SOFTWARE else f"Offboard and of {module}"
         raise StepFailed(why, f"install the same version of {what} on both sides, and restart the server")
     if not tasks:

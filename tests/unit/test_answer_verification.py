@@ -12,7 +12,13 @@ import pytest
 from offboard.common.errors import OffloadError
 from offboard.common.planning.planner import plan_path
 from offboard.common.task_states import TaskStates
-from offboard.loadgen.play.answer_verification import NEEDS_SAME, verified, wrong_plan
+from offboard.loadgen.play.answer_verification import (
+    NEEDS_SAME,
+    RETURNS_NOTHING,
+    _repeated,
+    verified,
+    wrong_plan,
+)
 from offboard.loadgen.robot import answers
 from offboard.loadgen.robot.work import make_work
 from offboard.loadgen.scenario.outcome import Answered
@@ -86,6 +92,18 @@ def test_answers_may_differ_within_the_tolerance_of_their_task(mean: Any, wrong:
     assert judged.unverified is None
     assert (judged.wrong is None) == (wrong is None)
     assert wrong is None or re.match(wrong, judged.wrong or "")
+
+
+def test_a_comparison_that_returns_nothing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A `same` without `return` would make each answer with other bytes wrong, and nobody would know why."""
+    right = answered_rightly(INPUTS)[3]
+    monkeypatch.setattr(frames, "same", lambda *_: None)
+    _repeated.cache_clear()
+    answer = answers.of_value({"mean": 0.0}, (), whole=True)
+    (judged,) = verified([replace(right, answer=answer)], INPUTS, SEED)
+    _repeated.cache_clear()
+    assert judged.wrong is not None
+    assert judged.wrong.endswith("cannot be compared: TypeError: " + RETURNS_NOTHING)
 
 
 @pytest.mark.parametrize("used", ["cloud", "onboard"])

@@ -254,7 +254,7 @@ def test_a_slow_file_keeps_no_call_waiting(made: Made, tmp_path: Path) -> None:
     go_on.set()
     read_files_of_robot(kind)
     assert not is_reading(kind)
-    assert difference(kind, CLOUD, there) == "a file that covering covers differs on the server"
+    assert difference(kind, CLOUD, there) == "model.bin, which covering covers, differs on the server"
     assert difference(kind, CLOUD, hashes()) is None
 
 
@@ -263,7 +263,9 @@ def test_other_source_is_said_before_files_are_read(made: Made, tmp_path: Path) 
     (tmp_path / "model.bin").write_bytes(b"weights")
     kind = made("(helper, 'model.bin')")
     there = {"covering": "f" * 128}
-    assert difference(kind, CLOUD, there) == "the source of task covering differs on the server"
+    assert difference(kind, CLOUD, there) == (
+        "the source of task covering or the code that it covers differs on the server"
+    )
 
 
 VARIANTS = """from offboard.common.tasks import task
@@ -324,7 +326,7 @@ def test_a_model_of_the_server_that_the_robot_has_is_compared(
     read_files_of_robot(kind)
     assert difference(kind, CLOUD, there) is None
     there["by_site@cloud"] = kind.at(CLOUD).source_hash + "f" * 64
-    assert difference(kind, CLOUD, there) == "a file that by_site@cloud covers differs on the server"
+    assert difference(kind, CLOUD, there) == "large.bin, which by_site@cloud covers, differs on the server"
 
 
 def test_covers_that_are_not_by_site_belong_to_all_variants(by_site: Callable[[str], Kind]) -> None:
