@@ -1,8 +1,8 @@
 """Plays recorded links on real processes, and in simulation with the costs of tasks on this machine.
 
-`python -m benchmarks.recordings_agree link-plans`: for each recording of a folder, the mean of the default over
-that of the better constant. It is simulated twice: with the costs of `task_costs.py`, which are those of another
-machine, and with those that three runs over a link without a recording have shown here.
+`python -m benchmarks.recordings_agree link-plans`: for each recording of a folder, the mean of the default
+over that of the better constant. It is simulated twice: with the costs of `task_costs.py`, which are those of
+another machine, and with those that three runs over a link without a recording have shown here.
 """
 
 import argparse
@@ -27,7 +27,7 @@ from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.simulation import simulated_testbed
 from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks, find_tasks
-from offboard.loadgen.simulation.model.task_costs import Cost
+from offboard.loadgen.simulation.model.task_costs import DECIDING_CPU_S, Cost
 from offboard.loadgen.simulation.simulated_run import simulate
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
@@ -40,23 +40,22 @@ MEASURED_TASKS = 100
 
 @dataclass(frozen=True, slots=True)
 class Costs:
-    """What a task costs on this machine, and the CPU seconds of the robot to decide about one."""
+    """What a task costs, and the CPU seconds of the robot to decide about one; None: as `task_costs` says."""
 
-    task: Cost
-    deciding_s: float
+    task: Cost | None = None
+    deciding_s: float = DECIDING_CPU_S
 
 
 def measure(scenario: Scenario, out: Path) -> Costs:
-    """Play each policy over the link of the scenario without its recording, and take the costs from the traces."""
+    """The costs by the traces of each policy over the link of the scenario without its recording."""
     link = {key: value for key, value in scenario.link.items() if "recording" not in key}
-    steady = replace(scenario, name=f"{scenario.name}-steady", link=link).changed(
-        tasks=MEASURED_TASKS, reference=0
-    )
-    records: dict[str, list[dict[str, Any]]] = {}
+    steady = replace(scenario, name=f"{scenario.name}-steady", link=link)
+    steady = steady.changed(tasks=MEASURED_TASKS, reference=0)
+    records: dict[str, list[Mapping[str, Any]]] = {}
     for policy in POLICIES:
         folder = out / steady.name / policy
         play_once(steady.changed(policy=policy), folder, "local", STOLEN_MAX)
-        records[policy] = list(read_trace(next(RobotFiles.of(steady, folder)).trace))
+        records[policy] = list(read_trace(next(iter(RobotFiles.of(steady, folder))).trace))
     tasks, lines = tasks_of(steady)[ROBOT].tasks, {}
     for site in (ONBOARD, CLOUD):
         runs = [(tasks[line["i"]].work[site], one["cpu_s"]) for line, one in runs_of(records[site], site)]
@@ -67,25 +66,26 @@ def measure(scenario: Scenario, out: Path) -> Costs:
         for _, one in runs_of(records[CLOUD], CLOUD)
     )
     deciding_s = median(
-        line["waited_s"] - min(one["seconds"] for one in line["executions"] if one["ok"])
+        line["waited_s"] - line["executions"][0]["seconds"]
         for line in records["default"]
         if len(line["executions"]) == 1
     )
-    slope, fixed_s = lines[ONBOARD]
+    slope, fixed_s = map(float, lines[ONBOARD])
     cpus = scenario.robot.cpus
-    cost = Cost(max(0.0, float(fixed_s)), float(slope), max(0.0, cpus * sending_s))
+    cost = Cost(max(0.0, fixed_s), slope, max(0.0, cpus * sending_s))
     costs = Costs(cost, max(0.0, cpus * deciding_s))
     print(f"{steady.name}: {costs}; on the server {lines[CLOUD]}", file=sys.stderr)
     return costs
 
 
 def runs_of(
-    records: Sequence[Mapping[str, Any]], site: str
+    records: Iterable[Mapping[str, Any]], site: str
 ) -> Iterator[tuple[Mapping[str, Any], Mapping[str, Any]]]:
+    """The good runs on a site, each with the line of its task."""
     for line in records:
         for one in line["executions"]:
             if one["site"] == site and one["ok"]:
-                yield dict(line), one
+                yield line, one
 
 
 def tasks_of(scenario: Scenario) -> dict[str, RobotTasks]:
@@ -95,37 +95,34 @@ def tasks_of(scenario: Scenario) -> dict[str, RobotTasks]:
     }
 
 
-def simulated(scenario: Scenario, tasks: Mapping[str, RobotTasks], costs: Costs | None) -> Outcome:
-    if costs is None:
-        return simulate(scenario, tasks)
+def simulated(scenario: Scenario, tasks: Mapping[str, RobotTasks], costs: Costs) -> Outcome:
     simulated_testbed.DECIDING_CPU_S = costs.deciding_s
-    return simulate(scenario, {name: replace(one, cost=costs.task) for name, one in tasks.items()})
+    if costs.task is not None:
+        tasks = {name: replace(one, cost=costs.task) for name, one in tasks.items()}
+    return simulate(scenario, tasks)
 
 
 def ratio(
     link: RecordedLink, scenario: Scenario, runs: Mapping[str, Outcome]
 ) -> tuple[float, dict[str, float]]:
+    """The default over the better constant, and the mean of each policy in milliseconds."""
     compared = scenario.compared()
     found = figures_of(link.family, link.name, {name: [run.of(compared)] for name, run in runs.items()})
     return found.mean_ratio("default"), {name: 1e3 * found.taken[name].mean_s for name in POLICIES}
 
 
 def compare(name: str, links: Sequence[RecordedLink], tasks: int, out: Path) -> Table:
+    """A line for each recording; the last one has the geometric means."""
     scenario = read_scenario(find_scenario(name)).changed(tasks=tasks, reference=0)
-    costs = measure(scenario, out)
-    as_is = simulated_testbed.DECIDING_CPU_S
-    rows, ratios = [], []
+    costs, rows, ratios = measure(scenario, out), [], []
     for n, link in enumerate(links):
         unit = over(scenario, link, scenario.seed)
         known = tasks_of(unit)
-        turned = (*POLICIES[n % 3 :], *POLICIES[: n % 3])
-        played = {
-            one: play_once(unit.changed(policy=one), out / unit.name / one, "local", STOLEN_MAX).outcome
-            for one in turned
-        }
-        ways = [played]
-        for way in (None, costs):
-            simulated_testbed.DECIDING_CPU_S = as_is
+        ways: list[dict[str, Outcome]] = [{}]
+        for policy in (*POLICIES[n % 3 :], *POLICIES[: n % 3]):  # each comes first equally often
+            played = play_once(unit.changed(policy=policy), out / unit.name / policy, "local", STOLEN_MAX)
+            ways[0][policy] = played.outcome
+        for way in (Costs(), costs):
             ways.append({one: simulated(unit.changed(policy=one), known, way) for one in POLICIES})
         found = [ratio(link, unit, way) for way in ways]
         ratios.append([one for one, _ in found])
@@ -134,27 +131,27 @@ def compare(name: str, links: Sequence[RecordedLink], tasks: int, out: Path) -> 
         print(" | ".join(rows[-1]), file=sys.stderr, flush=True)
     all_of = [geometric([one[way] for one in ratios]) for way in range(3)]
     rows.append(["geometric mean", *(f"{one:.3f}" for one in all_of), "", "", ""])
-    ways = ("processes", "simulation", "simulation with the costs of this machine")
-    columns = ["recording", *ways, *(f"ms, {way}: default / onboard / cloud" for way in ways)]
-    differs = abs(all_of[2] / all_of[0] - 1)
-    return Table(
-        f"{name}: {tasks} tasks over each recording, default over the better constant",
-        columns,
-        rows,
-        [Requirement("processes and simulation differ by", differs, DIFFER_MAX)],
-    )
+    names = ("processes", "simulation", "simulation, costs of this machine")
+    columns = ["recording", *names, *(f"{one}: default / onboard / cloud, ms" for one in names)]
+    differ = Requirement("processes and simulation differ by", abs(all_of[2] / all_of[0] - 1), DIFFER_MAX)
+    title = f"{name}: {tasks} tasks over each recording, default over the better constant"
+    return Table(title, columns, rows, [differ])
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scenario", nargs="+")
-    parser.add_argument("--recordings", type=Path, default=Path("loadgen/links"))
-    parser.add_argument("--tasks", type=int, default=300)
-    parser.add_argument("--out", type=Path, default=Path("out/recordings-agree"))
-    args = parser.parse_args()
-    links = find_recordings(args.recordings)
-    for name in args.scenario:
-        print(compare(name, links, args.tasks, args.out), flush=True)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.recordings_agree", description=__doc__)
+    parser.add_argument("scenario", nargs="+", help="some of link-plans, link-frames and link-images")
+    parser.add_argument(
+        "--recordings", type=Path, default=Path("loadgen/links"), help="(default: %(default)s)"
+    )
+    parser.add_argument("--tasks", type=int, default=300, help="over each recording (default: %(default)s)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/recordings-agree"), help="(default: %(default)s)"
+    )
+    flags = parser.parse_args()
+    links = find_recordings(flags.recordings)
+    for name in flags.scenario:
+        print(compare(name, links, flags.tasks, flags.out), flush=True)
     return 0
 
 
