@@ -63,6 +63,7 @@ COSTS: Mapping[str, Cost] = {
     "hash_rarely_long": HASH,
     "hash_rarely_long_everywhere": HASH,
     "look_at_frame": replace(HASH, sending_s=0.9e-3),  # 0.9 ms more for each MB
+    "look_at_any_frame": replace(HASH, sending_s=0.9e-3),
     "judge_image": replace(HASH, sending_s=1.2e-3),
 }
 PARTS = {ONBOARD: ROBOT, CLOUD: CLOUD_PART}  # the part of the testbed that runs a site
@@ -72,6 +73,7 @@ ROUNDS: Mapping[str, Callable[[str, Any], int]] = {
     "hash_rarely_long": lambda site, rounds: rounds_on(PARTS[site], rounds),
     "hash_rarely_long_everywhere": lambda _, rounds: rounds_on(EVERYWHERE, rounds),
     "look_at_frame": lambda _, frame: frame_rounds(frame),
+    "look_at_any_frame": lambda _, frame: frame_rounds(frame),
     "judge_image": lambda site, _: image_rounds(PARTS[site]),
 }
 
