@@ -23,7 +23,8 @@ def difference(kind: Kind, site: str, there: Mapping[str, str], software: str = 
         return f"the server has no task {name}"
     if _other_source(kind, there[name]):
         if not kind.variants:
-            return f"{source_of(kind)} differs on the server{versions(software)}"
+            covered = " or the code that it covers" if kind.covers.code else ""
+            return f"the source of task {name}{covered} differs on the server{versions(software)}"
         if not any(one.name in there for one in kind.variants.values()):
             return f"task {name} has no variants on the server"
         shared = "the parameters, dataclasses, packing, version or covered functions"
@@ -39,12 +40,6 @@ def difference(kind: Kind, site: str, there: Mapping[str, str], software: str = 
         what = f"the source of {variant.name}, a variant of task {name},"
         return f"{what} differs on the server{versions(software)}"
     return _other_files(variant, known)
-
-
-def source_of(kind: Kind) -> str:
-    """What the source hash of a kind covers, in words."""
-    covered = " or the code that it covers" if kind.covers.code else ""
-    return f"the source of task {kind.name}{covered}"
 
 
 def versions(software: str) -> str:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from offboard.common.errors import CloudTimeout
 from offboard.common.tasks import kind_of, task
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.learning.kind import KindMemory
@@ -52,6 +53,12 @@ class Robot:
             duplicates=3.0,
         )
 
+    def lose(self, size: float, condition: Condition) -> None:
+        """A run on the silent server times out."""
+        lost = Execution(CLOUD, 2.0, failure=CloudTimeout("no answer"), censored=True)
+        expected = self.forecast(size, condition).sites[CLOUD]
+        self._memory.site(CLOUD).learn(size, lost, expected, silent=True, size=size)
+
     def reason(self, size: float, condition: Condition) -> str:
         return policies.make("default").decide(self.forecast(size, condition)).reason
 
@@ -61,6 +68,7 @@ def test_the_page_shows_what_the_default_decides() -> None:
     robot = Robot()
     late, silent = robot.near._replace(wait_s=0.12), robot.near._replace(wait_s=0.3, silent=True)
     reasons = [robot.reason(3.0, one) for one in (robot.near, late, silent)]
+    robot.lose(3.0, silent)
     assert robot.reason(3.0, robot.near) == reasons[0], "after the outage"
     page = PAGE.read_text()
     found = [page.find(f"\n{reason}\n") for reason in reasons]
