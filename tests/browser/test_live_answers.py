@@ -15,7 +15,7 @@ from offboard.robot_client.records.trace import Record, as_dict
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution
 from tests.unit.test_trace import record
 
-pytestmark = [pytest.mark.browser, pytest.mark.timeout(60)]
+pytestmark = pytest.mark.browser
 
 SOON_MS = 10_000
 TASKS = 60

@@ -68,7 +68,6 @@ def flood(endpoint: str, rate: float) -> None:
     print(statuses["ok"], statuses["busy"])
 
 
-@pytest.mark.timeout(60)  # it measures twice for SECONDS
 def test_a_flood_takes_its_share_and_no_more() -> None:
     """At 50 times its share it gets `busy`; the others keep 75 % of their answers, and differ by 10 %."""
     with cloud_server("tests.probes", CLOUD_WORKERS="1") as server:

@@ -17,7 +17,7 @@ from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.robot_client.offloader import Offloader
 from tests.probes import echo, nap
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
+pytestmark = pytest.mark.integration
 
 WAIT_S = 5.0
 

@@ -19,7 +19,7 @@ from offboard.robot_client.sites.connection import LOG_LINES_MAX, LOG_PAUSE_S
 from tests.integration.test_heartbeats import Peer, met
 from tests.probes import echo
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
+pytestmark = pytest.mark.integration
 
 HEARTBEAT_S = 0.1
 ROUNDS = 300

@@ -11,7 +11,7 @@ import pytest
 from offboard.common.live.live_files import LOOKS
 from tests.probes import echo
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
+pytestmark = pytest.mark.integration
 
 
 def free_address() -> str:

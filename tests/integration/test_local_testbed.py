@@ -18,7 +18,7 @@ from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.loadgen.testbed.part_process import Part
 from offboard.loadgen.testbed.testbed import Setup
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
+pytestmark = pytest.mark.integration
 
 WAIT_S = 10.0
 WAN = """

@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 TASKS = 5
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
+pytestmark = pytest.mark.integration
 
 
 def test_robot_and_server_log_each_task_as_json(testbed: Callable[..., Any]) -> None:

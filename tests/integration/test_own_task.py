@@ -12,7 +12,7 @@ import pytest
 
 from offboard.loadgen.play.answer_verification import NEEDS_SAME
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
+pytestmark = pytest.mark.integration
 
 TASK = """from offboard.common.tasks import task
 

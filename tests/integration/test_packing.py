@@ -18,7 +18,7 @@ from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests import packing_tasks
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
+pytestmark = pytest.mark.integration
 
 TASKS = {"tasks": "tests.probes,tests.packing_tasks"}
 SLOW = {"bandwidth_mbps": 20.0, "delay_ms": 5.0}

@@ -225,7 +225,6 @@ def test_a_reset_that_is_due_at_once_is_not_lost(cloud: Any, wan: Any, after_ms:
     wait_until(lambda: connections(relay) == 0)
 
 
-@pytest.mark.timeout(60)
 def test_a_server_that_was_killed_behind_the_relay_is_not_blamed_on_keys(
     wan: Any, caplog: pytest.LogCaptureFixture
 ) -> None:

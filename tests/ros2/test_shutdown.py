@@ -7,7 +7,7 @@ import pytest
 
 from tests.ros2.conftest import RELEASES, ROOT, python_of
 
-pytestmark = [pytest.mark.ros2, pytest.mark.timeout(60)]
+pytestmark = pytest.mark.ros2
 
 
 @pytest.mark.parametrize("release", RELEASES)

@@ -136,7 +136,6 @@ def test_the_figures_of_the_paper_stand_next_to_ours(print_claims: Print) -> Non
     assert claims["onboard residual %, N = 50, full"]["theirs"] == "2.695"
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize("name", ["lstm", "lstm-sequence"])
 def test_only_the_lstm_is_claimed_to_be_worse(name: str) -> None:
     """The paper compares least squares with an LSTM; of other predictors it gives no figure."""

@@ -187,7 +187,6 @@ def test_every_format_can_be_written() -> None:
     assert r"\begin{table*}" in tables([one], replace(CONFIG, format="latex"))
 
 
-@pytest.mark.timeout(60)
 def test_the_shipped_recordings_can_be_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A family of shipped recordings in simulation, one at a time and at a rate."""
     for rate in (None, 4.0):

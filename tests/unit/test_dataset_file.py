@@ -21,7 +21,6 @@ from tests.mazes import warm
 from tests.recorded_rows import of_rows
 
 warm()
-pytestmark = pytest.mark.timeout(60)  # tasks of a simulation are planned for real
 
 WINDOW = 20
 RUNS = {

@@ -86,7 +86,6 @@ def test_no_secret_is_in_the_repository() -> None:
         assert not path.is_file() or not re.search(r"kind: Secret|secret-key *=", path.read_text()), path
 
 
-@pytest.mark.timeout(60)
 def test_kustomize_renders_all_manifests() -> None:
     """`kubectl kustomize` finds the three manifests."""
     assert [one["kind"] for one in kubectl("kustomize", str(FOLDER))] == [
@@ -94,7 +93,6 @@ def test_kustomize_renders_all_manifests() -> None:
     ]
 
 
-@pytest.mark.timeout(60)
 def test_the_documented_commands_make_what_the_pod_mounts(tmp_path: Path) -> None:
     """The commands of docs/deployment.md make the Secret and the ConfigMap that the pod asks for."""
     kubernetes_validate = pytest.importorskip("kubernetes_validate")

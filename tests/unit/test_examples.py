@@ -29,7 +29,6 @@ APPLICATIONS: dict[str, tuple[str, str, dict[str, Any]]] = {
 }
 
 pytestmark = [
-    pytest.mark.timeout(60),
     # These libraries warn about themselves and about newer versions of others.
     pytest.mark.filterwarnings("default::DeprecationWarning", "default::SyntaxWarning"),
 ]

@@ -47,7 +47,6 @@ def offloader(policy: str) -> Offloader:
     )
 
 
-@pytest.mark.timeout(60)  # slow because memory is traced
 @pytest.mark.parametrize("policy", ["paper", policies.DEFAULT])
 def test_memory_does_not_grow_with_the_tasks(policy: str) -> None:
     """After 5,000 tasks even a rarely used site is full, so 2,500 more tasks take no more memory."""

@@ -24,7 +24,6 @@ def error_ahead(name: str, rows: list[tuple[float, float]], split: int) -> float
     return sum(errors) / len(errors)
 
 
-@pytest.mark.timeout(60)
 def test_a_load_that_lasts_is_followed() -> None:
     """If a busy site stays busy for ten tasks, its error is less than half of that on single sizes."""
     rng = random.Random(2)

@@ -55,7 +55,6 @@ def make(name: str) -> Callable[[], Predictor]:
     return lambda: sized(rivals.make(name, checks.WINDOW, seed=3))
 
 
-@pytest.mark.timeout(60)  # the LSTMs are fitted up to ten times
 @pytest.mark.parametrize("check", checks.CONTRACT, ids=lambda check: check.__name__)
 def test_contract(check: Callable[[checks.Make], None], make: checks.Make) -> None:
     """Every check of the contract holds for every predictor."""

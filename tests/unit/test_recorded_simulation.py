@@ -113,7 +113,6 @@ def test_the_oracle_knows_the_rates_to_come() -> None:
     assert back > 10
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize(
     ("name", "recording"), [("link-plans", RURAL), ("link-frames", TRAM)], ids=["5g-rural", "3g-tram"]
 )

@@ -81,7 +81,6 @@ def test_names_are_escaped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert text.count("<p>&lt;b&gt;loud&lt;/b&gt;</p>") == 1
 
 
-@pytest.mark.timeout(60)  # ten charts
 def test_the_same_rows_give_the_same_bytes(tmp_path: Path) -> None:
     """Page and PNGs do not depend on the matplotlib settings of the user, and do not change them."""
     path = write_rows(tmp_path, THOUSAND[:80])

@@ -8,8 +8,6 @@ import pytest
 
 from tests.extras import needs
 
-pytestmark = pytest.mark.timeout(60)  # it starts Python
-
 ROOT = Path(__file__).parents[2]
 WITHOUT = "import sys; sys.modules['rclpy'] = None\n"
 

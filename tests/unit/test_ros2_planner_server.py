@@ -24,8 +24,6 @@ from offboard.ros2.stop import Stop, StoppableClock, StoppableRunner, connect
 from offboard.ros2.world import View, World
 from tests.fakes import ScriptedRunner
 
-pytestmark = pytest.mark.timeout(60)  # the first plan compiles the planner
-
 WAIT_S = 50.0
 begun = threading.Event()
 

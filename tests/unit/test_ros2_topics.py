@@ -21,8 +21,6 @@ from offboard.ros2.planner_server import Outcome
 from offboard.ros2.stop import connect
 from offboard.ros2.topics import SameFrames, Topics
 
-pytestmark = pytest.mark.timeout(60)  # the first plan compiles the planner
-
 WAIT_S = 50.0
 PLAIN = ros.Library(lambda name: SimpleNamespace, lambda values: values)  # noqa: ARG005 - one class for all
 MAP = ros.Header("map")

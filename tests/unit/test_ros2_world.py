@@ -7,8 +7,6 @@ from offboard.common.planning.maps import GridMap
 from offboard.common.planning.planner import Point, Pose, Scan, plan_path
 from offboard.ros2.world import COST_MAX, COSTS, View, World, nearest_free
 
-pytestmark = pytest.mark.timeout(60)  # the first plan compiles the planner
-
 
 class Clock:
     now = 0.0

@@ -22,7 +22,6 @@ from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.mazes import warm
 
 warm()
-pytestmark = pytest.mark.timeout(60)  # tasks of a simulation are planned for real
 
 Simulated = Callable[..., Path]
 

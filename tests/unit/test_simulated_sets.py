@@ -84,7 +84,6 @@ def test_only_large_differences_are_listed() -> None:
     assert rows == [["outage", "1.035", "1.135", "1.035", "+0.100"]]
 
 
-@pytest.mark.timeout(60)  # it starts `loadgen compare`, which compiles the planner
 def test_a_scenario_is_simulated_once(tmp_path: Path) -> None:
     """The second time its figures come from the file; other seeds are simulated again."""
     calm = ScenarioSet([find_scenario("calm")], seeds=1)

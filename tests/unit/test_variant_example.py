@@ -17,7 +17,6 @@ FRAMES = 8
 TOLERANCE = 0.1
 
 pytestmark = [
-    pytest.mark.timeout(60),
     pytest.mark.filterwarnings("default::DeprecationWarning", "default::SyntaxWarning"),  # of pupil_apriltags
 ]
 

@@ -55,7 +55,6 @@ def sizes_stream(kind: str, rng: random.Random, count: int) -> list[float]:
 STREAMS = ("wide", "offset", "jumps", "runs", "outliers", "equal")
 
 
-@pytest.mark.timeout(60)
 @given(
     st.sampled_from(STREAMS),
     st.integers(2, 40) | st.sampled_from([100, 250]),

@@ -27,7 +27,7 @@ from tests.integration.openpi.robot import (
     why_absent,
 )
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
+pytestmark = pytest.mark.integration
 
 TRACEBACK = 'Traceback (most recent call last):\n  File "policy.py", line 1\nValueError: no gripper'
 SHORT_ARRAY = pack({b"__ndarray__": True, b"data": b"1234", b"dtype": "<f4", b"shape": [2]})

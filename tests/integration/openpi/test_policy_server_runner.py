@@ -26,7 +26,7 @@ from tests.integration.openpi.bad_servers import says, serving, stays
 from tests.integration.openpi.robot import START_S, act, until
 from tests.leftovers import left
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
+pytestmark = pytest.mark.integration
 
 ROOT = Path(__file__).parents[3]
 KIND = kind_of(act)

@@ -7,7 +7,7 @@ import pytest
 
 from tests.integration.prometheus.conftest import RULES
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
+pytestmark = pytest.mark.integration
 
 
 def test_the_rules_are_valid(promtool: Any) -> None:

@@ -13,7 +13,7 @@ from prometheus_client import CollectorRegistry
 from offboard.cloud_server.http_api import HttpServer, create_app
 from offboard.cloud_server.metrics import Status
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
+pytestmark = pytest.mark.integration
 
 WAIT_S = 0.02  # between two parts of a request, so that the server reads them one by one
 MUTATED = 100

@@ -19,7 +19,7 @@ from tests.executor_tasks import ON_THIS_COMPUTER
 from tests.integration.server.peers import ROOT, WAIT_S, Join, Peer, Running, Serve, until
 from tests.relays import Wan
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
+pytestmark = pytest.mark.integration
 
 TIMEOUT_S = 40.0  # of the robots: longer than any wait here
 QUEUE = 3

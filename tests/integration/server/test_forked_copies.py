@@ -10,7 +10,7 @@ import pytest
 from tests.executor_tasks import ON_THIS_COMPUTER
 from tests.integration.server.peers import Command, Join, until
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
+pytestmark = pytest.mark.integration
 
 HOW = ("returns", "raises", "exits")
 

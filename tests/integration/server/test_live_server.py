@@ -15,7 +15,7 @@ from offboard.common.live.live_files import LOOKS, PATHS
 from offboard.common.live.look import EVERY_S, VIEWERS_MAX, Look
 from tests.integration.server.peers import WAIT_S, Join, Running, Serve
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(60)]
+pytestmark = pytest.mark.integration
 
 TOKEN = "a-token-of-the-tests"
 
