@@ -150,9 +150,12 @@ def main() -> int:
     )
     flags = parser.parse_args()
     links = find_recordings(flags.recordings)
+    failed = 0
     for name in flags.scenario:
-        print(compare(name, links, flags.tasks, flags.out), flush=True)
-    return 0
+        table = compare(name, links, flags.tasks, flags.out)
+        print(table, flush=True)
+        failed += sum(not requirement.holds for requirement in table.requirements)
+    return failed
 
 
 if __name__ == "__main__":
