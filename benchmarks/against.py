@@ -63,7 +63,7 @@ class Case:
         return text
 
 
-PLANS = ("calm", "outage", "robot-busy", "throttled", "heavy-tail", "bandwidth", "lossy")
+PLANS = ("calm", "outage", "robot-busy", "throttled", "heavy-tail")
 CASES: dict[str, Case] = {
     **{name: Case(name, 150) for name in PLANS},
     **{
