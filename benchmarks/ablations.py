@@ -1,27 +1,48 @@
 """Leaves out one mechanism of the default at a time, and shows what it costs.
 
-    python -m benchmarks.ablations --seeds 4                                     # in simulation
+    python -m benchmarks.ablations --recordings .cache/links                     # in simulation
     python -m benchmarks.ablations --cases apriltags-busy,registration-outage    # real runs
 
-The classes of `left_out` are the predictors without a mechanism. The cases of real runs are those of
-`against`. The command can be stopped and resumed; delete its folder to start anew.
+A mechanism stays only if leaving it out costs more than 1 % in the mean of a set, or more than 3 % in one
+scenario or in one family of recordings, and the 95 % interval of that cost lies above 0. The sets are those
+that nothing was tuned on: other seeds of the shipped scenarios, the scenarios of `unseen`, and every second
+recording of a folder. Scenarios with an objective of their own are left out: they make something else small.
+
+The classes of `left_out` are the predictors and policies without a mechanism. The cases of real runs are
+those of `against`. The command can be stopped and resumed; delete its folder to start anew.
 """
 
 import argparse
+import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from benchmarks.against import CASES, HERE, Played, play, read
 from benchmarks.against import table as table_of_runs
 from benchmarks.against_simulated import add_flags, chosen_sets
 from benchmarks.measure import Table
-from benchmarks.simulated_sets import Checkout, Figures, ScenarioSet, mean, simulate, table
+from benchmarks.simulated_sets import FRESH, NEW, Checkout, ScenarioSet, compare, simulate
+from offboard.loadgen.compare.recordings import find_recordings
+from offboard.loadgen.scenario.scenario_file import read_scenario
+from offboard.loadgen.table.confidence_intervals import Blocks
 from offboard.robot_client import policies
+from offboard.robot_client.policies.objectives import MEAN
 
 NOTHING = "nothing"
-LITTLE = 0.003  # a mechanism that costs less in the mean of every set is listed
+RECORDINGS = "recordings"
+WORKLOADS = ("link-plans", "link-frames", "link-images")  # that are played over the recordings
+SEEDS = 12
+MEAN_COSTS, ONE_COSTS = (
+    0.01,
+    0.03,
+)  # in the mean of a set, and in one scenario or family: so much must it cost
+
+Times = Mapping[tuple[str, str], float]  # by scenario and seed, or by family and recording
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,16 +58,38 @@ class LeftOut:
         return self.policy if self.predictor is None else f"{self.policy}@{self.predictor}"
 
 
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """What leaving out a mechanism costs, as a share of the time with it.
+
+    `low`, `high`: the 95 % interval over scenarios, seeds or recordings; nan: there are too few of them.
+    """
+
+    mean: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        bounds = "" if np.isnan(self.low) else f" [{100 * self.low:+.1f}, {100 * self.high:+.1f}]"
+        return f"{100 * self.mean:+.1f}{bounds}"
+
+
 def _predictor(name: str) -> LeftOut:
     return LeftOut(predictor=f"benchmarks.left_out.{name}")
+
+
+def _policy(name: str) -> LeftOut:
+    return LeftOut(f"benchmarks.left_out.{name}")
 
 
 LEFT_OUT: dict[str, LeftOut] = {
     NOTHING: LeftOut(),
     "hedge": LeftOut("probe:greedy"),
+    "time of the hedge: P95": _policy("HedgeAtP95"),
     "probe": LeftOut("hedge:greedy"),
     "heartbeats": LeftOut(heartbeats=False),
     "round trip of heartbeats": _predictor("RoundTrip"),
+    "stall": _policy("Stall"),
     "work": _predictor("Work"),
     "all parts: total seconds": _predictor("AllParts"),
     "network apart from run": _predictor("NetworkLine"),
@@ -71,10 +114,13 @@ LEFT_OUT: dict[str, LeftOut] = {
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.ablations", description=__doc__)
     parser.add_argument("--left-out", default=",".join(LEFT_OUT), help="some of %(default)s")
+    parser.add_argument(
+        "--recordings", type=Path, metavar="DIR", help="a folder of recordings to judge by, too"
+    )
     parser.add_argument("--cases", help=f"play these instead of simulating: some of {', '.join(CASES)}")
     parser.add_argument("--first-seed", type=int, default=1, help="of the cases (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("out/ablations"), help="(default: %(default)s)")
-    add_flags(parser)
+    add_flags(parser, sets=(FRESH, NEW))
     flags = parser.parse_args()
     names = list(dict.fromkeys([NOTHING, *flags.left_out.split(",")]))
     cases = flags.cases.split(",") if flags.cases else []
@@ -88,23 +134,132 @@ def main() -> int:
         return 0
     found = {}
     for name, scenarios in chosen_sets(parser, flags).items():
-        found[name] = simulate_all(scenarios, names, flags.out.resolve() / name)
-        print(table(f"{name}, left out", found[name], NOTHING), flush=True)
-    print(f"Cost at most {LITTLE} in the mean of every set: {', '.join(cheap(found)) or 'none'}")
+        judged = replace(
+            scenarios,
+            scenarios=[path for path in scenarios.scenarios if read_scenario(path).robot.objective == MEAN],
+            seeds=flags.seeds or SEEDS,
+        )
+        found[name] = simulate_all(judged, names, flags.out.resolve() / name)
+    if flags.recordings is not None:
+        found[RECORDINGS] = over_recordings(flags.recordings, names, flags.out.resolve() / RECORDINGS)
+    print(table(found), flush=True)
     return 0
 
 
-def simulate_all(scenarios: ScenarioSet, names: Sequence[str], out: Path) -> dict[str, Figures]:
-    """Time over oracle without each mechanism."""
-    found = {}
-    for heartbeats, folder in ((True, "with-heartbeats"), (False, "without-heartbeats")):
-        some = [name for name in names if LEFT_OUT[name].heartbeats is heartbeats]
-        if some:
-            strategies = [LEFT_OUT[name].strategy for name in some]
-            flags = [] if heartbeats else ["--no-heartbeats"]
-            played = simulate(Checkout(HERE), scenarios, strategies, out / folder, flags=flags)
-            found |= dict(zip(some, played.values(), strict=True))
-    return {name: found[name] for name in names}
+def simulate_all(scenarios: ScenarioSet, names: Sequence[str], out: Path) -> dict[str, Times]:
+    """Time over oracle without each mechanism, by scenario and seed."""
+    found: dict[str, Times] = {}
+    for folder, flags, some in _by_heartbeats(names):
+        strategies = [LEFT_OUT[name].strategy for name in some]
+        played = simulate(Checkout(HERE), scenarios, strategies, out / folder, flags=flags)
+        for name, of in zip(some, played.values(), strict=True):
+            found[name] = {(scenario, str(seed)): value for (scenario, seed), value in of.items()}
+    return found
+
+
+def over_recordings(
+    folder: Path, names: Sequence[str], out: Path, tasks: int | None = None
+) -> dict[str, Times]:
+    """The mean time of a task without each mechanism, over every second recording of the folder.
+
+    `tasks`: of each run; None: as many as `loadgen compare --recordings` plays.
+    """
+    half = out / "half"
+    for recorded in find_recordings(folder)[1::2]:
+        for path in recorded.files.values():
+            link = half / recorded.family / path.name
+            link.parent.mkdir(parents=True, exist_ok=True)
+            if not link.exists():
+                link.symlink_to(path)
+    found: dict[str, dict[tuple[str, str], float]] = {name: {} for name in names}
+    for sub, flags, some in _by_heartbeats(names):
+        by_strategy = {LEFT_OUT[name].strategy: name for name in some}
+        for workload in WORKLOADS:
+            kept = out / sub / f"{workload}.json"
+            strategies = [*by_strategy, "onboard", "cloud"]
+            if not kept.is_file() or json.loads(kept.read_text())["strategies"] != strategies:
+                print(f"{out.name}: {workload}", file=sys.stderr, flush=True)
+                asked = ["--recordings", str(half), "--policies", ",".join(strategies), *flags]
+                asked += [] if tasks is None else ["--tasks", str(tasks)]
+                said = compare(Checkout(HERE), [workload], asked)
+                kept.parent.mkdir(parents=True, exist_ok=True)
+                kept.write_text(json.dumps({"strategies": strategies, "said": said}))
+            for line in recording_lines(json.loads(kept.read_text())["said"]):
+                if line["policy"] in by_strategy:
+                    key = line["family"], f"{workload}/{line['recording']}"
+                    found[by_strategy[line["policy"]]][key] = line["mean_ms"]
+    return found
+
+
+def recording_lines(said: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The lines of single recordings in what `loadgen compare --recordings` printed as JSON."""
+    return [line for one in said["tables"] for line in one["scores"] if "recording" in line]
+
+
+def _by_heartbeats(names: Sequence[str]) -> list[tuple[str, list[str], list[str]]]:
+    """A folder, flags of `loadgen compare`, and the names that are simulated with them."""
+    both = (("with-heartbeats", [], True), ("without-heartbeats", ["--no-heartbeats"], False))
+    sorted_out = [
+        (folder, flags, [name for name in names if LEFT_OUT[name].heartbeats is heartbeats])
+        for folder, flags, heartbeats in both
+    ]
+    return [one for one in sorted_out if one[2]]
+
+
+def table(found: Mapping[str, Mapping[str, Times]]) -> Table:
+    """A line for each mechanism: its cost in each set, its largest loss and gain, and whether it stays."""
+    names = [name for name in next(iter(found.values())) if name != NOTHING]
+    columns = ["left out", *found, "largest loss", "largest gain", "stays"]
+    rows = []
+    for name in names:
+        sets = {of: logs(times[name], times[NOTHING]) for of, times in found.items()}
+        means = {of: _over_units(of, units) for of, units in sets.items()}
+        single = {unit: cost_of(each) for units in sets.values() for unit, each in units.items()}
+        in_order = sorted(single, key=lambda unit: single[unit].mean)
+        least, most = in_order[0], in_order[-1]
+        rows.append(
+            [
+                name,
+                *map(str, means.values()),
+                f"{most} {single[most]}",
+                f"{least} {single[least]}",
+                "yes" if stays(list(means.values()), list(single.values())) else "**no**",
+            ]
+        )
+    units = ", ".join(f"{len({unit for unit, _ in of[NOTHING]})} {name}" for name, of in found.items())
+    return Table(f"What it costs to leave out one mechanism, in percent of the time: {units}", columns, rows)
+
+
+def logs(without: Times, whole: Times) -> dict[str, list[float]]:
+    """The logarithms of the ratios of the same seeds or recordings, by scenario or family."""
+    found: dict[str, list[float]] = {}
+    for (unit, key), time in whole.items():
+        found.setdefault(unit, []).append(float(np.log(without[unit, key] / time)))
+    return found
+
+
+def cost_of(ratios: Sequence[float]) -> Cost:
+    """The geometric mean of ratios, given as logarithms, minus 1."""
+    values = np.array(ratios)
+    ends = Blocks(len(values), length=1).intervals(lambda picks: {"mean": values[picks].mean(axis=-1)})
+    low, high = (end["mean"] if end else np.nan for end in ends)
+    return Cost(float(np.expm1(values.mean())), float(np.expm1(low)), float(np.expm1(high)))
+
+
+def stays(means: Sequence[Cost], single: Sequence[Cost]) -> bool:
+    """Whether a mechanism has earned its place."""
+    return any(
+        one.mean > least and one.low > 0
+        for of, least in ((means, MEAN_COSTS), (single, ONE_COSTS))
+        for one in of
+    )
+
+
+def _over_units(name: str, units: Mapping[str, list[float]]) -> Cost:
+    """The cost in the mean of a set: scenarios are its units, and recordings are units of their own."""
+    if name == RECORDINGS:
+        return cost_of([value for each in units.values() for value in each])
+    return cost_of([float(np.mean(each)) for each in units.values()])
 
 
 def play_all(case: str, names: Sequence[str], seeds: Sequence[int], out: Path) -> Table:
@@ -132,16 +287,6 @@ def play_all(case: str, names: Sequence[str], seeds: Sequence[int], out: Path) -
             )
             runs[name].append(read(folder))
     return table_of_runs(case, runs, NOTHING)
-
-
-def cheap(found: Mapping[str, Mapping[str, Figures]]) -> list[str]:
-    """The mechanisms that cost at most LITTLE in the mean of every set."""
-    names = list(next(iter(found.values())))
-    return [
-        name
-        for name in names
-        if name != NOTHING and all(mean(of[name]) - mean(of[NOTHING]) <= LITTLE for of in found.values())
-    ]
 
 
 if __name__ == "__main__":

@@ -9,13 +9,14 @@ folder to start anew.
 
 import argparse
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.against import AFTER, BEFORE, HERE
 from benchmarks.measure import Table
 from benchmarks.simulated_sets import (
+    SETS,
     Checkout,
     Figures,
     ScenarioSet,
@@ -53,9 +54,10 @@ def main() -> int:
     return 0
 
 
-def add_flags(parser: argparse.ArgumentParser) -> None:
-    """The flags that choose what is simulated."""
-    parser.add_argument("--sets", default=",".join(scenario_sets()), help="some of %(default)s")
+def add_flags(parser: argparse.ArgumentParser, sets: Sequence[str] = SETS) -> None:
+    """The flags that choose what is simulated; `sets` are the default."""
+    known = ", ".join(SETS)
+    parser.add_argument("--sets", default=",".join(sets), help=f"some of {known} (default: %(default)s)")
     parser.add_argument("--scenarios", help="some of their scenarios, by name (default: all)")
     parser.add_argument("--seeds", type=int, help="seeds of each scenario (default: as many as the set has)")
 
@@ -65,7 +67,7 @@ def chosen_sets(parser: argparse.ArgumentParser, flags: argparse.Namespace) -> d
     known = scenario_sets()
     scenarios = {path.stem for one in known.values() for path in one.scenarios}
     for name, allowed in [
-        *((one, list(known)) for one in flags.sets.split(",")),
+        *((one, SETS) for one in flags.sets.split(",")),
         *((one, sorted(scenarios)) for one in (flags.scenarios or "").split(",") if one),
     ]:
         if name not in allowed:

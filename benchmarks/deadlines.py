@@ -17,7 +17,7 @@ from benchmarks.measure import Requirement, Table
 from offboard import DeadlineMissed, Offloader
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.loadgen.testbed.testbed import CLOUD, WAN, Setup
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.runner import ONBOARD
 
 CONNECT_S = 30.0

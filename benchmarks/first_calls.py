@@ -9,7 +9,7 @@ from benchmarks.measure import Requirement, Table
 from offboard import Offloader
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.loadgen.testbed.testbed import CLOUD, WAN, Setup
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 
 ROUND_TRIP_MS = 800.0
 CALLS = 6  # of each robot

@@ -1,12 +1,14 @@
-"""The parts model without one of its mechanisms: a class for each, named after what is left out.
+"""The default without one of its mechanisms: a class for each, named after what is left out.
 
-Each class is the name of a predictor, as in `loadgen run calm --predictor benchmarks.left_out.Tail`.
-`ablations` measures what leaving them out costs.
+Most are predictors, as in `loadgen run calm --predictor benchmarks.left_out.Tail`; the last ones are
+policies, as in `--policy benchmarks.left_out.Stall`. `ablations` measures what leaving them out costs.
 """
 
 import math
 
 from offboard.common.tasks import first_number
+from offboard.robot_client import policies
+from offboard.robot_client.policies import Decision, Forecast, Hedge
 from offboard.robot_client.predictors.base import Call, Prediction, Run
 from offboard.robot_client.predictors.line import (
     ODD,
@@ -16,7 +18,7 @@ from offboard.robot_client.predictors.line import (
     Line,
 )
 from offboard.robot_client.predictors.parts import Parts
-from offboard.robot_client.sites.runner import Condition
+from offboard.robot_client.sites.runner import ONBOARD, Condition
 
 
 class Switched(Line):
@@ -257,3 +259,46 @@ class AllParts(_Without):
 
     def _told(self, call: Call) -> Call:
         return call._replace(moved=0.0, condition=call.condition._replace(round_trip_s=None, queue=0))
+
+
+class _Default:
+    """The default policy; `_told` says what it gets of a forecast."""
+
+    pairs = True
+
+    def __init__(self, seed: int = 0) -> None:
+        self._policy = policies.make(policies.DEFAULT, seed)
+
+    def decide(self, forecast: Forecast) -> Decision:
+        return self._policy.decide(self._told(forecast))
+
+    def _told(self, forecast: Forecast) -> Forecast:
+        return forecast
+
+
+class HedgeAtP95(_Default):
+    """A run is late after the time that 95 % of such runs stay below, as by Dean and Barroso."""
+
+    SHARE = 0.95
+
+    def decide(self, forecast: Forecast) -> Decision:
+        decision = super().decide(forecast)
+        first, second = forecast.sites[decision.site], decision.second
+        if not isinstance(second, Hedge) or first.predicted_s is None:
+            return decision
+        after_s = first.errors.below(first.predicted_s, self.SHARE, first.error_s or 0.0)
+        return decision._replace(second=Hedge(second.site, after_s)) if after_s else decision
+
+
+class Stall(_Default):
+    """A late heartbeat adds nothing to the time of a server; once it is silent, it still is."""
+
+    def _told(self, forecast: Forecast) -> Forecast:
+        return forecast._replace(
+            sites={
+                site: one
+                if site == ONBOARD or one.predicted_s is None
+                else one._replace(predicted_s=one.predicted_s - one.condition.wait_s)
+                for site, one in forecast.sites.items()
+            }
+        )

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from offboard.loadgen.table.confidence_intervals import Blocks
 
 UNSEEN = HERE / "benchmarks" / "unseen"
 FRESH_SEED = 1001
-SHIPPED, FRESH, NEW = "shipped", "fresh", "unseen"
+SETS = SHIPPED, FRESH, NEW = "shipped", "fresh", "unseen"
 
 Figures = Mapping[tuple[str, int], float]  # time over oracle, by scenario and seed
 
@@ -100,6 +101,29 @@ def simulate(
     return found
 
 
+def compare(checkout: Checkout, names: Sequence[str], flags: Sequence[str]) -> dict[str, Any]:
+    """What `loadgen compare --simulate` of a checkout says of these scenarios, as JSON."""
+    command = [
+        sys.executable,
+        "-m",
+        checkout.module,
+        "compare",
+        *names,
+        "--simulate",
+        "--format",
+        "json",
+        *flags,
+    ]
+    environ = {**os.environ, "PYTHONPATH": str(checkout.path)}
+    done = subprocess.run(
+        command, cwd=checkout.path, env=environ, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        sys.exit(f"{' '.join(command)} in {checkout.path} failed:\n{done.stderr}")
+    said: dict[str, Any] = json.loads(done.stdout)
+    return said
+
+
 def table(title: str, figures: Mapping[str, Figures], base: str) -> Table:
     """A line for each strategy, compared with the strategy `base` on the same scenarios and seeds."""
     columns = ["", "mean time / oracle", "worst scenario", f"minus {base}", "largest difference"]
@@ -165,22 +189,11 @@ def _simulate(
     files = {f"{scenario.stem}-{seed}": seed for seed in seeds}
     for name, seed in files.items():
         (folder / f"{name}.toml").write_text(checkout.text(scenario, name, seed))
-    command = [sys.executable, "-m", checkout.module, "compare", *(f"{folder / name}.toml" for name in files)]
-    command += ["--simulate", "--seeds", "1", "--from-task", str(FROM_TASK), "--format", "json"]
-    command += ["--policies", ",".join(strategies), *flags]
-    done = subprocess.run(
-        command,
-        cwd=checkout.path,
-        env={**os.environ, "PYTHONPATH": str(checkout.path)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode:
-        sys.exit(f"{' '.join(command)} in {checkout.path} failed:\n{done.stderr}")
+    asked_too = ["--seeds", "1", "--from-task", str(FROM_TASK), "--policies", ",".join(strategies), *flags]
+    said = compare(checkout, [f"{folder / name}.toml" for name in files], asked_too)
     runs = [
         (line["policy"], files[one["scenario"]], line["time_over_oracle"])
-        for one in json.loads(done.stdout)["tables"]
+        for one in said["tables"]
         if "scenario" in one  # the first table is a summary
         for line in one["scores"]
         if not line["bound"]

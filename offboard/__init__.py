@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from offboard.robot_client.policies import Decision, Forecast, Outlook
     from offboard.robot_client.policies.expectation import Expectation
     from offboard.robot_client.predictors import Prediction, Predictor
-    from offboard.robot_client.records.trace import Record, Trace
+    from offboard.robot_client.records.record import Record
+    from offboard.robot_client.records.trace import Trace
     from offboard.robot_client.settings import Settings
     from offboard.robot_client.sites.runner import Execution, Runner
 
@@ -80,7 +81,7 @@ _HOMES = {
     "Outlook": "robot_client.policies",
     "Prediction": "robot_client.predictors",
     "Predictor": "robot_client.predictors",
-    "Record": "robot_client.records.trace",
+    "Record": "robot_client.records.record",
     "Runner": "robot_client.sites.runner",
     "Savings": "robot_client.learning.savings",
     "Settings": "robot_client.settings",

@@ -39,8 +39,8 @@ from offboard.robot_client.policies.expectation import Expectation, expectations
 from offboard.robot_client.policies.forecast import finishes_of
 from offboard.robot_client.policies.objectives import by_deadline
 from offboard.robot_client.policies.observe import Observe
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.records.recording import Recording, record_of, tell
-from offboard.robot_client.records.trace import Record
 from offboard.robot_client.settings import Settings, check_types
 from offboard.robot_client.sites.absence import Absent, absent_sites, present_sites, wait_for_sites
 from offboard.robot_client.sites.clock import Clock, SystemClock
@@ -393,7 +393,7 @@ class Offloader:
         """What a batch is placed by; `own` holds how many of its tasks each site has."""
         runners = {**runners, **self._sites.now}  # a batch may be pinned to a site that has left
         absent = absent_sites(runners, task.kind) if len(own) > 1 else {}
-        counts = {runners[one]: n for one, n in own.items() if one in runners and one not in absent}
+        sites = {one: runners[one] for one in own if one in runners and one not in absent}
         with self._lock:
             memory = self._memories.of(task.kind, runners)
-            return self._forecaster.forecast_in_batch(memory, task, counts)
+            return self._forecaster.forecast(memory, task, sites, now_s=self._clock.now_s(), own=own)

@@ -22,8 +22,7 @@ from offboard.robot_client.learning.store import Store
 from offboard.robot_client.policies import Policy
 from offboard.robot_client.policies.allowance import DUPLICATES, Allowance
 from offboard.robot_client.policies.decision import Named
-from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.objectives import S_PER_QUALITY, Mean, Objective
+from offboard.robot_client.policies.objectives import S_PER_QUALITY, Energy, Mean, Objective
 from offboard.robot_client.predictors.window import WINDOW, checked_length
 from offboard.robot_client.sites.runner import checked_timeout
 

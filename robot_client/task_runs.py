@@ -16,7 +16,7 @@ from offboard.robot_client.learning.runs_in_flight import Flights
 from offboard.robot_client.lifetime import Lifetime
 from offboard.robot_client.policies import PINNED, Hedge
 from offboard.robot_client.policies.allowance import Allowance
-from offboard.robot_client.records.trace import Late
+from offboard.robot_client.records.record import Late
 from offboard.robot_client.sites.clock import Clock
 from offboard.robot_client.sites.runner import ONBOARD, Execution
 

@@ -10,7 +10,7 @@ import time
 
 from offboard.loadgen.scenario.hash_tasks import hash_rounds
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 TASKS = 40

@@ -15,7 +15,7 @@ from offboard.robot_client.learning.store import Store
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Outlook
 from offboard.robot_client.predictors.least_squares import LeastSquares
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution
 from tests.fakes import ScriptedRunner
 from tests.virtual import VirtualClock

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 EDGE = "edge"

@@ -7,9 +7,9 @@ from typing import Any
 from offboard.common.tasks import task
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.policies.paper import Paper
+from offboard.robot_client.policies.baselines import Paper
 from offboard.robot_client.predictors import LEAST_SQUARES, make
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.runner import Runner
 
 

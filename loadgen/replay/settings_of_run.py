@@ -9,8 +9,7 @@ from offboard.common.errors import ConfigError, DataError
 from offboard.loadgen import rivals
 from offboard.loadgen.robot_files import SUMMARY
 from offboard.robot_client.policies import objectives
-from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.objectives import MEAN, Objective
+from offboard.robot_client.policies.objectives import MEAN, Energy, Objective
 from offboard.robot_client.predictors.window import WINDOW_MAX
 
 ENERGY = tuple(field.name for field in fields(Energy))

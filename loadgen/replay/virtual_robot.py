@@ -23,7 +23,7 @@ from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.policies import ALONE, PINNED, Decision, Forecast, Hedge, Policy, observe
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.policies.decision import pairs
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 NOT_BY_A_RULE = (PINNED, ALONE, batch.NAME, observe.NAME)  # who else decides where a task runs

@@ -24,7 +24,8 @@ from offboard.loadgen.robot.work import Plans, Work, make_work
 from offboard.loadgen.robot_files import alone_path, reference_path
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.records.lines import Lines
-from offboard.robot_client.records.trace import Record, Trace
+from offboard.robot_client.records.record import Record
+from offboard.robot_client.records.trace import Trace
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 

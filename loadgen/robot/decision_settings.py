@@ -8,8 +8,7 @@ from offboard.common.errors import ConfigError
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.policies import objectives
 from offboard.robot_client.policies.allowance import DUPLICATES
-from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.objectives import MEAN, OBJECTIVES, S_PER_QUALITY
+from offboard.robot_client.policies.objectives import MEAN, OBJECTIVES, S_PER_QUALITY, Energy
 from offboard.robot_client.predictors.window import WINDOW
 from offboard.robot_client.settings import Settings
 

@@ -22,7 +22,7 @@ from offboard.loadgen.robot_files import read_fields
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import BOTH
 from offboard.robot_client.records.lines import VERSION, Lines
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 WAYS = (ONBOARD, CLOUD, BOTH)

@@ -28,7 +28,7 @@ from offboard.loadgen.robot.work import Work
 from offboard.loadgen.robot.workload import CLOSED, due_instants
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import BOTH
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 
 MADE_MAX = 32  # tasks that are made ahead and wait for their instant
 MADE_FIRST_MAX = 1000  # tasks that are made before the first one starts, if none depends on an answer

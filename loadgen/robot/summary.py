@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from offboard.common.tasks import show_size
 from offboard.common.text.wording import duration
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.runner import ONBOARD
 
 PROGRESS_EVERY = 10  # tasks

@@ -26,8 +26,7 @@ from offboard.loadgen.testbed.cpu_quota import CPUS_MAX, CPUS_MIN
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, relay_of
 from offboard.robot_client import policies
 from offboard.robot_client.policies import BOTH, objectives
-from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.objectives import MEAN, OBJECTIVES, Objective
+from offboard.robot_client.policies.objectives import MEAN, OBJECTIVES, Energy, Objective
 from offboard.robot_client.sites.runner import ONBOARD
 
 ROBOTS_MAX = 64

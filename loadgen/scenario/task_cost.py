@@ -10,8 +10,7 @@ from typing import Any
 from offboard.loadgen.robot_files import Late
 from offboard.loadgen.table.measured_rows import Column
 from offboard.loadgen.table.table_two_figures import known_mean, known_quantile
-from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.objectives import S_PER_QUALITY
+from offboard.robot_client.policies.objectives import S_PER_QUALITY, Energy
 from offboard.robot_client.sites.runner import ONBOARD
 
 P95 = 95  # percent, as the objective `p95`

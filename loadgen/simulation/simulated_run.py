@@ -25,7 +25,8 @@ from offboard.loadgen.simulation.model.walker import Walk, Walker
 from offboard.loadgen.simulation.simulated_testbed import SimulatedTestbed
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client.policies import BOTH
-from offboard.robot_client.records.trace import Record, Trace, as_dict
+from offboard.robot_client.records.record import Record, as_dict
+from offboard.robot_client.records.trace import Trace
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites import heartbeat
 from offboard.robot_client.sites.runner import ONBOARD

@@ -8,7 +8,7 @@ from collections import Counter, deque
 
 from offboard.common.text.wording import duration
 from offboard.robot_client.policies import Outlook
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.runner import ONBOARD
 
 SHARE_TASKS = 100  # the share of each site is that of the last tasks

@@ -13,7 +13,7 @@ from typing import Any
 from offboard.common.errors import Unwanted
 from offboard.common.tasks import Kind, Task
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.servers import connect_sites
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.clock import SystemClock

@@ -22,7 +22,7 @@ from offboard.robot_client.execution.placement import (
 )
 from offboard.robot_client.policies import Decision, Forecast, Outlook
 from offboard.robot_client.predictors.base import WARM_UP
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.clock import Clock
 from offboard.robot_client.sites.runner import ONBOARD, Execution
 

@@ -1,6 +1,6 @@
 """Adaptive conformal intervals: they hold 90 % of the measured times, whatever the predictor.
 
-What a policy reads from the errors, such as when a task is overdue, is in `policies/forecast.py`.
+What a policy reads from the errors, such as when a task is overdue, is in `policies/prediction_errors.py`.
 """
 
 import math
@@ -8,7 +8,7 @@ import operator
 from bisect import bisect_left, insort
 from collections import deque
 
-from offboard.robot_client.policies.forecast import ERRORS_MIN, SPREADS_90, PredictionErrors, unit_s
+from offboard.robot_client.policies.prediction_errors import ERRORS_MIN, SPREADS_90, PredictionErrors, unit_s
 from offboard.robot_client.predictors.line import RATE, RunningMean
 
 COVERAGE = 0.9  # share of the times that an interval should hold

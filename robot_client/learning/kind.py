@@ -13,7 +13,8 @@ from offboard.common.variants import IN_GROUP, group_of
 from offboard.robot_client.learning.packing import PackingMemory
 from offboard.robot_client.learning.shared_work import SharedWork
 from offboard.robot_client.learning.site import SiteMemory
-from offboard.robot_client.policies.forecast import ERRORS_MIN, WHOLE, Quality
+from offboard.robot_client.policies.forecast import WHOLE, Quality
+from offboard.robot_client.policies.prediction_errors import ERRORS_MIN
 from offboard.robot_client.predictors import Model, Predictor
 from offboard.robot_client.predictors.base import REMEMBERED, WARM_UP
 from offboard.robot_client.sites.runner import ONBOARD, Execution

@@ -10,8 +10,14 @@ from offboard.common.tasks import Kind
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.memory_file import KeptKind
 from offboard.robot_client.learning.store import Store
-from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.objectives import S_PER_QUALITY, Deadline, Mean, Objective, Weighing
+from offboard.robot_client.policies.objectives import (
+    S_PER_QUALITY,
+    Deadline,
+    Energy,
+    Mean,
+    Objective,
+    Weighing,
+)
 from offboard.robot_client.predictors import Model, Predictor
 
 Snapshot = dict[str, KeptKind]

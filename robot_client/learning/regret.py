@@ -7,7 +7,7 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-from offboard.robot_client.policies.forecast import student_90
+from offboard.robot_client.policies.prediction_errors import student_90
 from offboard.robot_client.predictors.base import REMEMBERED, WARM_UP
 
 

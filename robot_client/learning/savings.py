@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 
 from offboard.common.text.wording import duration, with_bounds
-from offboard.robot_client.policies.forecast import student_90
+from offboard.robot_client.policies.prediction_errors import student_90
 from offboard.robot_client.predictors.base import WARM_UP
 
 

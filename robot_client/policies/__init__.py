@@ -59,10 +59,10 @@ class _Rule:
 
 
 _RULES: dict[str, _Rule] = {
-    "paper": _Rule("paper.Paper", weighs_cost=False, heartbeats=False),
-    "paper-with-heartbeats": _Rule("paper.Paper", weighs_cost=False),
-    ONBOARD: _Rule("always.Always", (ONBOARD,), predictor="parts", weighs_cost=False, heartbeats=False),
-    CLOUD: _Rule("always.Always", (CLOUD,), predictor="parts", weighs_cost=False, heartbeats=False),
+    "paper": _Rule("baselines.Paper", weighs_cost=False, heartbeats=False),
+    "paper-with-heartbeats": _Rule("baselines.Paper", weighs_cost=False),
+    ONBOARD: _Rule("baselines.Always", (ONBOARD,), predictor="parts", weighs_cost=False, heartbeats=False),
+    CLOUD: _Rule("baselines.Always", (CLOUD,), predictor="parts", weighs_cost=False, heartbeats=False),
     "greedy": _Rule("greedy.Greedy", predictor="parts"),
 }
 _OWN = _Rule("", predictor="parts")  # a class of a user

@@ -9,15 +9,8 @@ from functools import partial
 
 from offboard.common.text.wording import duration
 from offboard.robot_client.policies.decision import Decision, Hedge, Policy
-from offboard.robot_client.policies.forecast import (
-    ERRORS_MIN,
-    SPREADS_90,
-    Forecast,
-    Outlook,
-    cheapest,
-    unit_s,
-    widened_s,
-)
+from offboard.robot_client.policies.forecast import Forecast, Outlook, cheapest
+from offboard.robot_client.policies.prediction_errors import ERRORS_MIN, SPREADS_90, unit_s, widened_s
 from offboard.robot_client.sites.runner import ONBOARD
 
 TAIL_SHARE = 0.2  # of the errors, the largest ones: they say how much longer a late task may take
@@ -118,6 +111,8 @@ def _planned(first: str, forecast: Forecast) -> Hedge | str:
     if forecast.deadline_s is not None:
         others = {site: s for site, s in others.items() if not _is_worse(forecast.sites[site], chosen)}
     if not others:
+        if any(one.condition.silent for site, one in forecast.sites.items() if site != first):
+            return "no second site answers"
         return "no second site is known" if forecast.deadline_s is None else "no second site is as good"
     second = cheapest(others)
     after_s = late_after_s(chosen, others[second])

@@ -1,23 +1,16 @@
-"""Objectives: what a policy makes small, as a cost for each site. Less is better.
+"""Objectives: what a policy makes small, as a cost for each site; and what a task takes from the battery.
 
-The energy that joules are estimated with is in `energy`.
+Less cost is better. What a deadline changes is here, too.
 """
 
 import math
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
+from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError
-from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.forecast import (
-    SPREADS_90,
-    WHOLE,
-    Forecast,
-    Outlook,
-    PredictionErrors,
-    Quality,
-    widened_s,
-)
+from offboard.robot_client.policies.forecast import WHOLE, Forecast, Outlook, Quality
+from offboard.robot_client.policies.prediction_errors import SPREADS_90, PredictionErrors, widened_s
 from offboard.robot_client.sites.runner import ONBOARD, Execution
 
 S_PER_QUALITY = 1.0  # seconds that the whole quality is worth
@@ -102,6 +95,31 @@ class TimeAndSpending:
     def cost(self, expected: Expected, errors: PredictionErrors) -> float:  # noqa: ARG002
         spent_s = self.s_a_joule * expected.joules + self.s_a_megabyte * 1e-6 * expected.bytes
         return expected.seconds + spent_s + expected.quality.lost_s
+
+
+@dataclass(frozen=True)
+class Energy:
+    """The power and energy that a robot takes; measure your own robot for good values.
+
+    The defaults: a Raspberry Pi 4 B draws 2.7 W idle and 6.4 W with all four cores busy (Geerling, Power
+    Consumption Benchmarks, pidramble.com), so one core takes 0.9 W more; Wi-Fi takes 7 uJ per byte
+    (Balasubramanian et al., Energy Consumption in Mobile Phones, IMC 2009, table 4).
+    """
+
+    compute_w: float = setting(0.9, "power that one busy core draws above idle, in watts", minimum=0.0)
+    idle_w: float = setting(0.0, "power drawn while waiting for an answer, in watts", minimum=0.0)
+    radio_j_byte: float = setting(7e-6, "energy per byte sent or received, in joules", minimum=0.0)
+
+    def __post_init__(self) -> None:
+        check(self)
+
+    def onboard_j(self, cpu_s: float) -> float:
+        """Joules of computing for `cpu_s` CPU seconds."""
+        return self.compute_w * cpu_s
+
+    def remote_j(self, seconds: float, bytes_moved: float) -> float:
+        """Joules of waiting for `seconds`, and of sending and receiving the bytes."""
+        return self.idle_w * seconds + self.radio_j_byte * bytes_moved
 
 
 class Weighing:

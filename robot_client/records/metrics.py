@@ -14,7 +14,8 @@ from prometheus_client.registry import Collector
 from offboard.common.live.live_port import LivePort
 from offboard.common.live.robot_live import RobotLive
 from offboard.robot_client.learning.regret import Regret
-from offboard.robot_client.records.trace import Record, Trace, as_dict
+from offboard.robot_client.records.record import Record, as_dict
+from offboard.robot_client.records.trace import Trace
 from offboard.robot_client.sites.runner import Execution
 
 SECONDS_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)

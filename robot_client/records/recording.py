@@ -14,7 +14,8 @@ from offboard.common.live.robot_live import RobotLive
 from offboard.robot_client.learning.learner import PendingTask
 from offboard.robot_client.learning.regret import Regret
 from offboard.robot_client.learning.savings import Savings
-from offboard.robot_client.records.trace import Late, Record, Trace
+from offboard.robot_client.records.record import Late, Record
+from offboard.robot_client.records.trace import Trace
 from offboard.robot_client.sites.runner import Execution
 
 Observer = Callable[[Record], None]

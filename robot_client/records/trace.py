@@ -1,6 +1,6 @@
-"""The record of a task, and the trace: one JSON line per task with what was predicted, decided and measured.
+"""The trace: one JSON line for each task, written by a thread.
 
-Writing lines so that they survive a crash is left to `lines`.
+What a line says is in `record`; writing lines so that they survive a crash is left to `lines`.
 """
 
 import atexit
@@ -8,78 +8,18 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from offboard.common.errors import describe
-from offboard.common.tasks import Size
-from offboard.robot_client.learning.regret import Regret
-from offboard.robot_client.learning.savings import Savings
-from offboard.robot_client.policies import Decision, Hedge, Outlook
-from offboard.robot_client.policies.forecast import WHOLE
-from offboard.robot_client.records.lines import VERSION, Lines
-from offboard.robot_client.sites.runner import TIMEOUT_S, UNMEASURED, Condition, Execution
+from offboard.robot_client.records.lines import Lines
+from offboard.robot_client.records.record import Record, as_dict
 
 WRITE_EVERY_S = 0.5
 WAITING_MAX = 1000  # records in memory
 ROOM_WAIT_S, ROOM_POLL_S = 0.5, 0.001  # for which the first task without room waits for the disk
 CLOSE_WAIT_S = 5.0  # that `close` waits for the disk
 
-_OUTLOOK_FIELDS = ("predicted_s", "spread_s", "low_s", "high_s", "age", "failures")
-_EXECUTION_FIELDS = (
-    *("site", "seconds", "ok", "error", "censored", "started", "held_up"),
-    *("queue_s", "run_s", "network_s", "cpu_s", "bytes_out", "bytes_in"),
-)
-
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class Late:
-    """An execution that ended after another site had answered; `id` is that of the record of its task."""
-
-    id: str
-    execution: Execution
-
-
-@dataclass(slots=True)
-class Record:
-    """Everything about one task, made when it is answered.
-
-    used: the site whose answer was used; None if no site answered.
-    amount: what the predictors of the sites were asked with: the size, or the work that was expected for it.
-    work: what the results told.
-    started_s, timeout_s: when the task began, on the clock of the robot; how long a remote site had for it.
-    late: executions of earlier tasks that have ended since the record before.
-    regret, savings: the present estimates, if there are any; the savings are those of this kind.
-    deadline_s: of the call, if it had one. The call missed it if `waited_s`, the time until the answer, is
-    longer.
-    """
-
-    i: int
-    id: str
-    kind: str
-    size: Size
-    sites: Mapping[str, Outlook]
-    decision: Decision
-    executions: tuple[Execution, ...]
-    used: str | None
-    waited_s: float
-    amount: Size | None = None
-    work: float | None = None
-    started_s: float = 0.0
-    timeout_s: float = TIMEOUT_S
-    late: tuple[Late, ...] = ()
-    regret: Regret | None = None
-    started_at: datetime = field(default_factory=lambda: datetime.now(UTC))
-    deadline_s: float | None = None
-    savings: Savings | None = None
-
-
-_REGRET_FIELDS, _SAVINGS_FIELDS = (tuple(one.name for one in fields(of)) for of in (Regret, Savings))
 
 
 class Trace(Lines):
@@ -149,76 +89,3 @@ class Trace(Lines):
         except Exception as error:  # noqa: BLE001 - a policy of the user may decide anything
             self._lose(describe(error))
         self._waiting.popleft()
-
-
-def as_dict(record: Record) -> dict[str, Any]:
-    """The fields of the JSON line (docs/formats.md)."""
-    return {
-        "v": VERSION,
-        "i": record.i,
-        "id": record.id,
-        "kind": record.kind,
-        "started_at": record.started_at.isoformat(timespec="milliseconds"),
-        "started_s": record.started_s,
-        "timeout_s": record.timeout_s,
-        "size": record.size,
-        "work": record.work,
-        "features": features(record),
-        "sites": {site: _outlook(outlook) for site, outlook in record.sites.items()},
-        "decision": _decision(record.decision),
-        "executions": [_execution(one) for one in record.executions],
-        "used": record.used,
-        "waited_s": record.waited_s,
-        "deadline_s": record.deadline_s,
-        "late": [{"id": one.id} | _execution(one.execution) for one in record.late],
-        "regret": _values(record.regret, _REGRET_FIELDS) if record.regret else None,
-        "savings": _values(record.savings, _SAVINGS_FIELDS) if record.savings else None,
-    }
-
-
-def features(record: Record) -> dict[str, float]:
-    """What was measured, by name; a value of a site is named SITE.NAME."""
-    found: dict[str, float] = {}
-    amount = record.amount
-    if not (amount is None or isinstance(amount, tuple) or amount == record.size):
-        found["work"] = amount
-    for site, outlook in record.sites.items():
-        if outlook.condition is not UNMEASURED:
-            for name, value in zip(Condition._fields, outlook.condition, strict=True):
-                if value is not None:
-                    found[f"{site}.{name}"] = value
-    return found
-
-
-def _outlook(outlook: Outlook) -> dict[str, Any]:
-    """Only a task with variants has a quality."""
-    quality = None if outlook.quality is WHOLE else outlook.quality.value
-    packing = None if outlook.packing is None else outlook.packing._asdict()
-    sending = outlook.sending._asdict() if outlook.sending.bytes else None
-    return _values(outlook, _OUTLOOK_FIELDS) | {"quality": quality, "packing": packing, "sending": sending}
-
-
-def _execution(execution: Execution) -> dict[str, Any]:
-    packed = [one._asdict() for one in execution.packed]
-    return _values(execution, _EXECUTION_FIELDS) | {"packed": packed}
-
-
-def _decision(decision: Decision) -> dict[str, Any]:
-    """A probe is a second run after 0 s."""
-    second = decision.second
-    return {
-        "site": decision.site,
-        "both": decision.both,
-        "reason": decision.reason,
-        "policy": decision.policy,
-        "second": None if second is None else second.site,
-        "second_after_s": second.after_s if isinstance(second, Hedge) else 0.0,
-        "spared": decision.spared,
-        "waits": decision.waits,
-        "latest_s": None if decision.latest is None else decision.latest.after_s,
-        "advised": decision.advised,
-    }
-
-
-def _values(of: object, names: tuple[str, ...]) -> dict[str, Any]:
-    return {name: getattr(of, name) for name in names}

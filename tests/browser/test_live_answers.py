@@ -11,7 +11,7 @@ from offboard.common.live.live_port import LivePort
 from offboard.common.live.look import Look
 from offboard.robot_client.learning.regret import Regret
 from offboard.robot_client.policies import Decision, Hedge, Outlook
-from offboard.robot_client.records.trace import Record, as_dict
+from offboard.robot_client.records.record import Record, as_dict
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution
 from tests.unit.test_trace import record
 

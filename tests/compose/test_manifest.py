@@ -22,7 +22,7 @@ from offboard.common.planning.map_files import read_map
 from offboard.common.planning.maps import free_pairs, resampled
 from offboard.common.planning.planner import RADIUS_M, Plan, Point, Pose, plan_path
 from offboard.common.security.keys import make_keys
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from tests.compose.conftest import ROOT, docker
 from tests.manifests import Pod
 from tests.prometheus import until

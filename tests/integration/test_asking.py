@@ -15,7 +15,7 @@ import pytest
 from offboard import DeadlineMissed, Offloader
 from offboard.loadgen.robot_files import read_trace
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests import slow_site
 from tests.integration.test_own_task import server

@@ -12,7 +12,7 @@ import pytest
 from benchmarks.keyring import Keys
 from offboard.common.security.keys import read_public
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import ONBOARD
 from tests import slow_site

@@ -12,7 +12,7 @@ from offboard.common.errors import CannotCross
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import BOTH
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.crossing_tasks import (
     TOO_LARGE,

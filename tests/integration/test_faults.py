@@ -16,7 +16,7 @@ from offboard.common.errors import CloudTimeout
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.loadgen.testbed.testbed import Setup
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.probes import echo, mark_once, nap, process_id, total, zeros

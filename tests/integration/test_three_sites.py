@@ -12,7 +12,7 @@ from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.loadgen.testbed.testbed import Setup
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import DEFAULT
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests import slow_site
 from tests.phases import EDGE, PHASES, TASKS, check

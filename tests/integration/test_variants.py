@@ -17,7 +17,7 @@ from offboard.loadgen.robot_files import read_trace
 from offboard.loadgen.scenario.outage_recovery import read_outage
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.variant_tasks import grade, only_there
 

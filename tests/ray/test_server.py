@@ -13,7 +13,7 @@ import pytest
 from offboard import Offloader
 from offboard.common.planning.maps import GridMap
 from offboard.common.planning.planner import Plan, Point, Pose, plan_path
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.ray.clusters import RayNodes
 from tests.ray.servers import RayServer, until

@@ -7,8 +7,8 @@ from random import Random
 import pytest
 
 from offboard.robot_client.learning.conformal import COVERAGE, ERRORS_MAX, Conformal
-from offboard.robot_client.policies.forecast import ERRORS_MIN, NO_ERRORS, student_90
 from offboard.robot_client.policies.hedge import late_after_s
+from offboard.robot_client.policies.prediction_errors import ERRORS_MIN, NO_ERRORS, student_90
 from tests.outlooks import known
 
 TASKS = 6_000

@@ -14,9 +14,10 @@ from offboard.robot_client import policies
 from offboard.robot_client.learning.conformal import Conformal
 from offboard.robot_client.policies import Decision, Forecast, Hedge, Outlook
 from offboard.robot_client.policies.allowance import Allowance
-from offboard.robot_client.policies.forecast import NO_ERRORS, PredictionErrors, Quality
+from offboard.robot_client.policies.forecast import Quality
 from offboard.robot_client.policies.objectives import HANDOVER_S, Deadline, Expected, by_deadline
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.policies.prediction_errors import NO_ERRORS, PredictionErrors
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition
 from tests.outlooks import known

@@ -17,7 +17,7 @@ from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Probe
 from offboard.robot_client.policies.probe import PROBE_EVERY
 from offboard.robot_client.predictors.base import REMEMBERED, WARM_UP
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution
 from tests.fakes import ScriptedRunner

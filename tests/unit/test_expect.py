@@ -11,7 +11,7 @@ from offboard.robot_client import policies
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.policies.expectation import Expectation
-from offboard.robot_client.policies.forecast import ERRORS_MIN
+from offboard.robot_client.policies.prediction_errors import ERRORS_MIN
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.fakes import ScriptedRunner

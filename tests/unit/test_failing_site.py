@@ -9,7 +9,7 @@ from offboard.common.errors import CloudError, CloudTimeout, TaskFailed
 from offboard.common.tasks import Task, task
 from offboard.robot_client.policies.probe import PROBE_EVERY
 from offboard.robot_client.predictors.base import WARM_UP
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.fakes import ScriptedRunner

@@ -12,7 +12,7 @@ from offboard.robot_client import policies
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Outlook
 from offboard.robot_client.predictors.base import WARM_UP
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.outlooks import UNKNOWN, decide, known

@@ -7,8 +7,9 @@ import pytest
 
 from offboard.robot_client.learning.conformal import Conformal
 from offboard.robot_client.policies import Hedge, Outlook
-from offboard.robot_client.policies.forecast import PredictionErrors, Quality
+from offboard.robot_client.policies.forecast import Quality
 from offboard.robot_client.policies.hedge import late_after_s
+from offboard.robot_client.policies.prediction_errors import PredictionErrors
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition
 from tests.outlooks import UNKNOWN, decide, known
 
@@ -57,6 +58,11 @@ def test_the_time_of_a_hedge_moves_with_the_error_of_the_prediction() -> None:
         ({ONBOARD: known(3.0), CLOUD: known(1.0)}, {"duplicates": 0.9}, "no hedge: no second run is left"),
         (
             {ONBOARD: known(1.0), CLOUD: known(0.5, condition=Condition(silent=True), cost=9.0)},
+            {},
+            "no hedge: no second site answers",
+        ),
+        (
+            {ONBOARD: known(1.0), CLOUD: UNKNOWN._replace(observations=6)},
             {},
             "no hedge: no second site is known",
         ),

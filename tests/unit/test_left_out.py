@@ -12,11 +12,14 @@ from benchmarks.ablations import LEFT_OUT
 from benchmarks.left_out import Switched
 from offboard.common.class_path import find_class
 from offboard.loadgen.compare.compare_settings import split_strategy
+from offboard.robot_client.policies import Hedge
+from offboard.robot_client.policies.prediction_errors import PredictionErrors
 from offboard.robot_client.predictors.line import Line
 from offboard.robot_client.predictors.parts import Parts
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import Condition
 from tests.models import learn, predict
+from tests.outlooks import decide, known
 
 CLASSES = [
     one
@@ -102,3 +105,20 @@ def test_a_subclass_of_the_model_learns_per_work_as_the_model_does(name: str, pe
     """Its attribute `per_work` decides, so that only the mechanism in question differs."""
     memories = Settings(predictor=f"benchmarks.left_out.{name}", window=20).make_memories("greedy")
     assert memories._shared_work is per_work
+
+
+def test_without_the_stall_a_late_heartbeat_adds_nothing() -> None:
+    """The default leaves a server whose heartbeat is late; without the rule it goes there."""
+    cloud = known(0.3, condition=Condition(wait_s=0.2))
+    sites = {"onboard": known(0.2), "cloud": cloud}
+    assert decide("default", sites).site == "onboard"
+    assert decide(left_out.Stall(), sites).site == "cloud"
+
+
+def test_a_hedge_at_p95_starts_at_that_quantile() -> None:
+    """The default waits for the age with the longest rest; the other one for the 95th percentile."""
+    errors = PredictionErrors(scores=(0.0,) * 15 + (1.0,) * 3 + (2.0, 9.0), usual_s=1.0)
+    sites = {"onboard": known(3.0), "cloud": known(1.0, errors=errors)}
+    whole, other = (decide(policy, sites).second for policy in ("default", left_out.HedgeAtP95()))
+    assert whole == Hedge("onboard", 3.0)
+    assert other == Hedge("onboard", 10.0)

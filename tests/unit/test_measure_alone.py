@@ -16,7 +16,7 @@ from offboard.loadgen.robot.references import WAYS, measure_alone, orders
 from offboard.loadgen.robot.robot import SimulatedRobot
 from offboard.loadgen.robot.work import Plans
 from offboard.robot_client.offloader import BOTH
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.fakes import ScriptedRunner

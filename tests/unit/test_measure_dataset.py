@@ -16,7 +16,8 @@ from offboard.loadgen.table.measurement_notes import notes
 from offboard.loadgen.table.table_settings import TableConfig
 from offboard.loadgen.table.table_two import table_text
 from offboard.robot_client.policies import Decision
-from offboard.robot_client.records.trace import Record, Trace
+from offboard.robot_client.records.record import Record
+from offboard.robot_client.records.trace import Trace
 from offboard.robot_client.sites.runner import Execution
 
 ROOT = Path(__file__).parents[2]

@@ -9,7 +9,8 @@ import pytest
 from offboard.common.errors import CloudTimeout, ConfigError, DataError
 from offboard.loadgen.table import measured_rows as rows
 from offboard.robot_client.policies import Decision
-from offboard.robot_client.records.trace import Record, Trace, as_dict
+from offboard.robot_client.records.record import Record, as_dict
+from offboard.robot_client.records.trace import Trace
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 
 HEADER = "size,onboard_s,cloud_s\n"

@@ -17,7 +17,7 @@ from offboard.common.tasks import kind_of, task
 from offboard.robot_client import predictors
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.policies import Forecast, Outlook, objectives
-from offboard.robot_client.policies.energy import Energy
+from offboard.robot_client.policies.objectives import Energy
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution, Sending
 
 SILENT = Condition(silent=True)

@@ -5,9 +5,8 @@ import pytest
 from offboard.common.errors import ConfigError
 from offboard.robot_client.learning.conformal import Conformal
 from offboard.robot_client.policies import objectives
-from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.forecast import NO_ERRORS, PredictionErrors
-from offboard.robot_client.policies.objectives import Expected
+from offboard.robot_client.policies.objectives import Energy, Expected
+from offboard.robot_client.policies.prediction_errors import NO_ERRORS, PredictionErrors
 
 
 def expected(seconds: float, spread_s: float | None = None, joules: float = 0.0) -> Expected:

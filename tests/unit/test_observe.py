@@ -18,7 +18,7 @@ from offboard.robot_client.policies.objectives import S_PER_QUALITY
 from offboard.robot_client.policies.observe import Observe
 from offboard.robot_client.policies.probe import PROBE_EVERY
 from offboard.robot_client.predictors.base import WARM_UP
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.outlooks import decide, known

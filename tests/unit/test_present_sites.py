@@ -12,7 +12,7 @@ from offboard.robot_client.discovery.present_sites import LEAVING_MAX_S, LEAVING
 from offboard.robot_client.discovery.roster import LOOK_EVERY, LOOK_S, TRY_EVERY, Roster, Server
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.predictors.base import WARM_UP
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import ONBOARD, Execution, Sending
 from tests.fakes import ScriptedRunner

@@ -17,7 +17,7 @@ from offboard.loadgen.robot.calls import Calls
 from offboard.loadgen.robot.config import CallConfig
 from offboard.loadgen.robot.references import References, orders
 from offboard.loadgen.robot.run import OwnRecord, Run
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.fakes import ScriptedRunner

@@ -5,7 +5,7 @@ from random import Random
 import pytest
 
 from offboard.robot_client.learning.regret import RegretEstimate
-from offboard.robot_client.policies.forecast import student_90
+from offboard.robot_client.policies.prediction_errors import student_90
 from offboard.robot_client.predictors.base import REMEMBERED, WARM_UP
 
 REPETITIONS = 1_000

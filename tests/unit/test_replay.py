@@ -18,8 +18,9 @@ from offboard.loadgen.table.table_settings import TableConfig
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import BOTH, Decision, Forecast, Outlook, Policy
-from offboard.robot_client.policies.paper import Paper
-from offboard.robot_client.records.trace import Record, Trace
+from offboard.robot_client.policies.baselines import Paper
+from offboard.robot_client.records.record import Record
+from offboard.robot_client.records.trace import Trace
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.fakes import ScriptedRunner

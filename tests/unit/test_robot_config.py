@@ -13,8 +13,7 @@ from offboard.loadgen.robot.config import CallConfig, DriveConfig, RobotConfig
 from offboard.loadgen.robot_files import read_trace
 from offboard.robot_client import policies
 from offboard.robot_client.policies.allowance import DUPLICATES_MAX
-from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.objectives import S_PER_QUALITY, Mean, TimeAndSpending
+from offboard.robot_client.policies.objectives import S_PER_QUALITY, Energy, Mean, TimeAndSpending
 from offboard.robot_client.policies.probe import PROBE_EVERY
 
 MAP, TASK = {"map": Path("m.yaml")}, {"task": "m:f", "sizes": ("constant:1",)}

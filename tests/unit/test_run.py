@@ -19,7 +19,7 @@ from offboard.loadgen.robot.answers import Answers
 from offboard.loadgen.robot.calls import Calls
 from offboard.loadgen.robot.config import CallConfig
 from offboard.loadgen.robot.run import MADE_MAX, OwnRecord, Run, made_ahead
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import CLOUD, Execution
 from tests.fakes import ScriptedRunner

@@ -17,7 +17,8 @@ from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.learning.store import Store
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.predictors import LEAST_SQUARES, PARTS
-from offboard.robot_client.records.trace import Record, Trace
+from offboard.robot_client.records.record import Record
+from offboard.robot_client.records.trace import Trace
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.fakes import ScriptedRunner
 

@@ -23,7 +23,7 @@ from offboard.robot_client import predictors
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Decision, Forecast, Hedge, Probe
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.heartbeat import ServerReport
 
 SMALL = """name = "small"

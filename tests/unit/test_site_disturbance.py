@@ -11,7 +11,8 @@ from offboard.loadgen.play.run_files import TRACE
 from offboard.loadgen.robot_files import alone_path
 from offboard.loadgen.table.site_disturbance import ALONE, Change, Disturbance, measure
 from offboard.robot_client.policies import Decision
-from offboard.robot_client.records.trace import Record, Trace, as_dict
+from offboard.robot_client.records.record import Record, as_dict
+from offboard.robot_client.records.trace import Trace
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 
 LATE = Execution(CLOUD, 2.0, failure=CloudTimeout("late"), censored=True)

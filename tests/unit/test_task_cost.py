@@ -17,8 +17,7 @@ from offboard.loadgen.scenario.outcome_figures import FIGURES
 from offboard.loadgen.scenario.scenario import RobotPart, Scenario, Workload
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.scenario.task_cost import Costing, Spent, spent_of
-from offboard.robot_client.policies.energy import Energy
-from offboard.robot_client.policies.objectives import Deadline, Mean, Tail, TimeAndSpending
+from offboard.robot_client.policies.objectives import Deadline, Energy, Mean, Tail, TimeAndSpending
 
 WORKLOAD = Workload(task="m:f", sizes=("constant:1",), deadline_ms=200)
 ENERGY = Energy(compute_w=5.0, idle_w=1.0, radio_j_byte=1e-6)

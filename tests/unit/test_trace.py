@@ -20,7 +20,8 @@ from offboard.robot_client.learning.regret import Regret
 from offboard.robot_client.learning.savings import Savings
 from offboard.robot_client.policies import Decision, Hedge, Outlook
 from offboard.robot_client.policies.forecast import Packing
-from offboard.robot_client.records.trace import WAITING_MAX, Late, Record, Trace
+from offboard.robot_client.records.record import Late, Record
+from offboard.robot_client.records.trace import WAITING_MAX, Trace
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution, Packed, Sending
 
 ROOT = Path(__file__).parents[2]

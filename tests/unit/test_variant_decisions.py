@@ -18,10 +18,11 @@ from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.store import Store
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Decision, Forecast, Hedge, Outlook, Probe, objectives
-from offboard.robot_client.policies.forecast import WHOLE, PredictionErrors, Quality
+from offboard.robot_client.policies.forecast import WHOLE, Quality
 from offboard.robot_client.policies.hedge import late_after_s
 from offboard.robot_client.policies.objectives import Deadline, Expected, Mean, Tail, TimeAndSpending
-from offboard.robot_client.records.trace import Record, as_dict
+from offboard.robot_client.policies.prediction_errors import PredictionErrors
+from offboard.robot_client.records.record import Record, as_dict
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution
 from tests.outlooks import decide, known

@@ -6,7 +6,7 @@ import pytest
 
 from offboard.robot_client import policies
 from offboard.robot_client.policies import Forecast, Hedge, Outlook, Probe
-from offboard.robot_client.policies.forecast import SPREADS_90
+from offboard.robot_client.policies.prediction_errors import SPREADS_90
 from offboard.robot_client.policies.probe import PROBE_EVERY
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.outlooks import UNKNOWN, decide, known

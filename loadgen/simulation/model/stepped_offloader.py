@@ -8,7 +8,7 @@ from offboard.robot_client.execution.batch import Placed
 from offboard.robot_client.execution.race import Wait
 from offboard.robot_client.learning.learner import PendingTask
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.outgoing import new_task
 
 

@@ -18,7 +18,7 @@ from offboard.cloud_server.executors.worker_pool import WorkerPool
 from offboard.common.errors import OffloadError
 from offboard.common.tasks import task
 from offboard.robot_client.policies import BOTH
-from offboard.robot_client.records.trace import Record
+from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests import stateful_tasks
 from tests.executor_tasks import ON_THIS_COMPUTER, call, run, value

@@ -1,18 +1,39 @@
-"""The published rule, exactly: Algorithm 1 of Penmetcha, Kannan and Min.
+"""The policies that others are compared with: one site for every task, and the published rule.
 
-The windows and the least squares that it was published with are in `predictors`.
+The windows and the least squares that the rule was published with are in `predictors`.
 """
 
 from collections.abc import Mapping
 from functools import partial
 
 from offboard.common.text.wording import duration
+from offboard.common.variants import group_of
 from offboard.robot_client.policies.decision import Decision
-from offboard.robot_client.policies.forecast import Forecast, cheapest, home
+from offboard.robot_client.policies.forecast import Forecast, cheapest, costs_of, home
+
+
+class Always:
+    """Runs every task on one site, or the cheapest one of a group of this name.
+
+    While none of them can take tasks, tasks run onboard.
+    """
+
+    def __init__(self, site: str) -> None:
+        self._site = site
+
+    def decide(self, forecast: Forecast) -> Decision:
+        sites = [site for site in forecast.sites if group_of(site) == self._site]
+        if sites:
+            site = cheapest(costs_of(forecast.only(sites)))
+            return Decision(site, f"always {self._site}", self._site)
+        return Decision(home(forecast), f"{self._site} cannot take it", self._site)
 
 
 class Paper:
-    """Runs each task on the site with the lowest prediction, after a warm-up on all sites."""
+    """Algorithm 1 of Penmetcha, Kannan and Min, exactly.
+
+    Runs each task on the site with the lowest prediction, after a warm-up on all sites.
+    """
 
     def decide(self, forecast: Forecast) -> Decision:
         cold = [site for site, outlook in forecast.sites.items() if not outlook.full]
