@@ -37,10 +37,8 @@ NOTHING = "nothing"
 RECORDINGS = "recordings"
 WORKLOADS = ("link-plans", "link-frames", "link-images")  # that are played over the recordings
 SEEDS = 12
-MEAN_COSTS, ONE_COSTS = (
-    0.01,
-    0.03,
-)  # in the mean of a set, and in one scenario or family: so much must it cost
+MEAN_COSTS = 0.01  # what a mechanism must be worth in the mean of a set
+ONE_COSTS = 0.03  # or in one scenario or family
 
 Times = Mapping[tuple[str, str], float]  # by scenario and seed, or by family and recording
 
@@ -214,16 +212,14 @@ def table(found: Mapping[str, Mapping[str, Times]]) -> Table:
     for name in names:
         sets = {of: logs(times[name], times[NOTHING]) for of, times in found.items()}
         means = {of: _over_units(of, units) for of, units in sets.items()}
-        single = {unit: cost_of(each) for units in sets.values() for unit, each in units.items()}
-        in_order = sorted(single, key=lambda unit: single[unit].mean)
-        least, most = in_order[0], in_order[-1]
+        single = [(unit, cost_of(each)) for units in sets.values() for unit, each in units.items()]
+        single.sort(key=lambda one: one[1].mean)
         rows.append(
             [
                 name,
                 *map(str, means.values()),
-                f"{most} {single[most]}",
-                f"{least} {single[least]}",
-                "yes" if stays(list(means.values()), list(single.values())) else "**no**",
+                *(f"{unit} {cost}" for unit, cost in (single[-1], single[0])),
+                "yes" if stays(list(means.values()), [cost for _, cost in single]) else "**no**",
             ]
         )
     units = ", ".join(f"{len({unit for unit, _ in of[NOTHING]})} {name}" for name, of in found.items())

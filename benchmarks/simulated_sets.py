@@ -103,17 +103,8 @@ def simulate(
 
 def compare(checkout: Checkout, names: Sequence[str], flags: Sequence[str]) -> dict[str, Any]:
     """What `loadgen compare --simulate` of a checkout says of these scenarios, as JSON."""
-    command = [
-        sys.executable,
-        "-m",
-        checkout.module,
-        "compare",
-        *names,
-        "--simulate",
-        "--format",
-        "json",
-        *flags,
-    ]
+    command = [sys.executable, "-m", checkout.module, "compare", *names]
+    command += ["--simulate", "--format", "json", *flags]
     environ = {**os.environ, "PYTHONPATH": str(checkout.path)}
     done = subprocess.run(
         command, cwd=checkout.path, env=environ, capture_output=True, text=True, check=False

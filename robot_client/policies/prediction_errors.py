@@ -1,4 +1,4 @@
-"""How wrong the predictions for a site were: shares of late tasks, quantiles, and the width of intervals.
+"""How wrong past predictions were, and how late a task may therefore be.
 
 `learning/conformal.py` collects the errors; `hedge` and `objectives` read them.
 """
@@ -18,7 +18,7 @@ class PredictionErrors:
     """How wrong the last predictions for one site were; a value that never changes.
 
     `scores`: the error of each prediction in units of `unit_s`, sorted. `usual_s`: the usual time of a task.
-    `stopped`: the errors so far of late runs that were stopped, mostly because a hedge answered first.
+    `stopped`: the same of runs that were stopped late, until then; mostly a hedge had answered first.
     The methods return None while fewer than ERRORS_MIN errors are known, unless a spread helps.
     """
 
