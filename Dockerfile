@@ -78,7 +78,7 @@ USER offboard
 EXPOSE 9090
 ENTRYPOINT ["prometheus", "--config.file=/etc/prometheus/prometheus.yml", "--storage.tsdb.path=/prometheus"]
 
-# Runs the unit tests with the Python of the image.
+# Runs the unit tests of what robots and servers run, with the Python of the image.
 FROM bench AS test
 USER root
 COPY requirements/dev.txt /tmp/requirements.txt
@@ -87,7 +87,7 @@ WORKDIR /src
 COPY . .
 RUN chown -R offboard /src
 USER offboard
+# Other tests run outside: those of the test bench, and those that take minutes.
+RUN grep -LE 'offboard\.loadgen|benchmarks' tests/unit/test_*.py | grep -vE 'test_(learned|accelerations)' > tests.txt
 ENTRYPOINT ["python3", "-m", "pytest", "-p", "no:cacheprovider"]
-# These tests take minutes and run outside: learned predictors, tables of docs/, A* and jump points, reports, simulations.
-CMD ["--numprocesses=2", "tests/unit", "--ignore=tests/unit/test_learned.py", "--ignore=tests/unit/test_datasets.py", \
-  "--ignore=tests/unit/test_accelerations.py", "--ignore=tests/unit/test_report.py", "--ignore-glob=*test_simulation*"]
+CMD ["--numprocesses=2", "-m", "not long", "@/src/tests.txt"]

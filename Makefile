@@ -16,13 +16,16 @@ EXAMPLES_READY := .cache/examples/.ready
 # Ray is large, and only its own tests need it.
 RAY_BIN := .cache/ray/bin
 RAY_READY := .cache/ray/.ready
+# The site of the documentation needs nothing of the other environments.
+DOCS_BIN := .cache/docs/bin
+DOCS_READY := .cache/docs/.ready
 
 ROS2_READY := .cache/ros2-kilted/.ready .cache/ros2-jazzy/.ready
 
-.PHONY: help demo install format lint type test unit pythons integration compose chaos state bench figures examples ray ros2 browser prometheus torch up down table lock wheel clean
+.PHONY: help demo install format lint type test test-all unit pythons integration compose chaos state bench figures docs examples ray ros2 browser prometheus torch up down table lock wheel clean
 
 help: ## list the targets
-	@grep -E '^[a-z0-9]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+	@grep -E '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
 demo: $(BENCH_READY) ## plan 350 paths on a real map with three processes on loopback; writes out/demo/
 	$(BIN)/loadgen demo --out out/demo
@@ -37,22 +40,23 @@ lint: $(DEV_READY) ## check style and format with ruff
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-# In a checkout the packages lie next to `offboard/`, where mypy does not find them, so mypy reads the wheel.
-type: $(DEV_READY) ## check types with mypy, strict, on the unpacked wheel
-	rm -rf $(CACHE)/typed
-	$(BIN)/python -m build --wheel --no-isolation --outdir $(CACHE)/typed . >/dev/null
-	cd $(CACHE)/typed && $(BIN_ABS)/python -m zipfile -e offboard-*.whl . && $(BIN_ABS)/mypy --config-file $(CURDIR)/pyproject.toml --cache-dir $(CACHE)/mypy -p offboard
+type: $(DEV_READY) ## check types with mypy, strict
+	$(BIN)/mypy --cache-dir $(CACHE)/mypy -p offboard
 
-# Tests that may run in parallel with others.
-CROWDED := tests/unit tests/integration/executors tests/integration/keys tests/integration/toxiproxy $(addprefix tests/integration/test_,$(addsuffix .py,alone attacks blobs channel check compare cpu_time crashes dataset demo export fuzz own_task local_testbed robot_workload values_cross wheel))
-test: $(DEV_READY) ## run every test that this machine can run; skipped tests say why
-	$(BIN)/pytest --numprocesses 2 $(CROWDED)
-	$(BIN)/pytest --ignore tests/ros2 $(addprefix --ignore ,$(CROWDED))
+# tests/conftest.py says which tests are `long`, and which are `alone`.
+test: $(DEV_READY) ## run what guards the core, in minutes: unit tests, and a real server, relay and robot
+	$(BIN)/pytest --numprocesses 2 -m "not long and not alone" tests/unit tests/integration
+	@echo "left out: tests that take long, measure times, or need containers, a browser, Ray or ROS 2: make test-all"
+
+test-all: test ## run every other test that this machine can run, too; skipped tests say why
+	$(BIN)/pytest --numprocesses 3 -m "long and not alone" --ignore tests/ros2
+	$(BIN)/pytest -m alone --ignore tests/ros2
+	$(MAKE) --jobs 2 --output-sync=target ray ros2  # they mostly wait
 
 unit: $(DEV_READY) ## run the tests without sockets
 	$(BIN)/pytest --numprocesses 2 tests/unit
 
-VERSIONS := 3.11 3.12 3.13
+VERSIONS := 3.10 3.11 3.12 3.13
 pythons: ## run the unit tests on each supported Python, VERSIONS=3.13: on this one only
 	set -e; for version in $(VERSIONS); do $(MAKE) unit PYTHON=python$$version VENV=.cache/python$$version; done
 
@@ -75,6 +79,12 @@ bench: $(PEERS_READY) ## measure speed next to other libraries; needs an otherwi
 figures: $(DEV_READY) ## measure all figures of the docs that are not up to date, ONLY=NAME,..: these only; takes hours
 	$(BIN)/python -m benchmarks.figures $(if $(ONLY),--only $(ONLY))
 
+# Not with --quiet: it would hide the warnings from --strict, too.
+docs: $(DOCS_READY) ## build the documentation as a site in out/site, strictly: a broken link or anchor fails
+	$(DOCS_BIN)/python -m docs.site.reference
+	NO_MKDOCS_2_WARNING=1 $(DOCS_BIN)/mkdocs build --strict
+	@echo "built: out/site/index.html; with search: $(PYTHON) -m http.server --directory out/site"
+
 examples: $(EXAMPLES_READY) ## measure the five applications with one seed, FULL=1: with three; needs an otherwise idle machine
 	$(EXAMPLES_BIN)/python -m benchmarks.applications $(if $(FULL),--seeds 3)
 
@@ -83,7 +93,7 @@ ray: $(RAY_READY) ## test `--executor ray` on real Ray clusters of two nodes
 
 ros2: $(DEV_READY) $(ROS2_READY) ## test with real rclpy of two releases of ROS; needs python3.11, python3.12 and a C++ compiler
 	tests/ros2/alone.sh $(BIN)/pytest -s tests/ros2/test_goals.py
-	tests/ros2/alone.sh $(BIN)/pytest --numprocesses 2 --ignore tests/ros2/test_goals.py tests/ros2
+	tests/ros2/alone.sh $(BIN)/pytest --numprocesses 2 --dist worksteal --ignore tests/ros2/test_goals.py tests/ros2
 
 browser: $(DEV_READY) ## run the tests in a real browser; needs Chromium
 	$(BIN)/pytest tests/browser
@@ -146,6 +156,11 @@ $(EXAMPLES_READY): requirements/examples.txt pyproject.toml
 	test -x $(EXAMPLES_BIN)/python || $(PYTHON) -m venv .cache/examples
 	$(EXAMPLES_BIN)/python -m pip install --quiet --require-hashes -r requirements/examples.txt
 	$(EXAMPLES_BIN)/python -m pip install --quiet --no-deps --editable .
+	touch $@
+
+$(DOCS_READY): requirements/docs.txt
+	test -x $(DOCS_BIN)/python || $(PYTHON) -m venv .cache/docs
+	$(DOCS_BIN)/python -m pip install --quiet --require-hashes -r requirements/docs.txt
 	touch $@
 
 $(RAY_READY): requirements/ray.txt pyproject.toml

@@ -22,6 +22,7 @@ TABLES = (
     "attacks",
     "footprint",
     "page_cost",
+    "stream_steps",
     "task_cost",
 )
 

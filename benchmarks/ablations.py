@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from benchmarks.against import CASES, HERE, Played, play, read
 from benchmarks.against import table as table_of_runs
@@ -29,7 +30,6 @@ from benchmarks.measure import Table
 from benchmarks.simulated_sets import FRESH, NEW, Checkout, ScenarioSet, compare, simulate
 from offboard.loadgen.compare.recordings import find_recordings
 from offboard.loadgen.scenario.scenario_file import read_scenario
-from offboard.loadgen.table.confidence_intervals import Blocks
 from offboard.robot_client import policies
 from offboard.robot_client.policies.objectives import MEAN
 
@@ -39,6 +39,7 @@ WORKLOADS = ("link-plans", "link-frames", "link-images")  # that are played over
 SEEDS = 12
 MEAN_COSTS = 0.01  # what a mechanism must be worth in the mean of a set
 ONE_COSTS = 0.03  # or in one scenario or family
+RATIOS_MIN = 3  # for an interval
 
 Times = Mapping[tuple[str, str], float]  # by scenario and seed, or by family and recording
 
@@ -101,11 +102,9 @@ LEFT_OUT: dict[str, LeftOut] = {
     "change": _predictor("Change"),
     "change to slower": _predictor("BadNews"),
     "change to faster at once": _predictor("GoodNews"),
-    "at most doubles": _predictor("Doubling"),
     "bound": _predictor("Bound"),
     "late runs": _predictor("Late"),
     "PACE": _predictor("Pace"),
-    "first slope": _predictor("FirstSlope"),
 }
 
 
@@ -235,11 +234,12 @@ def logs(without: Times, whole: Times) -> dict[str, list[float]]:
 
 
 def cost_of(ratios: Sequence[float]) -> Cost:
-    """The geometric mean of ratios, given as logarithms, minus 1."""
+    """The geometric mean of ratios, given as logarithms, minus 1, with the interval of Student's t."""
     values = np.array(ratios)
-    ends = Blocks(len(values), length=1).intervals(lambda picks: {"mean": values[picks].mean(axis=-1)})
-    low, high = (end["mean"] if end else np.nan for end in ends)
-    return Cost(float(np.expm1(values.mean())), float(np.expm1(low)), float(np.expm1(high)))
+    mean, half = float(values.mean()), np.nan
+    if len(values) >= RATIOS_MIN:
+        half = float(stats.t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values)))
+    return Cost(*(float(np.expm1(one)) for one in (mean, mean - half, mean + half)))
 
 
 def stays(means: Sequence[Cost], single: Sequence[Cost]) -> bool:

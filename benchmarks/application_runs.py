@@ -13,8 +13,7 @@ from typing import Any
 
 from benchmarks.application_tables import POLICIES, Known, Run
 from offboard.common.tasks import Kind, kinds
-from offboard.loadgen.compare.compare import rotated
-from offboard.loadgen.compare.resume import play_once
+from offboard.loadgen.compare.runs import play_once, rotated
 from offboard.loadgen.play.run_files import ANSWERS, SUMMARY, TRACE
 from offboard.loadgen.robot.answers import value_of
 from offboard.loadgen.robot_files import read_trace

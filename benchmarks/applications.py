@@ -20,7 +20,7 @@ from offboard.common.config import check, flag_of, resolve, setting, settings_of
 from offboard.common.errors import ConfigError
 from offboard.common.toml_file import unknown
 from offboard.loadgen.compare.compare_settings import SEEDS_MAX
-from offboard.loadgen.play.code_commit import commit_here
+from offboard.loadgen.play.machine import commit_here
 from offboard.loadgen.play.run_files import SUMMARY
 from offboard.loadgen.table.measured_rows import write_whole
 

@@ -23,7 +23,7 @@ from benchmarks.measure import processor
 from offboard.common.command_line import run_command
 from offboard.common.errors import ConfigError, MissingExtra, OffloadError
 from offboard.common.toml_file import unknown
-from offboard.loadgen.play.code_commit import commit_here
+from offboard.loadgen.play.machine import commit_here
 from offboard.loadgen.play.part_setups import setups
 from offboard.loadgen.scenario.outcome_files import read_lines
 from offboard.loadgen.scenario.scenario import Scenario

@@ -17,13 +17,13 @@ import time
 import urllib.request
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 from benchmarks.measure import processor
 from benchmarks.servers import Server, cloud_server
-from offboard.loadgen.play.code_commit import commit_here
+from offboard.loadgen.play.machine import commit_here
 from offboard.loadgen.robot_files import read_trace
 
 MAP = Path(__file__).parents[1] / "maps" / "willow-full-0.05.yaml"
@@ -76,7 +76,7 @@ def main() -> None:
             print(step, file=sys.stderr, flush=True)
             steps.append(asdict(step))
         figures = {
-            "measured": f"{datetime.now(UTC):%Y-%m-%d}, commit {commit_here() or 'unknown'}",
+            "measured": f"{datetime.now(timezone.utc):%Y-%m-%d}, commit {commit_here() or 'unknown'}",
             "machine": f"{processor()}, {os.cpu_count()} cores, shared by server and {ROBOTS} robots",
             "task": f"plan_path on {MAP.stem} at {chosen.resolution} m",
             "workers": chosen.workers,

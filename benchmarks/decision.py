@@ -166,12 +166,10 @@ def _decide(kept: Remembering, count: int) -> None:
 
 
 def _predictors() -> Table:
-    from river import linear_model
     from sklearn.linear_model import LinearRegression
 
     least = model_of(predictors.make(predictors.LEAST_SQUARES, WINDOW), remote=False)
     parts = model_of(predictors.make(predictors.PARTS, WINDOW), remote=False)
-    streaming = linear_model.LinearRegression()
     sizes, seconds = np.array(SIZES[:WINDOW]), np.array(SIZES[:WINDOW]) * 0.04
     for size in SIZES[:WINDOW]:
         for one in (least, parts):
@@ -185,11 +183,6 @@ def _predictors() -> Table:
 
         return run
 
-    def river(count: int) -> None:
-        for size in SIZES[:count]:
-            streaming.learn_one({"d": size}, 0.04 * size)
-            streaming.predict_one({"d": size})
-
     def polyfit(count: int) -> None:
         for n, size in enumerate(SIZES[:count]):
             sizes[n % WINDOW], seconds[n % WINDOW] = size, 0.04 * size
@@ -201,13 +194,13 @@ def _predictors() -> Table:
             sizes[n % WINDOW], seconds[n % WINDOW] = size, 0.04 * size
             LinearRegression().fit(sizes[:, np.newaxis], seconds).predict([[size]])
 
-    found = each_of({"least squares": ours(least), "parts": ours(parts), "river": river}, CALLS)
+    found = each_of({"least squares": ours(least), "parts": ours(parts)}, CALLS)
     found |= each_of({"numpy.polyfit": polyfit, "scikit-learn": sklearn}, CALLS // 10)
     base = found["least squares"]
     rows = [[name, f"{each * 1e6:.2f}", f"{each / base:.1f}"] for name, each in found.items()]
     requirements = [
         Requirement(f"{name}, relative to least squares", found[name] / base, limit, at_least=True)
-        for name, limit in (("numpy.polyfit", 8.0), ("river", 2.0), ("scikit-learn", 50.0))
+        for name, limit in (("numpy.polyfit", 8.0), ("scikit-learn", 50.0))
     ]
     columns = ("predictor", "us", "relative to least squares")
     return Table(f"Learn and predict for one site, N = {WINDOW}", columns, rows, requirements)

@@ -20,8 +20,8 @@ import numpy as np
 from benchmarks.measure import Requirement, Table
 from benchmarks.servers import READY_S, cloud_server, running
 from benchmarks.tasks import ONBOARD_FACTOR, hash_near_or_far
-from offboard.loadgen.fleet.fleet_robot import server_of
 from offboard.loadgen.fleet.fleet_run import SPREAD, make_tasks, run_fleet
+from offboard.loadgen.fleet.fleet_servers import server_of
 from offboard.loadgen.fleet.fleet_settings import FleetConfig
 from offboard.loadgen.progress import progress
 from offboard.robot_client.offloader import Offloader

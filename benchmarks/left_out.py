@@ -8,7 +8,7 @@ import math
 
 from offboard.common.tasks import first_number
 from offboard.robot_client import policies
-from offboard.robot_client.policies import Decision, Forecast, Hedge
+from offboard.robot_client.policies import Decision, Forecast, Hedge, Outlook
 from offboard.robot_client.predictors.base import Call, Prediction, Run
 from offboard.robot_client.predictors.line import (
     ODD,
@@ -28,24 +28,23 @@ class Switched(Line):
     outliers = True  # a time beyond the reach counts only up to it
     good_news = True  # one outlier below the line is a change
     bad_news = True  # two outliers above it are one
-    doubling = True  # a change at most doubles the time
 
-    def learn(self, x: float, y: float, known: float = 0.0) -> None:
+    def learn(self, x: float, y: float, apart_s: float = 0.0) -> None:
         self.count += 1
         if self.count == 1:
-            self._begin(x, y, known)
+            self._begin(x, y, apart_s)
             return
         rate = max(RATE, 1.0 / self.count)
         error = y - self.a - self.b * x
-        unit = 0.5 * (max(0.0, self.a + self.b * x + known) + self._usual) or 1.0
-        self._usual += rate * (min(y + known, ODD * self._usual) - self._usual)
-        self._loosen(self.pace * self.pace, known)
+        unit = 0.5 * (max(0.0, self.a + self.b * x + apart_s) + self._usual) or 1.0
+        self._usual += rate * (min(y + apart_s, ODD * self._usual) - self._usual)
+        self._loosen(self.pace * self.pace, apart_s)
         variance, reach = self._reach(x, unit)
         side = math.copysign(1.0, error) if abs(error) > reach else 0.0
-        changed = self._is_change(side)
+        again = side != 0 and side == self._side
+        changed = (self.good_news and side < 0) or (self.bad_news and again)
         if changed:
-            error = min(error, unit) if self.doubling else error
-            self._loosen(min(1.0, (error / unit) ** 2), known)
+            self._loosen(min(1.0, (error / unit) ** 2), apart_s)
             variance, reach = self._reach(x, unit)
         self._side = side
         beyond = min(max(0.0, error - reach) / unit, TAIL_MAX)
@@ -54,10 +53,6 @@ class Switched(Line):
             seen = max(0.0, min(error * error, 0.5 * reach * reach) - variance) / (unit * unit)
             self._noise += rate * (min(1.0, seen) - self._noise)
         self._correct(x, max(-reach, min(reach, error)), unit)
-
-    def _is_change(self, side: float) -> bool:
-        again = side != 0 and side == self._side
-        return (self.good_news and side < 0) or (self.bad_news and again)
 
     def _reach(self, x: float, unit: float) -> tuple[float, float]:
         variance, reach = super()._reach(x, unit)
@@ -84,20 +79,10 @@ class _WithoutChange(Switched):
     good_news = bad_news = False
 
 
-class _WithoutDoubling(Switched):
-    doubling = False
-
-
 class _WithoutTail(Line):
     @property
     def tail(self) -> float:
         return 0.0
-
-
-class _WithoutFirstSlope(Line):
-    def _begin(self, x: float, y: float, known: float) -> None:
-        self.slope = None
-        super()._begin(x, y, known)
 
 
 class _WithoutLoadedShape(Line):
@@ -135,22 +120,10 @@ class Change(Parts):
     LINE = _WithoutChange
 
 
-class Doubling(Parts):
-    """A change may more than double the time."""
-
-    LINE = _WithoutDoubling
-
-
 class Tail(Parts):
     """What outliers take beyond the reach is not predicted."""
 
     LINE = _WithoutTail
-
-
-class FirstSlope(Parts):
-    """The first answer says as much about the bandwidth of the link as about its delay."""
-
-    LINE = _WithoutFirstSlope
 
 
 class LoadedShape(Parts):
@@ -298,7 +271,13 @@ class Stall(_Default):
             sites={
                 site: one
                 if site == ONBOARD or one.predicted_s is None
-                else one._replace(predicted_s=one.predicted_s - one.condition.wait_s)
+                else _without_wait(one, one.predicted_s)
                 for site, one in forecast.sites.items()
             }
         )
+
+
+def _without_wait(one: Outlook, predicted_s: float) -> Outlook:
+    wait_s = one.condition.wait_s
+    cost = None if one.cost is None else one.cost - wait_s
+    return one._replace(predicted_s=predicted_s - wait_s, cost=cost)

@@ -13,7 +13,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -40,13 +40,13 @@ def no_port() -> list[Metrics]:
 def metrics_alone() -> list[Metrics]:
     """No record is kept for a page."""
     (served,) = metrics_and_page()
-    served.live.due_at = datetime.max.replace(tzinfo=UTC)
+    served.live.due_at = datetime.max.replace(tzinfo=timezone.utc)
     return [served]
 
 
 def let_time_pass() -> None:
     """Let a task take TASK for the page, as on a real robot: counting instructions slows it down."""
-    begun, tasks = datetime.now(UTC), itertools.count()
+    begun, tasks = datetime.now(timezone.utc), itertools.count()
     offloader.datetime = SimpleNamespace(now=lambda _: begun + next(tasks) * TASK)
 
 

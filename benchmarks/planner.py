@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.measure import Requirement, Table, interleaved
-from offboard.common.planning import planner
+from offboard.common.planning import ASTAR, JPS, planner
+from offboard.common.planning.grid_kernels import largest_component
 from offboard.common.planning.map_files import read_map
-from offboard.common.planning.maps import GridMap, free_pairs, largest_component, passable
+from offboard.common.planning.maps import GridMap, free_pairs, passable
 from offboard.common.planning.planner import Point, Pose, Scan
-from offboard.common.planning.planner_names import ASTAR, JPS
 from offboard.common.planning.search import Cell, Field, Route
 
 ROOT = Path(__file__).parents[1]

@@ -16,18 +16,16 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measure import Requirement, Table
-from offboard.loadgen.compare.recording_figures import figures_of
 from offboard.loadgen.compare.recording_table import geometric
-from offboard.loadgen.compare.recordings import RecordedLink, find_recordings, over
-from offboard.loadgen.compare.resume import play_once
+from offboard.loadgen.compare.recordings import RecordedLink, figures_of, find_recordings, over
+from offboard.loadgen.compare.runs import play_once
 from offboard.loadgen.play.run_files import ROBOT_SEED_STEP, RobotFiles
 from offboard.loadgen.robot_files import read_trace
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.simulation import simulated_testbed
-from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks, find_tasks
-from offboard.loadgen.simulation.model.task_costs import DECIDING_CPU_S, Cost
+from offboard.loadgen.simulation.model.task_costs import DECIDING_CPU_S, Cost, RobotTasks, find_tasks
 from offboard.loadgen.simulation.simulated_run import simulate
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD

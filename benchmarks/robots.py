@@ -16,7 +16,7 @@ from benchmarks.servers import READY_S
 from benchmarks.tasks import nothing
 from offboard.common.tasks import Task, kind_of
 from offboard.common.wire import messages as wire
-from offboard.robot_client.sites.cloud import CloudRunner
+from offboard.robot_client.cloud.cloud_runner import CloudRunner
 
 BUDGET_S = 60.0
 

@@ -9,8 +9,8 @@ from benchmarks.measure import Requirement, Table
 from offboard.loadgen.play.play_scenario import play
 from offboard.loadgen.play.run_files import TRACE
 from offboard.loadgen.replay.recorded_tasks import read_tasks
-from offboard.loadgen.replay.replay import ReplayConfig
 from offboard.loadgen.replay.replay import tables as replayed
+from offboard.loadgen.replay.replay_settings import ReplayConfig
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.robot_client import policies
 

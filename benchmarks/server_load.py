@@ -18,7 +18,7 @@ from offboard.common.planning.map_files import read_map
 from offboard.common.planning.maps import free_pairs
 from offboard.common.planning.planner import Point, Pose
 from offboard.common.tasks import Task, kind_of
-from offboard.robot_client.sites.cloud import CloudRunner
+from offboard.robot_client.cloud.cloud_runner import CloudRunner
 from offboard.robot_client.sites.runner import Execution
 
 ROBOTS = (1, 10, 100, 1_000)

@@ -129,11 +129,11 @@ def _robot(endpoint: str) -> None:
 
 def _server(endpoint: str) -> None:
     """The server as ever, but what depends on the clock does not happen: here, time passes slowly."""
-    from offboard.cloud_server import __main__, reader_threads, server, tcp_connections
-    from offboard.common.host import load_watch
+    from offboard.cloud_server import __main__, connections, reader_threads, server
+    from offboard.common import load
 
     reader_threads.SHORT_S = reader_threads.AWAY_S = NEVER_S
-    server.SERVER_EVERY_S = server.LOOK_S = tcp_connections.LOOK_S = load_watch.HURRIED_S = NEVER_S
+    server.SERVER_EVERY_S = server.LOOK_S = connections.MEMORY_S = load.HURRIED_S = NEVER_S
     flags = ["--listen", endpoint, "--http", "127.0.0.1:0", "--tasks", "benchmarks.tasks", "--log", "error"]
     sys.argv = ["cloud-server", *flags, "--robot-mib-s", "65536"]
     sys.exit(__main__.main())

@@ -1,7 +1,4 @@
-"""`cloud-server`: builds the server from its settings, and runs it until a signal stops it.
-
-What the server does is in `server`, `http_api` and `executors`.
-"""
+"""`cloud-server`: builds the server from its settings, and runs it until a signal stops it."""
 
 import logging
 import os
@@ -10,13 +7,13 @@ import signal
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
-from offboard.cloud_server.config import ROBOTS, ServerConfig
+from offboard.cloud_server.config import MIB, ROBOTS, ServerConfig
 from offboard.common.command_line import load, run_command
 from offboard.common.config import as_dict
 from offboard.common.errors import ConfigError
-from offboard.common.host.logs import start_log
+from offboard.common.logs import start_log
 
 DESCRIPTION = (
     "Run tasks for robots. Robots connect over ZMQ; HTTP serves /live (a page), /health, /ready, /metrics, "
@@ -62,20 +59,21 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
     from offboard.cloud_server.http_api import make_http
     from offboard.cloud_server.metrics import Metrics
     from offboard.cloud_server.server import Limits, Server
-    from offboard.common.security.exposure import warn_each_minute
+    from offboard.common.security.address import warn_each_minute
     from offboard.common.security.keys import server_keys
-    from offboard.common.security.private_files import read_token
+    from offboard.common.security.plain_files import read_token
 
     sys.setswitchinterval(SWITCH_S)
-    files_max = raise_file_limit()
+    files_max = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (files_max, files_max))
     token = read_token(config.token_file)
     keys = server_keys(config.keys) if config.keys else None
     modules = load_tasks(config.tasks)
     log.info("settings: %s", as_dict(config))
     log.info("up to %d files may be open; each connected robot needs one", files_max)
     metrics = Metrics()
+    limits = (config.blob_mib * MIB, config.worker_memory * MIB)
     of_ray = {"ray_address": config.ray_address, "ray_resources": config.resources}
-    limits = (config.blob_bytes_max, config.worker_memory_bytes)
     executor = EXECUTORS[config.executor](config.workers, modules, *limits, **of_ray)
     server = Server(
         config.listen,
@@ -83,9 +81,9 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
         metrics,
         Limits(
             queue_max=config.queue_max,
-            blob_bytes_max=config.blob_bytes_max,
-            message_bytes_max=config.message_bytes_max,
-            robot_bytes_per_s=config.robot_bytes_a_s,
+            blob_bytes_max=config.blob_mib * MIB,
+            message_bytes_max=config.message_mib * MIB,
+            robot_bytes_per_s=config.robot_mib_s * MIB,
             drain_s=config.drain_s,
         ),
         on_ready=lambda: log.info("ready: listening on %s, http://%s", server.endpoint, web.address),
@@ -97,7 +95,7 @@ def serve(argv: Sequence[str], environ: Mapping[str, str]) -> int:
     if config.open_ways:
         warn_each_minute(config.open_ways)
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: _stop(server))
+        signal.signal(number, lambda *_: server.drain())
     try:
         answered = server.run()
     finally:
@@ -117,12 +115,10 @@ def abandon(drain_s: float) -> NoReturn:
 
 
 def load_tasks(modules: Sequence[str]) -> tuple[str, ...]:
-    """Import the modules of the user's tasks, and of the empty task that `robot-client check` runs.
-
-    The files that the tasks cover are read.
-    """
-    from offboard.common.source.reading import read_files_of_server
-    from offboard.common.tasks import kinds, load_modules
+    """Import the modules of tasks and of the one that `robot-client check` runs; read what they cover."""
+    from offboard.common.source.comparison import read_files_of_server
+    from offboard.common.source.task_modules import load_modules
+    from offboard.common.tasks import kinds
 
     load_modules(modules)
     if not kinds():
@@ -130,17 +126,6 @@ def load_tasks(modules: Sequence[str]) -> tuple[str, ...]:
     load_modules([EMPTY_TASK_MODULE])
     read_files_of_server()
     return (*modules, EMPTY_TASK_MODULE)
-
-
-def raise_file_limit() -> int:
-    """Raise the limit of open files to the most that this process may have; return it."""
-    most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
-    return most
-
-
-def _stop(server: Any) -> None:
-    server.drain()
 
 
 if __name__ == "__main__":

@@ -9,14 +9,15 @@ import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import zmq
 from zmq.utils import z85
 
+from offboard.cloud_server.connections import end, other_end
 from offboard.cloud_server.metrics import Metrics
-from offboard.cloud_server.tcp_connections import end, other_end
 from offboard.common.errors import ConfigError
+from offboard.common.logs import RareLog
 from offboard.common.security.keys import PUBLIC, read_public
 
 ZAP = "inproc://zeromq.zap.01"  # the address where libzmq asks (RFC 27)
@@ -28,46 +29,34 @@ SETTLED_NS = 2_000_000_000  # from this age on, the time stamp of a file shows e
 ROBOTS_MAX = 10_000  # key files; those beyond it, in the order of their names, are ignored
 CUT_KEPT = 4096  # connections remembered as cut off, so that their waiting tasks do not run
 NO_FILE = (errno.EMFILE, errno.ENFILE)  # connections have taken all files
-LOG_PAUSE_S = 10.0  # at least, between two warnings about refused robots
 
 log = logging.getLogger("offboard.cloud_server")
 
 
-class Access(Protocol):
-    """Answers questions about connections. All methods may be called from any thread."""
+class Access:
+    """Answers questions about connections: on a server without keys, each one counts as a robot of its own.
 
-    def lets_in(self, peer: zmq.Frame) -> bool:
-        """True if the server may read messages of the connection that this frame names."""
-
-    def robot_of(self, peer: bytes) -> bytes:
-        """The robot of this connection. A robot may have several connections."""
-
-    def name_of(self, robot: bytes) -> str:
-        """The name of a robot, for people."""
-
-    def shut_out(self, peer: bytes, seconds: float) -> str:
-        """Refuse new connections of this robot for a while; returns its name."""
-
-    def knows(self, peer: bytes) -> bool:
-        """True if tasks of this connection may still run and be answered."""
-
-
-class Everyone:
-    """Access to a server without keys: every connection counts as a robot of its own."""
+    All methods may be called from any thread.
+    """
 
     def lets_in(self, peer: zmq.Frame) -> bool:  # noqa: ARG002
+        """True if the server may read messages of the connection that this frame names."""
         return True
 
     def robot_of(self, peer: bytes) -> bytes:
+        """The robot of this connection. A robot may have several connections."""
         return peer
 
     def name_of(self, robot: bytes) -> str:
+        """The name of a robot, for people."""
         return f"connection {robot.hex()[-8:]}" if robot else "all others"
 
     def shut_out(self, peer: bytes, seconds: float) -> str:  # noqa: ARG002 - it cannot be recognised
+        """Refuse new connections of this robot for a while; returns its name."""
         return "robot without a key"
 
     def knows(self, peer: bytes) -> bool:  # noqa: ARG002
+        """True if tasks of this connection may still run and be answered."""
         return True
 
 
@@ -81,7 +70,7 @@ class _Connection:
     other_end: Any
 
 
-class Authorisation:
+class Authorisation(Access):
     """Access for the robots whose public keys are in a folder. A question costs about a microsecond.
 
     A thread answers libzmq, reads the folder again every RELOAD_S, and closes the connections of robots that
@@ -97,7 +86,7 @@ class Authorisation:
         self._connections: dict[bytes, _Connection] = {}
         self._cut: dict[bytes, None] = {}
         self._shut_out: dict[str, float] = {}  # for a public key, until when it is shut out
-        self._last_warning = -float("inf")
+        self._log = RareLog(log)
         for problem in self._reload():
             raise ConfigError(f"--robots: {problem}")
         if not self._known:
@@ -108,7 +97,10 @@ class Authorisation:
         threading.Thread(target=self._run, name="robots", daemon=True).start()
 
     def lets_in(self, peer: zmq.Frame) -> bool:
-        user = _user(peer)
+        try:
+            user = str(peer.get("User-Id"))
+        except zmq.ZMQError:  # the connection has none
+            user = ""
         name = self._known.get(user)
         if name is None:
             self._metrics.dropped.labels("unknown robot").inc()
@@ -198,15 +190,11 @@ class Authorisation:
         # A recently changed file may change again without a later time stamp: then read it again.
         recent_ns = time.time_ns() - SETTLED_NS
         self._seen = None if problems or any(state[-1] > recent_ns for _, state in seen) else seen
-        self._log_changes(known)
+        for what, some, others in (("known", known, self._known), ("removed", self._known, known)):
+            if names := [name for key, name in some.items() if key not in others]:
+                log.info("robots %s: %s", what, ", ".join(names))
         self._known = known
         return problems
-
-    def _log_changes(self, known: dict[str, str]) -> None:
-        for what, some, others in (("known", known, self._known), ("removed", self._known, known)):
-            names = [name for key, name in some.items() if key not in others]
-            if names:
-                log.info("robots %s: %s", what, ", ".join(names))
 
     def _judge(self, asked: list[bytes]) -> list[bytes]:
         """The answer to a question of libzmq. The user id of a connection is its public key."""
@@ -216,13 +204,11 @@ class Authorisation:
         if user in self._known and self._shut_out.get(user, 0.0) <= time.monotonic():
             return [ZAP_VERSION, request_id, b"200", b"OK", user.encode(), b""]
         self._metrics.refused.inc()
-        now = time.monotonic()
-        if now - self._last_warning >= LOG_PAUSE_S:
-            self._last_warning = now
-            where = asked[3].decode(errors="replace") if well_formed else "?"
-            why = "was cut off a moment ago" if user in self._known else f"is not in {self._folder}"
-            text = "refused a robot at %s: its key %s %s; remedy: if it is yours, copy its robot.key there"
-            log.warning(text, where, user, why)
+        where = asked[3].decode(errors="replace") if well_formed else "?"
+        why = "was cut off a moment ago" if user in self._known else f"is not in {self._folder}"
+        text = f"refused a robot at {where}: its key {user} {why}; "
+        text += "remedy: if it is yours, copy its robot.key there"
+        self._log(logging.WARNING, text, time.monotonic())
         return [ZAP_VERSION, request_id, b"400", b"unknown robot", b"", b""]
 
     def _cut_off(self, peer: bytes, connection: _Connection) -> None:
@@ -230,20 +216,14 @@ class Authorisation:
         if peer in self._cut:
             return
         self._cut[peer] = None
-        while len(self._cut) > CUT_KEPT:
+        if len(self._cut) > CUT_KEPT:
             del self._cut[next(iter(self._cut))]
-        text = (
-            "cut off robot %s: its key is no longer in %s; remedy: if it is yours, copy its key there again"
+        log.warning(
+            "cut off robot %s: its key is no longer in %s; remedy: if it is yours, copy its key there again",
+            connection.name,
+            self._folder,
         )
-        log.warning(text, connection.name, self._folder)
         end(connection.file, connection.other_end)
-
-
-def _user(peer: zmq.Frame) -> str:
-    try:
-        return str(peer.get("User-Id"))
-    except zmq.ZMQError:  # the connection has none
-        return ""
 
 
 def _state(path: Path) -> tuple[int, ...]:

@@ -2,23 +2,27 @@
 
 import contextlib
 import json
-import math
 import os
 import re
+import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError
-from offboard.common.host.logs import JSON, LEVELS, TEXT
-from offboard.common.security.exposure import OPEN_REMEDY, on_loopback
+from offboard.common.logs import JSON, LEVELS, TEXT
+from offboard.common.security.address import OPEN_REMEDY, on_loopback
 
 MIB = 1024 * 1024
 ROBOTS = "robots"  # default folder for the keys of robots, inside the folder of --keys
 PORT_MAX = 65535
 AUTO = "auto"  # Ray's word for the cluster that runs on this computer
 RESOURCES_EXAMPLE = '{"CPU": 1, "GPU": 1}'
-ADDRESSES, TASKS, ACCESS, OUTPUT, LIMITS = "addresses", "tasks", "access", "output", "limits"
+
+_address, _tasks = partial(setting, group="addresses"), partial(setting, group="tasks")
+_access, _output = partial(setting, group="access"), partial(setting, group="output")
+_limit = partial(setting, group="limits", rare=True)
 
 _LISTEN = re.compile(r"tcp://(\*|\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5})")
 _HTTP = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5})")
@@ -28,137 +32,89 @@ _HTTP = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5})")
 class ServerConfig:
     """What the server listens on, whom it lets in, which tasks it runs, and its limits."""
 
-    listen: str = setting(
+    listen: str = _address(
         "tcp://127.0.0.1:5555",
         "endpoint for robots; port 0 picks a free one; an address beyond loopback needs --keys",
-        group=ADDRESSES,
         metavar="ENDPOINT",
     )
-    http: str = setting(
+    http: str = _address(
         "127.0.0.1:8000",
         "address of /health, /metrics and the other pages; an address beyond loopback needs --token-file",
-        group=ADDRESSES,
         metavar="HOST:PORT",
     )
-    tasks: tuple[str, ...] = setting(
+    tasks: tuple[str, ...] = _tasks(
         ("offboard.common.planning.planner",),
         "modules that register tasks, separated by commas",
-        group=TASKS,
         metavar="MODULE,MODULE",
     )
-    executor: str = setting(
+    executor: str = _tasks(
         "threads",
         "what runs the tasks: threads share memory; processes survive a task that crashes; "
         "ray: actors on the nodes of a Ray cluster",
-        group=TASKS,
         choices=("threads", "processes", "ray"),
     )
-    workers: int = setting(
-        len(os.sched_getaffinity(0)),
-        "tasks that run at the same time",
-        group=TASKS,
-        minimum=1,
-        maximum=1024,
-        metavar="W",
+    workers: int = _tasks(
+        len(os.sched_getaffinity(0)), "tasks that run at the same time", minimum=1, maximum=1024, metavar="W"
     )
-    ray_address: str = setting(
+    ray_address: str = _tasks(
         AUTO,
         "head of the Ray cluster, of which this computer is a node; auto: the cluster that runs here",
-        group=TASKS,
         rare=True,
         metavar="HOST:PORT",
     )
-    ray_resources: str = setting(
+    ray_resources: str = _tasks(
         '{"CPU": 1}',
         "what each worker needs on a node of the Ray cluster, as JSON",
-        group=TASKS,
         rare=True,
         metavar="JSON",
     )
-    keys: Path | None = setting(
+    keys: Path | None = _access(
         None,
         "folder with server.key_secret, made by `cloud-server keys`; encrypts everything (CURVE)",
-        group=ACCESS,
         metavar="DIR",
     )
-    token_file: Path | None = setting(
-        None, "file with the bearer token that HTTP needs, except for /health and /ready", group=ACCESS
+    token_file: Path | None = _access(
+        None, "file with the bearer token that HTTP needs, except for /health and /ready"
     )
-    insecure: bool = setting(
-        False,
-        "accept anybody from beyond loopback without keys or token; logs a warning every minute",
-        group=ACCESS,
+    insecure: bool = _access(
+        False, "accept anybody from beyond loopback without keys or token; logs a warning every minute"
     )
-    robots: Path | None = setting(
+    robots: Path | None = _access(
         None,
         "folder with the public key of each robot that may connect, read again when it changes "
         "(default: robots in the folder of --keys)",
-        group=ACCESS,
         rare=True,
         metavar="DIR",
     )
-    log: str = setting(
-        "info",
-        "least severe messages that are logged",
-        group=OUTPUT,
-        choices=LEVELS,
+    log: str = _output("info", "least severe messages that are logged", choices=LEVELS)
+    log_format: str = _output(
+        TEXT, "form of the lines of the log: text, or a JSON object each", rare=True, choices=(TEXT, JSON)
     )
-    log_format: str = setting(
-        TEXT,
-        "form of the lines of the log: text, or a JSON object each",
-        group=OUTPUT,
-        rare=True,
-        choices=(TEXT, JSON),
-    )
-    worker_memory: int = setting(
+    worker_memory: int = _limit(
         2048,
         "memory that one worker process may use, in MiB; a task that needs more fails",
-        group=LIMITS,
-        rare=True,
         minimum=256,
         maximum=2**20,
         metavar="MIB",
     )
-    queue_max: int = setting(
-        64,
-        "requests that may wait; further requests are answered busy",
-        group=LIMITS,
-        rare=True,
-        minimum=1,
-        maximum=100_000,
+    queue_max: int = _limit(
+        64, "requests that may wait; further requests are answered busy", minimum=1, maximum=100_000
     )
-    blob_mib: int = setting(
-        256,
-        "memory for large arguments that are kept for later requests, in MiB",
-        group=LIMITS,
-        rare=True,
-        minimum=1,
-        maximum=2**20,
+    blob_mib: int = _limit(
+        256, "memory for large arguments that are kept for later requests, in MiB", minimum=1, maximum=2**20
     )
-    message_mib: int = setting(
-        64,
-        "largest message that is received or sent, in MiB",
-        group=LIMITS,
-        rare=True,
-        minimum=1,
-        maximum=2**11 - 1,
+    message_mib: int = _limit(
+        64, "largest message that is received or sent, in MiB", minimum=1, maximum=2**11 - 1
     )
-    robot_mib_s: int = setting(
+    robot_mib_s: int = _limit(
         64,
         "data that one robot may send, in MiB per second; each message counts for at least 64 KiB; "
         "further requests are answered busy",
-        group=LIMITS,
-        rare=True,
         minimum=1,
         maximum=2**20,
     )
-    drain_s: float = setting(
-        10.0,
-        "time to finish accepted tasks after SIGTERM or Ctrl-C, in seconds",
-        group=LIMITS,
-        rare=True,
-        minimum=0,
-        maximum=3600,
+    drain_s: float = _limit(
+        10.0, "time to finish accepted tasks after SIGTERM or Ctrl-C, in seconds", minimum=0, maximum=3600
     )
 
     def __post_init__(self) -> None:
@@ -215,26 +171,10 @@ class ServerConfig:
     def http_address(self) -> tuple[str, int]:
         return host_and_port("--http", self.http, _HTTP, "HOST:PORT")
 
-    @property
-    def blob_bytes_max(self) -> int:
-        return self.blob_mib * MIB
-
-    @property
-    def worker_memory_bytes(self) -> int:
-        return self.worker_memory * MIB
-
-    @property
-    def robot_bytes_a_s(self) -> int:
-        return self.robot_mib_s * MIB
-
-    @property
-    def message_bytes_max(self) -> int:
-        return self.message_mib * MIB
-
 
 def _is_amount(value: object) -> bool:
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    return number and math.isfinite(float(value)) and float(value) >= 0  # type: ignore[arg-type]
+    return number and 0 <= value <= sys.float_info.max  # type: ignore[operator]
 
 
 def host_and_port(flag: str, text: str, pattern: re.Pattern[str], allowed: str) -> tuple[str, int]:

@@ -1,7 +1,4 @@
-"""The queue of accepted requests: one line per robot, and the next robot is the one that had the least time.
-
-It reads no clock and no socket; `scheduler` decides which requests enter it.
-"""
+"""The queue of accepted requests: one line per robot, without clocks; `scheduler` decides who enters it."""
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
@@ -111,7 +108,6 @@ class FairQueue:
             self._had_s = {one: self._had_s[one] for one in asking}
 
     def take(self, matches: Callable[[Work], bool]) -> list[Work]:
-        """Remove and return every waiting request that matches."""
         if not self._count:
             return []
         taken = [work for work in self if matches(work)]
@@ -123,11 +119,6 @@ class FairQueue:
             self._held.drop(work)
         self._count -= len(taken)
         return taken
-
-    @property
-    def robot_count(self) -> int:
-        """The number of robots whose worker time is remembered."""
-        return len(self._had_s)
 
     def __len__(self) -> int:
         return self._count

@@ -1,7 +1,4 @@
-"""The HTTP side of the server: health, readiness, metrics, settings and tasks, in a thread of its own.
-
-`server` gives the figures; `HttpGuard` decides who may read them.
-"""
+"""The HTTP side of the server, in a thread of its own; `http_guard` decides who may read what."""
 
 import asyncio
 import dataclasses
@@ -19,8 +16,7 @@ from offboard.cloud_server.server import Server
 from offboard.common import VERSION, tasks
 from offboard.common.config import as_dict
 from offboard.common.errors import ConfigError, MissingExtra
-from offboard.common.live.live_files import DOCS_PATHS, LOOKS, PATHS
-from offboard.common.live.live_pages import LivePages
+from offboard.common.live.live_files import DOCS_PATHS, LOOKS, PATHS, LivePages
 from offboard.common.live.look import EVERY_S, Look, Source, Viewers, encode
 from offboard.common.security.http_guard import HttpGuard
 from offboard.common.token_bucket import Bucket
@@ -42,7 +38,6 @@ TICKS, UVICORN_TICK_S = 5, 0.1  # five of uvicorn's ten ticks per second are don
 
 
 def make_http(config: ServerConfig, metrics: Metrics, server: Server, *, token: str | None) -> "HttpServer":
-    """The HTTP server of the process, bound to its address but not started."""
     app = create_app(
         server.status,
         metrics.registry,

@@ -1,12 +1,9 @@
-"""The figures that the server counts, and its status.
-
-`http_api` shows them.
-"""
+"""The figures that the server counts, and its status; `http_api` shows them."""
 
 import time
 from collections.abc import Callable, Generator
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
@@ -49,10 +46,7 @@ class RobotUse:
 
 
 class RobotUses:
-    """What each robot asks of this server, counted only while somebody looks at the page /live.
-
-    counting: whether a use must be noted.
-    """
+    """What each robot asks of this server. `counting`: somebody looks at /live, so a use must be noted."""
 
     def __init__(self) -> None:
         self.counting = False
@@ -82,54 +76,30 @@ class Metrics:
 
     def __init__(self) -> None:
         self.robots = RobotUses()
-        r = self.registry = CollectorRegistry()
-        self.requests = Counter(
-            "offboard_server_requests", "Requests by outcome", ["kind", "status"], registry=r
-        )
-        self.requests_of = lru_cache(LABELS_MAX)(self.requests.labels)
-        self.queue_depth = Gauge(
-            "offboard_server_waiting_requests", "Requests waiting for a worker", registry=r
-        )
-        self.running = Gauge("offboard_server_running_tasks", "Tasks running", registry=r)
-        self.up = Gauge(
-            "offboard_server_up_workers", "Workers that run a task or can take one", ["executor"], registry=r
-        )
-        self.queue_s = Histogram(
-            "offboard_server_queue_seconds",
-            "Time from arrival to start",
-            ["kind"],
-            buckets=SECONDS_BUCKETS,
-            registry=r,
-        )
-        self.run_s = Histogram(
-            "offboard_server_run_seconds", "Time in the worker", ["kind"], buckets=SECONDS_BUCKETS, registry=r
-        )
-        self.queue_s_of = lru_cache(LABELS_MAX)(self.queue_s.labels)
-        self.run_s_of = lru_cache(LABELS_MAX)(self.run_s.labels)
-        self.bytes_in = Counter("offboard_server_received_bytes", "Bytes of messages received", registry=r)
-        self.bytes_out = Counter("offboard_server_sent_bytes", "Bytes of messages sent", registry=r)
-        self.blob_bytes = Gauge("offboard_server_blob_bytes", "Bytes of stored large arguments", registry=r)
-        self.load = Gauge(
-            "offboard_server_other_load_ratio", "Share of the CPU that other programs take", registry=r
-        )
-        self.capacity = Gauge(
-            "offboard_server_task_cpu_ratio", "Share of one CPU that a task may use", registry=r
-        )
-        self.dropped = Counter(
-            "offboard_server_dropped_messages",
-            "Messages and replies that were dropped",
-            ["reason"],
-            registry=r,
-        )
-        self.refused = Counter(
-            "offboard_server_refused_handshakes", "Handshakes with an unknown key", registry=r
-        )
-        self.cut_off = Counter(
-            "offboard_server_cut_off_connections", "Connections closed because they sent too much", registry=r
-        )
-        self.restarts = Counter(
-            "offboard_server_worker_restarts", "Workers that died and were replaced", ["reason"], registry=r
-        )
+        self.registry = CollectorRegistry()
+        counter, gauge = partial(Counter, registry=self.registry), partial(Gauge, registry=self.registry)
+        seconds = partial(Histogram, labelnames=["kind"], buckets=SECONDS_BUCKETS, registry=self.registry)
+        requests = counter("offboard_server_requests", "Requests by outcome", ["kind", "status"])
+        self.requests_of = lru_cache(LABELS_MAX)(requests.labels)
+        self.queue_depth = gauge("offboard_server_waiting_requests", "Requests waiting for a worker")
+        self.running = gauge("offboard_server_running_tasks", "Tasks running")
+        self.up = gauge("offboard_server_up_workers", "Workers that run a task or can take one", ["executor"])
+        queue_s = seconds("offboard_server_queue_seconds", "Time from arrival to start")
+        self.queue_s_of = lru_cache(LABELS_MAX)(queue_s.labels)
+        run_s = seconds("offboard_server_run_seconds", "Time in the worker")
+        self.run_s_of = lru_cache(LABELS_MAX)(run_s.labels)
+        self.bytes_in = counter("offboard_server_received_bytes", "Bytes of messages received")
+        self.bytes_out = counter("offboard_server_sent_bytes", "Bytes of messages sent")
+        self.blob_bytes = gauge("offboard_server_blob_bytes", "Bytes of stored large arguments")
+        self.load = gauge("offboard_server_other_load_ratio", "Share of the CPU that other programs take")
+        self.capacity = gauge("offboard_server_task_cpu_ratio", "Share of one CPU that a task may use")
+        dropped = "Messages and replies that were dropped"
+        self.dropped = counter("offboard_server_dropped_messages", dropped, ["reason"])
+        self.refused = counter("offboard_server_refused_handshakes", "Handshakes with an unknown key")
+        cut_off = "Connections closed because they sent too much"
+        self.cut_off = counter("offboard_server_cut_off_connections", cut_off)
+        restarts = "Workers that died and were replaced"
+        self.restarts = counter("offboard_server_worker_restarts", restarts, ["reason"])
 
 
 class ServerLive:

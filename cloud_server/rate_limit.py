@@ -1,7 +1,4 @@
-"""Limits how much each robot may send per second, and decides what happens to a robot that sends more.
-
-It reads no clock and no socket; `server` does what it decides.
-"""
+"""Limits how much each robot may send per second, without clocks; `server` does what it decides."""
 
 import math
 from collections import OrderedDict
@@ -68,13 +65,6 @@ class RateLimit:
             robot.refusals_left.take(1)
             return Verdict.REFUSE
         return Verdict.DROP
-
-    def __len__(self) -> int:
-        """The number of robots remembered."""
-        return len(self._robots)
-
-    def __contains__(self, name: bytes) -> bool:
-        return name in self._robots
 
     def _new(self, now_s: float) -> _Robot:
         left = Bucket(self._rate, self._most, self._most)

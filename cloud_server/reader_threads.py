@@ -15,8 +15,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 
-from offboard.cloud_server.executors.executor import Executor
-from offboard.cloud_server.executors.task_run import Call, Outcome
+from offboard.cloud_server.executors.executor import Call, Executor, Outcome
 from offboard.cloud_server.fair_queue import Work
 
 SHORT_S = 0.0005  # tasks of a kind that usually take less are short

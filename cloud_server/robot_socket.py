@@ -1,11 +1,8 @@
-"""The socket of the robots: its options, and sending without waiting.
-
-`server` reads it; `scheduler` decides which replies are sent.
-"""
+"""The socket of the robots: its options, and sending without waiting; `server` reads it."""
 
 import os
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import zmq
@@ -67,7 +64,9 @@ class ReplySender:
     ) -> None:
         self._channel = channel
         self._metrics = metrics
-        self._unread = _UnreadReplies(message_bytes_max)
+        self._unread_max = message_bytes_max
+        # The large replies that libzmq still holds because their robots have not read them.
+        self._held: OrderedDict[bytes, list[tuple[zmq.MessageTracker, int]]] = OrderedDict()
         self._knows = knows
 
     def send(self, peer: bytes, message: Message) -> None:
@@ -75,13 +74,19 @@ class ReplySender:
         if not self._knows(peer):
             self._metrics.dropped.labels("unknown robot").inc()
             return
-        frames = pack(message)
+        frames: list[Any] = pack(message)
         size = byte_count(frames)
         if size > LARGE_BYTES:
-            if not self._unread.has_room(peer, size):
+            held = self._held[peer] = [one for one in self._held.pop(peer, ()) if not one[0].done]
+            if held and sum(bytes_ for _, bytes_ in held) + size > self._unread_max:
                 self._metrics.dropped.labels("not reading").inc()
                 return
-            frames = self._unread.tracked(peer, frames, size)
+            last = zmq.Frame(frames[-1], track=True, copy_threshold=0)
+            assert last.tracker is not None
+            held.append((last.tracker, size))  # libzmq reports when it has let go of the last frame
+            frames = [*frames[:-1], last]
+            if len(self._held) > PEERS_MAX:
+                self._held.popitem(last=False)
         try:
             self._channel.send([peer, *frames])
             self._metrics.bytes_out.inc(size)
@@ -91,27 +96,3 @@ class ReplySender:
             if error.errno != zmq.EHOSTUNREACH:
                 raise
             self._metrics.dropped.labels("gone").inc()
-
-
-class _UnreadReplies:
-    """The large replies that libzmq still holds because their robots have not read them."""
-
-    def __init__(self, bytes_max: int) -> None:
-        self._bytes_max = bytes_max
-        self._held: OrderedDict[bytes, list[tuple[zmq.MessageTracker, int]]] = OrderedDict()
-
-    def has_room(self, peer: bytes, size: int) -> bool:
-        """True if one more reply of this size may be held. A single one may have any size."""
-        held = [one for one in self._held.pop(peer, ()) if not one[0].done]
-        if held:
-            self._held[peer] = held
-        return not held or sum(bytes_ for _, bytes_ in held) + size <= self._bytes_max
-
-    def tracked(self, peer: bytes, frames: Sequence[Any], size: int) -> list[Any]:
-        """The frames. libzmq reports when it has let go of the last one."""
-        last = zmq.Frame(frames[-1], track=True, copy_threshold=0)
-        assert last.tracker is not None
-        self._held.setdefault(peer, []).append((last.tracker, size))
-        while len(self._held) > PEERS_MAX:
-            self._held.popitem(last=False)
-        return [*frames[:-1], last]

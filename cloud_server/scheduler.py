@@ -1,24 +1,22 @@
 """Decides what happens to each request: accept or refuse it, when it starts, and how it is answered.
 
-`server` reads the messages; `fair_queue` decides whose turn it is. Every method but `wanted` is called under
-the lock of the channel.
+Every method but `wanted` is called under the lock of the channel.
 """
 
 import logging
 import time
 from collections import Counter, OrderedDict
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from offboard.cloud_server.authorisation import Access
-from offboard.cloud_server.executors.executor import Executor
-from offboard.cloud_server.executors.task_run import Outcome
+from offboard.cloud_server.executors.executor import Executor, Outcome, bounded
 from offboard.cloud_server.fair_queue import FairQueue, Work
 from offboard.cloud_server.metrics import Metrics
 from offboard.cloud_server.robot_socket import ReplySender
 from offboard.common import tasks
-from offboard.common.host.load_watch import LoadWatch
+from offboard.common.load import LoadWatch
 from offboard.common.wire.blobs import BlobStore
-from offboard.common.wire.messages import Reply, Request, byte_count
+from offboard.common.wire.messages import Reply, Request
 
 CRASHES_MAX = 3  # workers that one request may cost
 CRASHED_KEPT = 1024  # requests whose crashes are remembered
@@ -112,7 +110,10 @@ class Scheduler:
             return Refusal("busy", "the server is warming up")
         if self._queue.closed_to(work.robot):
             return self._full()
-        if missing := self._pin(work):
+        for digest in request.blobs:
+            if (blob := self._blobs.get(digest)) is not None:
+                work.blobs[digest] = blob
+        if missing := tuple(digest for digest in request.blobs if digest not in work.blobs):
             return Refusal("need_blob", missing=missing)
         if self._queue.bytes_with(work) > self._blobs.bytes_max + self._message_bytes_max:
             return Refusal("busy", "waiting requests hold all the memory allowed")
@@ -120,14 +121,6 @@ class Scheduler:
 
     def _full(self) -> Refusal:
         return Refusal("busy", f"{len(self._queue)} requests are waiting")
-
-    def _pin(self, work: Work) -> tuple[bytes, ...]:
-        """Give the work its blobs; returns the digests of those that the server does not have."""
-        for digest in work.request.blobs:
-            blob = self._blobs.get(digest)
-            if blob is not None:
-                work.blobs[digest] = blob
-        return tuple(digest for digest in work.request.blobs if digest not in work.blobs)
 
     def cancel(self, peer: bytes, id: int | None = None) -> None:
         """Nobody wants the answer to this request (None: to any request of this connection) any more."""
@@ -179,10 +172,10 @@ class Scheduler:
 
         A run that must not be repeated goes on, within its budget. Called in any thread.
         """
-        return (work.wanted or self._goes_on(work)) and self._access.knows(work.peer)
-
-    def _goes_on(self, work: Work) -> bool:
-        return not tasks.kind_named(work.request.kind).duplicate and not work.expired(time.monotonic())
+        goes_on = work.wanted or (
+            not tasks.kind_named(work.request.kind).duplicate and not work.expired(time.monotonic())
+        )
+        return goes_on and self._access.knows(work.peer)
 
     def answer(self, work: Work, outcome: Outcome) -> None:
         """A task has ended: send its reply."""
@@ -192,10 +185,7 @@ class Scheduler:
         request = work.request
         if outcome.crashed:
             self._crashes.note(work.peer, request.id)
-        size = byte_count(outcome.frames)
-        if size > self._message_bytes_max:
-            error = f"BadValue: the result takes {size} bytes, at most {self._message_bytes_max} are allowed"
-            outcome = replace(outcome, status="failed", error=error, frames=[], server_fault=True)
+        outcome = bounded(outcome, self._message_bytes_max)
         self._failures.note(request.kind, outcome)
         if work.wanted:
             self._load.hurry()  # the load during the task, not before it
@@ -228,7 +218,6 @@ class Scheduler:
         return len(waiting) + len(self._running)
 
     def refuse(self, peer: bytes, request: Request, why: Refusal) -> None:
-        """Answer a request that does not run."""
         self._count(request, why.status, why.queue_s)
         if self._metrics.robots.counting and why.status != "need_blob":  # the robot sends that one again
             self._metrics.robots.of(self._access.robot_of(peer)).refused += 1
@@ -261,9 +250,6 @@ class CrashCount:
 
     def too_many(self, peer: bytes, id: int) -> bool:
         return self._counts.get((peer, id), 0) >= CRASHES_MAX
-
-    def __len__(self) -> int:
-        return len(self._counts)
 
 
 class FailureLog:

@@ -1,7 +1,4 @@
-"""The server: reads the messages of robots, and answers or hands on each of them.
-
-`scheduler` decides about requests, `reader_threads` which thread reads, and `executors` run the tasks.
-"""
+"""The server: reads the messages of robots, and answers or hands on each of them."""
 
 import logging
 import time
@@ -13,23 +10,20 @@ from typing import Any
 
 import zmq
 
-from offboard.cloud_server.authorisation import Access, Authorisation, Everyone
-from offboard.cloud_server.connections import LOOK_S, Connections
-from offboard.cloud_server.executors.executor import Executor
-from offboard.cloud_server.executors.task_run import Outcome
+from offboard.cloud_server.authorisation import Access, Authorisation
+from offboard.cloud_server.connections import LOOK_S, Connections, OtherVersions, UnreadLimit, end, other_end
+from offboard.cloud_server.executors.executor import Executor, Outcome
 from offboard.cloud_server.fair_queue import Work
 from offboard.cloud_server.metrics import Metrics, RobotUse, Status
-from offboard.cloud_server.other_versions import OtherVersions
 from offboard.cloud_server.rate_limit import CUT_OFF_S, RateLimit, Verdict
 from offboard.cloud_server.reader_threads import ReaderThreads
 from offboard.cloud_server.robot_socket import ReplySender, bind_router
 from offboard.cloud_server.scheduler import Refusal, Scheduler
-from offboard.cloud_server.tcp_connections import UnreadLimit, end, other_end
 from offboard.common import VERSION, tasks
+from offboard.common.cpu_time import SELF
 from offboard.common.errors import ConfigError, OffloadError, ProtocolError, TaskFailed, describe
-from offboard.common.host.cgroup import SELF
-from offboard.common.host.load import SERVER_EVERY_S, Load
-from offboard.common.host.load_watch import LoadWatch
+from offboard.common.load import SERVER_EVERY_S, Load, LoadWatch
+from offboard.common.logs import RareLog
 from offboard.common.security.keys import KeyPair
 from offboard.common.wire.blobs import BlobStore, Buffer, byte_length
 from offboard.common.wire.channel import Channel, make_context
@@ -50,7 +44,6 @@ POLL_S = 0.5
 COPIED_BYTES_MAX = 64 * 1024  # a larger frame is used where libzmq has put it
 RECEIVE_MAX = 64  # messages read in one turn
 SEND_LAST_S = 1.0  # for the last replies to leave when the server stops
-LOG_PAUSE_S = 10.0  # at least, between two warnings about bad messages
 
 log = logging.getLogger("offboard.cloud_server")
 
@@ -92,9 +85,9 @@ class Server:
         self._warming: Future[None] | None = None
         self._closed = False
         self._started = self._last_turn = time.monotonic()
-        self._last_warning = -float("inf")
+        self._log = RareLog(log)
         self._context = make_context(f"--listen: {listen!r}")
-        self._access: Access = Everyone()
+        self._access = Access()
         if keys is not None and robots is not None:
             self._access = Authorisation(self._context, robots, metrics)
         self._socket = bind_router(self._context, listen, limits.message_bytes_max, keys)
@@ -117,11 +110,7 @@ class Server:
             access=self._access, load=self._load,
         )  # fmt: skip
         self._readers = ReaderThreads(
-            executor,
-            turn=self._turn,
-            answered=self._answered,
-            wanted=self._scheduler.wanted,
-            over=self._over,
+            executor, turn=self._turn, answered=self._answered, wanted=self._scheduler.wanted, over=self._over
         )
         metrics.queue_depth.set_function(lambda: self._scheduler.waiting)
         metrics.running.set_function(lambda: self._scheduler.running)
@@ -188,14 +177,10 @@ class Server:
             self._scheduler.expire(now)
             if now >= self._look_due:
                 self._look_due = now + LOOK_S
-                self._drop_ended()
+                for peer in self._scheduler.peers():
+                    if self._connections.ended(peer):
+                        self._scheduler.cancel(peer)  # nobody can have the answers
             return self._scheduler.take_chosen()
-
-    def _drop_ended(self) -> None:
-        """Cancel the requests of connections that have ended: nobody can have the answers."""
-        for peer in self._scheduler.peers():
-            if self._connections.ended(peer):
-                self._scheduler.cancel(peer)
 
     def _tend_executor(self) -> None:
         """Start the executor, and notice when it is warm."""
@@ -269,7 +254,6 @@ class Server:
         end(file, address)
 
     def _take(self, peer: bytes, file: int, message: Message, verdict: Verdict) -> None:
-        """Do what a message asks for."""
         match message:
             case Request() if verdict is Verdict.REFUSE:
                 why = Refusal("busy", "more bytes or messages per second than one robot may send")
@@ -324,10 +308,8 @@ class Server:
 
     def _drop(self, reason: str, error: ProtocolError) -> None:
         self.metrics.dropped.labels(reason).inc()
-        if self._last_turn - self._last_warning >= LOG_PAUSE_S:
-            self._last_warning = self._last_turn
-            text = "dropped a message: %s (others within %g s are not logged); remedy: find out who sends it"
-            log.warning(text, error, LOG_PAUSE_S)
+        text = f"dropped a message: {error}; remedy: find out who sends it"
+        self._log(logging.WARNING, text, self._last_turn)
 
     def _over(self) -> bool:
         """True if the server may stop: it is drained, or the time for that is over."""

@@ -1,7 +1,4 @@
-"""The command line of a process: flags from a config dataclass, help in groups, sub-commands and exit codes.
-
-The values of the flags are checked in `config`.
-"""
+"""The command line of a process: flags from a config dataclass, help in groups, commands and exit codes."""
 
 import argparse
 import os
@@ -11,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
+from offboard.common import VERSION
 from offboard.common.config import REQUIRED, flag_of, resolve, settings_of, type_of
 from offboard.common.errors import ConfigError, DataError, OffloadError
 from offboard.common.toml_file import nearest, unknown
@@ -21,6 +19,7 @@ COLUMNS = 80  # width of the help if there is no terminal
 USAGE_EXIT = 2
 INTERRUPTED_EXIT, BROKEN_PIPE_EXIT = 130, 141  # 128 + the signal, as shells do it
 HELP = ("-h", "--help")
+SHOW_VERSION = "--version"
 
 
 @dataclass(frozen=True)
@@ -32,14 +31,18 @@ class Command:
 
 
 def run_commands(prog: str, about: str, commands: Mapping[str, Command], argv: Sequence[str]) -> int:
-    """Run the sub-command that `argv` begins with, or print the usage."""
+    """Run the sub-command that `argv` begins with, or print the version or the usage."""
     chosen = argv[0] if argv else ""
     if chosen in commands:
         return run_command(f"{prog} {chosen}", lambda: commands[chosen].run(argv[1:]))
+    if chosen == SHOW_VERSION:
+        print(prog, VERSION)
+        return 0
     width = max(map(len, commands))
     lines = [f"  {name:<{width}}  {command.about}" for name, command in commands.items()]
     usage = [f"usage: {prog} COMMAND ...", "", about, "", *lines, ""]
     usage.append(f"`{prog} COMMAND --help` explains the flags of a command.")
+    usage.append(f"`{prog} {SHOW_VERSION}` prints the version.")
     if chosen in HELP:
         print("\n".join(usage))
         return 0
@@ -69,13 +72,7 @@ def run_command(prog: str, command: Callable[[], int]) -> int:
 
 
 def load(
-    cls: type[C],
-    argv: Sequence[str],
-    *,
-    prog: str,
-    description: str,
-    environ: Mapping[str, str],
-    prefix: str,
+    cls: type[C], argv: Sequence[str], *, prog: str, description: str, environ: Mapping[str, str], prefix: str
 ) -> C:
     """Build `cls` from `argv`, then `PREFIX_NAME` in `environ`, then the TOML file of --config."""
     parser = CommandParser(prog=prog, description=description)
@@ -106,6 +103,9 @@ class CommandParser(argparse.ArgumentParser):
         self.register("action", None, _StoreOnce)  # what a flag does unless it says otherwise
         about = "show this help, and exit"
         self._short_help = self.add_argument(*HELP, action=_ShowHelp, rare=False, help=about)
+        if " " not in prog:  # of a sub-command, the command itself prints the version
+            about = "print the version, and exit"
+            self.add_argument(SHOW_VERSION, action="version", version=f"{prog} {VERSION}", help=about)
 
     def add_rare(self, action: argparse.Action) -> None:
         """Hide a flag from --help; --help-all shows it."""
@@ -116,7 +116,6 @@ class CommandParser(argparse.ArgumentParser):
         action.help = argparse.SUPPRESS
 
     def format_all(self) -> str:
-        """The help with all flags."""
         for action, help in self._rare.items():
             action.help = help
         return self.format_help()
@@ -139,13 +138,11 @@ def add_flags(parser: CommandParser, cls: type, prefix: str) -> None:
         help = field.metadata["help"]
         if field.default is REQUIRED:
             help += " (required)"
-        elif not _obvious(field.default):
-            help += f" (default: {_shown(field.default)})"
+        elif not (field.default is None or field.default is False or field.default == ()):
+            values = field.default if isinstance(field.default, tuple) else (field.default,)
+            help += f" (default: {','.join(map(str, values))})"
         action = groups.get(field.metadata["group"], parser).add_argument(
-            f"--{flag_of(field)}",
-            dest=field.name,
-            help=help.replace("%", "%%"),
-            **_shape(field, cls),
+            f"--{flag_of(field)}", dest=field.name, help=help.replace("%", "%%"), **_shape(field, cls)
         )
         parser.flags.append(f"--{flag_of(field)}")
         if field.metadata["rare"]:
@@ -211,12 +208,3 @@ def _shape(field: Any, cls: type) -> dict[str, Any]:
     metavar = field.metadata["metavar"] or "|".join(field.metadata["choices"] or ())
     metavar = metavar or {int: "K", float: "X", Path: "FILE"}.get(base, "TEXT")
     return {"metavar": metavar, "action": "append" if many else None}
-
-
-def _obvious(default: Any) -> bool:
-    """Whether the help need not show this default."""
-    return default is None or default is False or default == ()
-
-
-def _shown(value: Any) -> str:
-    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)

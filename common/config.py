@@ -1,11 +1,9 @@
-"""The settings of a process: a frozen dataclass, filled from flags, environment, a TOML file and defaults.
-
-Each process lists its own settings in its own config file; `command_line` turns them into flags.
-"""
+"""The settings of a process: a frozen dataclass, filled from flags, environment, TOML file and defaults."""
 
 import argparse
 import dataclasses
 import functools
+import importlib
 import math
 import types
 import typing
@@ -13,10 +11,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from offboard.common.errors import ConfigError, DataError
+from offboard.common.errors import ConfigError, DataError, describe
 from offboard.common.toml_file import read_toml, unknown_key
 
 C = TypeVar("C")
+MODULE_CLASS = "MODULE.CLASS"
 
 REQUIRED: Any = dataclasses.MISSING
 
@@ -43,16 +42,26 @@ def setting(
     return dataclasses.field(default=default, metadata=shown | bounds)
 
 
-def check(config: Any) -> None:
+def check(config: Any, dashes: str = "--") -> None:
     """Raise a ConfigError that names the first value out of bounds. Call it in `__post_init__`."""
     for field in settings_of(type(config)):
-        _check_value(f"--{flag_of(field)}", field, getattr(config, field.name))
+        _check_value(dashes + (flag_of(field) if dashes else field.name), field, getattr(config, field.name))
+
+
+def part_of(cls: type[C], config: Any, **others: Any) -> C:
+    """The `cls` with the values that another dataclass has for the same fields, and with `others`."""
+    return cls(**{name: getattr(config, name) for name in _names(cls) & _names(config)} | others)
+
+
+def _names(of: Any) -> set[str]:
+    return {field.name for field in dataclasses.fields(of)}
 
 
 def resolve(cls: type[C], flags: argparse.Namespace, *, environ: Mapping[str, str], prefix: str) -> C:
     """Build a checked `cls` from parsed flags, then `PREFIX_NAME` in `environ`, then the file of --config."""
     config = getattr(flags, "config", None)
-    from_file = {} if config is None else _read_known(config, cls)
+    known = [flag_of(field) for field in settings_of(cls)]
+    from_file = {} if config is None else _known(config, read_toml(config), known)
     values: dict[str, Any] = {}
     for field in settings_of(cls):
         name = flag_of(field)
@@ -75,9 +84,7 @@ def from_table(cls: type[C], table: Mapping[str, Any], path: Path, section: str)
     An unknown key or a wrong value is a DataError that names the file and the key.
     """
     fields = {flag_of(field).replace("-", "_"): field for field in settings_of(cls)}
-    for key in table:
-        if key not in fields:
-            raise unknown_key(path, key, list(fields))
+    _known(path, table, list(fields))
     try:
         values = {
             field.name: _convert(f"{section}.{name}", field, cls, table[name])
@@ -166,10 +173,8 @@ def _check_value(where: str, field: dataclasses.Field[Any], value: Any) -> None:
             raise ConfigError(f"{where}: {item} is not a finite number")
 
 
-def _read_known(path: Path, cls: type) -> dict[str, Any]:
-    """The keys of a --config file, each of which must be the name of a flag."""
-    table = read_toml(path)
-    known = [flag_of(field) for field in settings_of(cls)]
+def _known(path: Path, table: Mapping[str, Any], known: Sequence[str]) -> Mapping[str, Any]:
+    """The table, if each of its keys is the name of a setting."""
     for key in table:
         if key not in known:
             raise unknown_key(path, key, known)
@@ -178,3 +183,18 @@ def _read_known(path: Path, cls: type) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else list(value) if isinstance(value, tuple) else value
+
+
+def find_class(path: str, what: str) -> Any:
+    """The class that MODULE.CLASS names; ConfigError, which says `what` it should be, if there is none."""
+    module, _, name = path.rpartition(".")
+    try:
+        found = getattr(importlib.import_module(module), name, None)
+    except ConfigError:  # such as a missing extra
+        raise
+    except (Exception, SystemExit) as error:
+        why = f"module {module!r} cannot be imported: {describe(error)}"
+        raise ConfigError(f"{what} {path!r}: {why}") from error
+    if not callable(found):
+        raise ConfigError(f"{what} {path!r}: module {module!r} has no class {name!r}")
+    return found

@@ -48,7 +48,9 @@ def fields_of(value: Any) -> dict[str, Any]:
     own = getattr(value, "__dict__", ())
     if layout.slots or not layout.known.issuperset(own):
         for name in (*own, *layout.slots):
-            if name not in layout.known and hasattr(value, name) and not _follows_from_fields(cls, name):
+            if name in layout.known or not hasattr(value, name):
+                continue
+            if not isinstance(inspect.getattr_static(cls, name, None), functools.cached_property):
                 raise BadValue(f"{cls.__name__} has the attribute {name!r}, which is no field")
     return fields
 
@@ -77,7 +79,3 @@ def _layout(cls: Any) -> _Layout:
         name for base in cls.__mro__ for name, one in vars(base).items() if inspect.ismemberdescriptor(one)
     ]
     return _Layout(names, frozenset(names), tuple(name for name in members if name not in names))
-
-
-def _follows_from_fields(cls: type, name: str) -> bool:
-    return isinstance(inspect.getattr_static(cls, name, None), functools.cached_property)

@@ -6,7 +6,12 @@ from typing import Any
 
 
 class OffloadError(Exception):
-    """Base of all errors raised by Offboard."""
+    """Base of all errors raised by Offboard.
+
+    `record` is that of the call that raised it; None if the call did not get so far.
+    """
+
+    record: Any = None
 
 
 def describe(error: BaseException) -> str:
@@ -74,7 +79,8 @@ class BadValue(TaskError):
 class DeadlineMissed(OffloadError):
     """A call with `deadline_s` had no answer in time. A task that has begun runs to its end and is learnt.
 
-    `expected` is what was expected of each site when the call began: an `Expectation` by site.
+    `expected` is what was expected of each site when the call began: an `Expectation` by site. `record` says
+    what had happened by the deadline; observers get another one with the same id when the task has ended.
     """
 
     def __init__(self, message: str, expected: Mapping[str, Any]) -> None:
@@ -95,7 +101,7 @@ class CloudBusy(CloudError):
 
 
 class Overtaken(CloudError):
-    """Another site answered first. The time that this site would have needed is unknown."""
+    """Another site answered first, or nobody wants the answer. How long this site would take is unknown."""
 
 
 class CloudBroken(CloudError):

@@ -1,7 +1,4 @@
-"""Owns what `@task(setup=...)` makes, such as a model: one state for each kind and worker.
-
-Runners and executors decide which thread or process runs a task, and when a state is made.
-"""
+"""Owns what `@task(setup=...)` makes, such as a model: one state for each kind and worker."""
 
 import threading
 import time
@@ -13,8 +10,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from offboard.common.errors import TaskFailed, describe, is_interrupt
+from offboard.common.task_call import traceback_of
 from offboard.common.tasks import Kind
-from offboard.common.tracebacks import traceback_of
 
 SETUP_AGAIN_S = 30.0  # after a setup has raised; until then, its error is the answer of each call
 SETUPS_MAX = 64  # setups whose times are remembered: more than the tasks of one queue can wait for
@@ -62,10 +59,7 @@ class TaskStates:
         self._changed = threading.Condition()
 
     def prepare(self, kind: Kind) -> None:
-        """Make the missing states of a kind, one after the other. TaskFailed if its setup raises.
-
-        A setup that has raised is tried again.
-        """
+        """Make the missing states of a kind. TaskFailed if its setup raises; one that did is tried again."""
         with self._changed:
             self._failed.pop(kind.name, None)
         while kind.setup is not None and not self.ready(kind):
@@ -106,7 +100,6 @@ class TaskStates:
                     self._give_back(kind, state)
 
     def call(self, kind: Kind, args: Sequence[Any]) -> Any:
-        """Call the function of a kind directly."""
         with self.lend(kind) as state:
             return kind.function(*state, *args)
 

@@ -1,33 +1,36 @@
-"""The `@task` decorator, the registry of kinds, and loading the modules that register them.
+"""The `@task` decorator, and the registry of kinds."""
 
-`robot_client` decides where a task runs; `common.wire` sends it.
-"""
-
-import importlib
 import inspect
 import itertools
 import math
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any, Concatenate, Literal, ParamSpec, Protocol, TypeVar, overload
 
 from offboard.common.dataclass_types import check_types
 from offboard.common.errors import BadValue, ConfigError, UnknownTask, describe, is_interrupt
-from offboard.common.source.covers import Covers, covers_by_site, covers_of
-from offboard.common.source.source_hash import contract_hash, source_hash
-from offboard.common.task_functions import (
-    check_first_parameter,
+from offboard.common.source.covers import Covers, contract_hash, covers_by_site, covers_of, source_hash
+from offboard.common.variants import (
+    AT,
+    CLOUD,
+    ONBOARD,
+    Variant,
     check_ordinary,
     check_packing,
     check_parameters,
     check_variant,
+    elsewhere,
+    given_to,
+    group_of,
     name_of,
+    variants_of,
     without_state,
 )
-from offboard.common.variants import AT, CLOUD, ONBOARD, Variant, elsewhere, group_of, variants_of
 
 F = TypeVar("F", bound=Callable[..., Any])
+P = ParamSpec("P")
+R_co = TypeVar("R_co", covariant=True)
 
 NAME_LENGTH_MAX = 64
 KINDS_MAX = 256  # a `hello` message names all of them
@@ -113,7 +116,6 @@ class Kind:
 
     @property
     def present(self) -> bool:
-        """Whether this computer has the function."""
         return self.function is not elsewhere
 
     def size_of(self, args: tuple[Any, ...]) -> Size:
@@ -122,8 +124,11 @@ class Kind:
         for number in numbers:
             if not (math.isfinite(number) and number >= 0):
                 raise BadValue(f"task {self.name}: input size {number} is not a finite number >= 0")
-        if self._counts != [len(numbers)]:
-            self._check_count(len(numbers))
+        if not self._counts:
+            self._counts.append(len(numbers))  # if two threads do this at once, the first one counts
+        if self._counts[0] != len(numbers):
+            before = f"{self._counts[0]} before; the count must not change"
+            raise BadValue(f"task {self.name}: input size has {len(numbers)} numbers, but had {before}")
         return numbers if len(numbers) > 1 else numbers[0]
 
     @property
@@ -145,13 +150,6 @@ class Kind:
             allowed = f"1 to {SIZE_NUMBERS_MAX} are allowed"
             raise BadValue(f"task {self.name}: input size has {len(numbers)} numbers; {allowed}")
         return numbers
-
-    def _check_count(self, count: int) -> None:
-        if not self._counts:
-            self._counts.append(count)  # if two threads do this at once, the first one counts
-        if self._counts[0] != count:
-            before = f"{self._counts[0]} before; the count must not change"
-            raise BadValue(f"task {self.name}: input size has {count} numbers, but had {before}")
 
     def work_of(self, result: Any) -> float | None:
         """The amount of work that a result took; None if it is unknown or not a number above 0."""
@@ -177,10 +175,50 @@ class Task:
     parcel: Any = field(default=None, compare=False, repr=False)
 
 
+class PlainTask(Protocol[P, R_co]):
+    """What type checkers see of a task without `setup=`: any function."""
+
+    @property
+    def __code__(self) -> Any: ...
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
+
+
+class SetupTask(Protocol[P, R_co]):
+    """What type checkers see of a task with `setup=`: an offloader calls it without its first argument.
+
+    `takes_state` tells it from a plain one, and is there for type checkers only.
+    """
+
+    takes_state: Literal[True]
+
+    def __call__(self, state: Any, /, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
+
+
 _kinds: dict[str, Kind] = {}
 _on_servers: dict[str, Kind] = {}  # by the name that a request has
 
 
+@overload
+def task(
+    name: str, *, size: Callable[..., float | Sequence[float]], duplicate: bool = ...,
+    types: tuple[type, ...] = ..., warm: Callable[[], None] | None = ...,
+    work: Callable[[Any], float] | None = ..., setup: None = ...,
+    variants: Mapping[str, Callable[..., Any] | None] | None = ..., quality: Mapping[str, float] | None = ...,
+    pack: Callable[..., Any] | None = ..., unpack: Callable[[Any], Any] | None = ...,
+    policy_server: bool = ..., version: str | int = ...,
+    covers: Sequence[Any] | Mapping[str, Sequence[Any]] = ...,
+) -> Callable[[F], F]: ...  # fmt: skip
+@overload
+def task(
+    name: str, *, size: Callable[..., float | Sequence[float]], duplicate: bool = ...,
+    types: tuple[type, ...] = ..., warm: Callable[[], None] | None = ...,
+    work: Callable[[Any], float] | None = ..., setup: Callable[[], Any] | Mapping[str, Callable[[], Any]],
+    variants: Mapping[str, Callable[..., Any] | None] | None = ..., quality: Mapping[str, float] | None = ...,
+    pack: Callable[..., Any] | None = ..., unpack: Callable[[Any], Any] | None = ...,
+    policy_server: bool = ..., version: str | int = ...,
+    covers: Sequence[Any] | Mapping[str, Sequence[Any]] = ...,
+) -> Callable[[Callable[Concatenate[Any, P], R_co]], SetupTask[P, R_co]]: ...  # fmt: skip
 def task(
     name: str,
     *,
@@ -197,7 +235,7 @@ def task(
     policy_server: bool = False,
     version: str | int = "",
     covers: Sequence[Any] | Mapping[str, Sequence[Any]] = (),
-) -> Callable[[F], F]:
+) -> Any:
     """Register a function as a kind of task. It can still be called as an ordinary function.
 
     Robot and server load the same module. If the source of the function, of its setup, of its pack or unpack
@@ -277,21 +315,7 @@ def hashes() -> dict[str, str]:
 
 
 def kinds() -> tuple[Kind, ...]:
-    """All kinds registered in this process."""
     return tuple(_kinds.values())
-
-
-def load_modules(names: Iterable[str]) -> None:
-    """Import the modules that register tasks. ConfigError names a module that cannot be imported."""
-    for name in names:
-        meant = _meant(name)
-        if meant != name:
-            raise ConfigError(f"task module {name!r} is not the name of a module; did you mean {meant!r}?")
-        try:
-            importlib.import_module(name)
-        except (Exception, SystemExit) as error:
-            where = _where(name) if _is_missing(name, error) else ""
-            raise ConfigError(f"task module {name!r} cannot be imported: {describe(error)}{where}") from error
 
 
 def _checked(kind: Kind) -> Kind:
@@ -299,10 +323,7 @@ def _checked(kind: Kind) -> Kind:
     name, function, setup = kind.name, kind.function, kind.setup
     check_ordinary(name, function=function, size=kind.size, setup=setup, work=kind.work, warm=kind.warm)
     check_packing(name, kind.pack, kind.unpack)
-    signature = inspect.signature(function)
-    if setup is not None:
-        check_first_parameter(name, signature)
-    parameters = without_state(signature, setup).parameters.values()
+    parameters = given_to(name, function, setup).parameters.values()
     check_parameters(name, parameters)
     fixed = all(parameter.kind != parameter.VAR_POSITIONAL for parameter in parameters)
     count = len(parameters) if fixed else None
@@ -315,7 +336,6 @@ def _checked(kind: Kind) -> Kind:
 
 
 def _add(kind: Kind) -> None:
-    """Put a kind into the registry."""
     known = _kinds.get(kind.name)
     if known is not None:
         _check_same(known, kind)
@@ -349,26 +369,6 @@ def _with_variants(kind: Kind, found: Mapping[str, Variant], by_site: Mapping[st
             raise ConfigError(f"task {name}: {made[site].name!r} has over {NAME_LENGTH_MAX} characters")
     shared = contract_hash(given, kind.types, packing, covers=kind.covers)
     return replace(kind, source_hash=shared, variants=made)
-
-
-def _meant(name: str) -> str:
-    """The module that a file, or MODULE:FUNCTION, stands for; the same name if it is that of a module."""
-    file = name.partition(":")[0].removesuffix(".py")
-    parts = [part for part in file.split("/") if part.strip(".")]
-    if not parts:
-        return name
-    return parts[-1] if file.startswith(("/", "..")) else ".".join(parts)
-
-
-def _is_missing(name: str, error: BaseException) -> bool:
-    """Whether the module itself was not found, rather than one that it imports."""
-    return isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}.")
-
-
-def _where(name: str) -> str:
-    if name.startswith("examples."):
-        return "; examples/ is only in a checkout: start the command in the folder of the checkout"
-    return "; it is looked for in this folder and on PYTHONPATH"
 
 
 def _check_same(known: Kind, kind: Kind) -> None:

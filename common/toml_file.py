@@ -1,9 +1,7 @@
-"""Reads TOML files that people write; errors name the file, the line and the nearest known key.
-
-What the keys mean is said where the file is used.
-"""
+"""Reads TOML files that people write; errors name the file, the line and the nearest known key."""
 
 import re
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,8 +20,10 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def parse_toml(path: Path, text: bytes) -> dict[str, Any]:
-    """The tables of this text of a file."""
-    import tomllib  # not for --help
+    if sys.version_info >= (3, 11):  # not at the top: --help reads no file
+        import tomllib
+    else:
+        import tomli as tomllib
 
     try:
         return tomllib.loads(text.decode())

@@ -112,11 +112,10 @@ def main(endpoint: str) -> None:
     with Offloader.connect(endpoint) as offload:
         offload.wait_for_sites(detect_tags, 30.0)
         for (frame,) in itertools.islice(inputs(seed=1), 30):
-            tags = offload(detect_tags, frame)
-            last = offload.last
+            tags, record = offload.call(detect_tags, frame)
             print(
                 f"{pixels(frame) / 1e6:.1f} Mpixel, {frame.nbytes / 1e3:.0f} kB: {len(tags)} tags from "
-                f"{last.used} after {last.waited_s * 1e3:.0f} ms ({last.decision.reason})"
+                f"{record.used} after {record.waited_s * 1e3:.0f} ms ({record.decision.reason})"
             )
 
 

@@ -119,11 +119,10 @@ def main(endpoint: str) -> None:
     with Offloader.connect(endpoint) as offload:
         offload.wait_for_sites(plan_motion, 30.0)
         for start, goal, seed in itertools.islice(inputs(seed=1), 30):
-            motion = offload(plan_motion, start, goal, seed)
-            last = offload.last
+            motion, record = offload.call(plan_motion, start, goal, seed)
             print(
-                f"{len(motion.waypoints)} waypoints, {motion.samples} samples on {last.used}, "
-                f"{last.waited_s * 1e3:.0f} ms ({last.decision.reason})"
+                f"{len(motion.waypoints)} waypoints, {motion.samples} samples on {record.used}, "
+                f"{record.waited_s * 1e3:.0f} ms ({record.decision.reason})"
             )
 
 

@@ -103,11 +103,10 @@ def main(endpoint: str) -> None:
     with Offloader.connect(endpoint) as offload:
         offload.wait_for_sites(optimise_graph, 30.0)
         for poses, pairs, moves in itertools.islice(inputs(seed=1), CALLS):
-            result = offload(optimise_graph, poses, pairs, moves)
-            last = offload.last
+            result, record = offload.call(optimise_graph, poses, pairs, moves)
             print(
-                f"{len(poses)} poses, {len(pairs)} edges: {result.iterations} iterations on {last.used}, "
-                f"{last.waited_s * 1e3:.0f} ms ({last.decision.reason})"
+                f"{len(poses)} poses, {len(pairs)} edges: {result.iterations} iterations on {record.used}, "
+                f"{record.waited_s * 1e3:.0f} ms ({record.decision.reason})"
             )
 
 

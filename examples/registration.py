@@ -106,11 +106,10 @@ def main(endpoint: str) -> None:
     with Offloader.connect(endpoint) as offload:
         offload.wait_for_sites(register_scan, 30.0)
         for scan, guess in itertools.islice(inputs(seed=1), 30):
-            match = offload(register_scan, scan, guess)
-            last = offload.last
+            match, record = offload.call(register_scan, scan, guess)
             print(
                 f"{len(scan)} points, {scan.nbytes / 1e3:.0f} kB: {match.iterations} iterations on "
-                f"{last.used}, {last.waited_s * 1e3:.0f} ms ({last.decision.reason})"
+                f"{record.used}, {record.waited_s * 1e3:.0f} ms ({record.decision.reason})"
             )
 
 

@@ -95,11 +95,10 @@ def main(endpoint: str) -> None:
     with Offloader.connect(endpoint) as offload:
         offload.wait_for_sites(read_signs, 60.0)
         for (frame,) in itertools.islice(inputs(seed=1), 30):
-            signs = offload(read_signs, frame)
-            last = offload.last
+            signs, record = offload.call(read_signs, frame)
             print(
-                f"{len(signs)} signs from {last.used} after {last.waited_s * 1e3:.0f} ms "
-                f"({last.decision.reason})"
+                f"{len(signs)} signs from {record.used} after {record.waited_s * 1e3:.0f} ms "
+                f"({record.decision.reason})"
             )
 
 

@@ -61,12 +61,13 @@ def main(endpoint: str) -> None:
     with Offloader.connect(endpoint) as offload:
         offload.wait_for_sites(find_tags, 30.0)
         for (frame,) in itertools.islice(inputs(seed=1), CALLS):
-            found, last = len(offload(find_tags, frame)), offload.last
+            tags, record = offload.call(find_tags, frame)
+            found = len(tags)
             every = len(find_tags(detector, frame))
-            calls[last.used].append((found, every, last.waited_s))
+            calls[record.used].append((found, every, record.waited_s))
             print(
-                f"{found} of {every} tags from {last.used} after {last.waited_s * 1e3:.0f} ms "
-                f"({last.decision.reason})"
+                f"{found} of {every} tags from {record.used} after {record.waited_s * 1e3:.0f} ms "
+                f"({record.decision.reason})"
             )
     for site, those in calls.items():
         found, every, waited_s = (sum(column) for column in zip(*those, strict=True))

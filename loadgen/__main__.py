@@ -3,17 +3,16 @@
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 from offboard.common.command_line import Command, CommandParser, add_flags, load, run_commands
 from offboard.common.config import check, resolve, setting
 from offboard.loadgen import rivals
-
-if TYPE_CHECKING:
-    from offboard.loadgen.robot.config import RobotConfig
+from offboard.robot_client import policies
 
 C = TypeVar("C")
 
@@ -49,7 +48,7 @@ class RunConfig:
     )
     seed: int | None = setting(None, "another seed", group=CHANGES, minimum=0)
     tasks: int | None = setting(None, "another number of tasks per robot", group=CHANGES, minimum=1)
-    policy: str | None = setting(None, f"another policy: {rivals.POLICY_HELP}", group=CHANGES, metavar="NAME")
+    policy: str | None = setting(None, f"another policy: {policies.HELP}", group=CHANGES, metavar="NAME")
     predictor: str | None = setting(
         None, f"another predictor: {rivals.PREDICTOR_HELP}", group=CHANGES, metavar="NAME"
     )
@@ -73,24 +72,15 @@ def _demo(argv: Sequence[str]) -> int:
 
 
 def _run(argv: Sequence[str]) -> int:
-    from offboard.loadgen.scenario.scenario_file import (
-        check_calls,
-        find_scenario,
-        known_names,
-        read_scenario,
-    )
+    from offboard.loadgen.scenario.scenario_file import check_calls, find_scenario, known_names, read_scenario
 
-    parser = _parser("run", "SCENARIO")
     help = f"TOML file, or one of {', '.join(known_names())}"
-    parser.add_argument("scenario", metavar="SCENARIO", help=help)
-    add_flags(parser, RunConfig, PREFIX)
-    flags = parser.parse_args(argv)
-    config = resolve(RunConfig, flags, environ=os.environ, prefix=PREFIX)
+    name, config = _operand_and_config("run", RunConfig, argv, operand="SCENARIO", help=help)
     from offboard.loadgen.play.play_scenario import play
     from offboard.loadgen.play.watch import Page
 
     _find_modules_here()
-    path = find_scenario(flags.scenario)
+    path = find_scenario(name)
     scenario = read_scenario(path).changed(
         seed=config.seed,
         tasks=config.tasks,
@@ -109,11 +99,8 @@ def _run(argv: Sequence[str]) -> int:
 def _watch(argv: Sequence[str]) -> int:
     from offboard.loadgen.play.watch import WatchConfig, run_watch
 
-    parser = _parser("watch", "DIR")
-    parser.add_argument("run", type=Path, metavar="DIR", help="folder of a run, which may still go on")
-    add_flags(parser, WatchConfig, PREFIX)
-    flags = parser.parse_args(argv)
-    return run_watch(flags.run, resolve(WatchConfig, flags, environ=os.environ, prefix=PREFIX))
+    help = "folder of a run, which may still go on"
+    return run_watch(*_operand_and_config("watch", WatchConfig, argv, operand="DIR", help=help, type=Path))
 
 
 def _compare(argv: Sequence[str]) -> int:
@@ -138,19 +125,20 @@ def _table(argv: Sequence[str]) -> int:
 
 
 def _claims(argv: Sequence[str]) -> int:
+    from offboard.loadgen.claims.claim import ClaimsConfig
     from offboard.loadgen.claims.claims import run_claims
-    from offboard.loadgen.claims.claims_settings import ClaimsConfig
 
-    parser = _parser("claims", "DATASET ...")
-    parser.add_argument("datasets", type=Path, metavar="DATASET", nargs="+", help=MEASURED)
-    add_flags(parser, ClaimsConfig, PREFIX)
-    flags = parser.parse_args(argv)
     _find_modules_here()
-    return run_claims(flags.datasets, resolve(ClaimsConfig, flags, environ=os.environ, prefix=PREFIX))
+    return run_claims(
+        *_operand_and_config(
+            "claims", ClaimsConfig, argv, operand="DATASET", help=MEASURED, type=Path, several=True
+        )
+    )
 
 
 def _replay(argv: Sequence[str]) -> int:
-    from offboard.loadgen.replay.replay import ReplayConfig, run_replay
+    from offboard.loadgen.replay.replay import run_replay
+    from offboard.loadgen.replay.replay_settings import ReplayConfig
 
     return run_replay(*_file_and_config("replay", ReplayConfig, argv))
 
@@ -158,41 +146,31 @@ def _replay(argv: Sequence[str]) -> int:
 def _report(argv: Sequence[str]) -> int:
     from offboard.loadgen.report.report import ReportConfig, run_report
 
-    parser = _parser("report", "DIR ...")
-    help = "folder of a run, or a trace or CSV file; several folders or traces are compared"
-    parser.add_argument("runs", type=Path, metavar="DIR", nargs="+", help=help)
-    add_flags(parser, ReportConfig, PREFIX)
-    flags = parser.parse_args(argv)
     _find_modules_here()
-    config = resolve(ReportConfig, flags, environ=os.environ, prefix=PREFIX)
-    if len(flags.runs) == 1:
-        return run_report(flags.runs[0], config)
+    help = "folder of a run, or a trace or CSV file; several folders or traces are compared"
+    runs, config = _operand_and_config(
+        "report", ReportConfig, argv, operand="DIR", help=help, type=Path, several=True
+    )
+    if len(runs) == 1:
+        return run_report(runs[0], config)
     from offboard.loadgen.report.run_comparison import run_comparison
 
-    return run_comparison(flags.runs, config)
+    return run_comparison(runs, config)
 
 
 def _dataset(argv: Sequence[str]) -> int:
     from offboard.loadgen.play.measure_dataset import DatasetConfig, run_dataset
 
-    parser = _parser("dataset", "SCENARIO")
     help = "TOML file, or a shipped scenario: paper, congested, apriltags"
-    parser.add_argument("scenario", metavar="SCENARIO", help=help)
-    add_flags(parser, DatasetConfig, PREFIX)
-    flags = parser.parse_args(argv)
-    config = resolve(DatasetConfig, flags, environ=os.environ, prefix=PREFIX)
-    return run_dataset(flags.scenario, config, ["loadgen", "dataset", *argv])
+    name, config = _operand_and_config("dataset", DatasetConfig, argv, operand="SCENARIO", help=help)
+    return run_dataset(name, config, ["loadgen", "dataset", *argv])
 
 
 def _export(argv: Sequence[str]) -> int:
     from offboard.loadgen.export.export import ExportConfig, run_export
 
-    parser = _parser("export", "RUN")
     help = "folder of a run, or its trace.jsonl; of further robots, trace-2.jsonl and so on"
-    parser.add_argument("run", type=Path, metavar="RUN", help=help)
-    add_flags(parser, ExportConfig, PREFIX)
-    flags = parser.parse_args(argv)
-    return run_export(flags.run, resolve(ExportConfig, flags, environ=os.environ, prefix=PREFIX))
+    return run_export(*_operand_and_config("export", ExportConfig, argv, operand="RUN", help=help, type=Path))
 
 
 def _fleet(argv: Sequence[str]) -> int:
@@ -203,20 +181,10 @@ def _fleet(argv: Sequence[str]) -> int:
     return run_fleets(_config("fleet", FleetConfig, argv))
 
 
-def _drive(argv: Sequence[str]) -> int:
-    from offboard.loadgen.robot.config import DriveConfig
+def _robot(name: str, argv: Sequence[str]) -> int:
+    from offboard.loadgen.robot.config import CallConfig, DriveConfig, RobotConfig
 
-    return _robot("drive", DriveConfig, argv)
-
-
-def _call(argv: Sequence[str]) -> int:
-    from offboard.loadgen.robot.config import CallConfig
-
-    return _robot("call", CallConfig, argv)
-
-
-def _robot(name: str, cls: "type[RobotConfig]", argv: Sequence[str]) -> int:
-    """Run the tasks of a robot."""
+    cls: type[RobotConfig] = DriveConfig if name == "drive" else CallConfig
     config = load(
         cls, argv, prog=f"loadgen {name}", description=_about(name), environ=os.environ, prefix="ROBOT"
     )
@@ -237,10 +205,6 @@ def _wan(argv: Sequence[str]) -> int:
     return run_wan(_config("wan", WanConfig, argv, prefix="WAN"))
 
 
-def _parser(name: str, operands: str = "") -> CommandParser:
-    return CommandParser(prog=f"loadgen {name}", description=_about(name), operands=operands)
-
-
 def _about(name: str) -> str:
     about = COMMANDS[name].about
     return f"{about[0].upper()}{about[1:]}."
@@ -248,32 +212,43 @@ def _about(name: str) -> str:
 
 def _config(name: str, cls: type[C], argv: Sequence[str], prefix: str = PREFIX) -> C:
     """The settings of a command that has flags only."""
-    parser = _parser(name)
+    parser = CommandParser(prog=f"loadgen {name}", description=_about(name))
     add_flags(parser, cls, prefix)
     return resolve(cls, parser.parse_args(argv), environ=os.environ, prefix=prefix)
 
 
-def _file_and_config(name: str, cls: type[C], argv: Sequence[str]) -> tuple[Path, C]:
-    """The file and the settings of a command that reads one file of measured times."""
-    parser = _parser(name, "TRACE")
-    parser.add_argument("trace", type=Path, metavar="TRACE", help=MEASURED)
+def _operand_and_config(
+    name: str,
+    cls: type[C],
+    argv: Sequence[str],
+    *,
+    operand: str,
+    help: str,
+    type: Callable[[str], Any] = str,
+    several: bool = False,
+) -> tuple[Any, C]:
+    """The operand of a command, or its list of `several`, and its settings."""
+    operands = f"{operand} ..." if several else operand
+    parser = CommandParser(prog=f"loadgen {name}", description=_about(name), operands=operands)
+    parser.add_argument("operand", type=type, metavar=operand, nargs="+" if several else None, help=help)
     add_flags(parser, cls, PREFIX)
     flags = parser.parse_args(argv)
+    return flags.operand, resolve(cls, flags, environ=os.environ, prefix=PREFIX)
+
+
+def _file_and_config(name: str, cls: type[C], argv: Sequence[str]) -> tuple[Path, C]:
+    """The file and the settings of a command that reads one file of measured times."""
     _find_modules_here()
-    return flags.trace, resolve(cls, flags, environ=os.environ, prefix=PREFIX)
+    return _operand_and_config(name, cls, argv, operand="TRACE", help=MEASURED, type=Path)
 
 
 def _scenarios_and_config(name: str, cls: type[C], argv: Sequence[str]) -> tuple[list[str], C]:
     """The scenarios and the settings of a command that plays several of them."""
     from offboard.loadgen.scenario.scenario_file import known_names
 
-    parser = _parser(name, "SCENARIO ...")
-    help = f"TOML files, or some of {', '.join(known_names())}"
-    parser.add_argument("scenarios", metavar="SCENARIO", nargs="+", help=help)
-    add_flags(parser, cls, PREFIX)
-    flags = parser.parse_args(argv)
     _find_modules_here()
-    return flags.scenarios, resolve(cls, flags, environ=os.environ, prefix=PREFIX)
+    help = f"TOML files, or some of {', '.join(known_names())}"
+    return _operand_and_config(name, cls, argv, operand="SCENARIO", help=help, several=True)
 
 
 def _find_modules_here() -> None:
@@ -300,8 +275,14 @@ COMMANDS = {
         "measure the plans of a scenario on both sites, and write them as a CSV file", _dataset
     ),
     "export": Command("write a run as a CSV file, or as an MCAP file with messages of ROS 2", _export),
-    "drive": Command("drive a simulated robot on a map, and plan its paths onboard or in the cloud", _drive),
-    "call": Command("call a task of yours with numbers or inputs, one after the other or at a rate", _call),
+    "drive": Command(
+        "drive a simulated robot on a map, and plan its paths onboard or in the cloud",
+        partial(_robot, "drive"),
+    ),
+    "call": Command(
+        "call a task of yours with numbers or inputs, one after the other or at a rate",
+        partial(_robot, "call"),
+    ),
     "wan": Command("relay between robot and cloud, with delay, jitter, loss, outages and other faults", _wan),
 }
 

@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -52,7 +52,7 @@ class DriveRecord:
             raise ConfigError(f"drive record {path}: {error.strerror}") from error
 
     @classmethod
-    def read(cls, trace: Path) -> Self:
+    def read(cls, trace: Path) -> "DriveRecord":
         """The record next to the trace; a DataError if it cannot be read."""
         path = drive_path(trace)
         record = next(read_fields(path, ("software", "answers", "settings", "map")), None)

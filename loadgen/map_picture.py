@@ -29,12 +29,7 @@ PATH_PIXELS, HIT_PIXELS = 4, 2
 Colour = tuple[int, int, int]
 # Colour-blind readers can tell them apart.
 WHITE, BLACK, GREY = (255, 255, 255), (40, 44, 52), (196, 200, 206)
-PATH, SCAN, ROBOT, GOAL = (
-    (0, 114, 178),
-    (213, 94, 0),
-    (0, 130, 90),
-    (170, 60, 130),
-)
+PATH, SCAN, ROBOT, GOAL = ((0, 114, 178), (213, 94, 0), (0, 130, 90), (170, 60, 130))
 LEGEND: tuple[tuple[str, Colour], ...] = (
     ("robot", ROBOT),
     ("goal", GOAL),

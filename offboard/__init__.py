@@ -1,6 +1,6 @@
 """The entrance: the names that users import, as in `from offboard import Offloader, task`.
 
-The names live in the packages next to this file; in a checkout those are the folders next to this one.
+The names live in the packages inside this folder; in a checkout those are links to the folders next to it.
 """
 
 import importlib
@@ -26,8 +26,9 @@ if TYPE_CHECKING:
         UnknownTask,
         Unwanted,
     )
+    from offboard.common.task_call import check_wanted
     from offboard.common.tasks import task
-    from offboard.common.wanted import check_wanted
+    from offboard.robot_client.execution.call_future import CallFuture
     from offboard.robot_client.learning.savings import Savings
     from offboard.robot_client.offloader import Offloader
     from offboard.robot_client.policies import Decision, Forecast, Outlook
@@ -37,9 +38,12 @@ if TYPE_CHECKING:
     from offboard.robot_client.records.trace import Trace
     from offboard.robot_client.settings import Settings
     from offboard.robot_client.sites.runner import Execution, Runner
+    from offboard.robot_client.streams.action_stream import ActionStream, Step
 
 __all__ = [
+    "ActionStream",
     "BadValue",
+    "CallFuture",
     "CloudBroken",
     "CloudBusy",
     "CloudError",
@@ -62,6 +66,7 @@ __all__ = [
     "Runner",
     "Savings",
     "Settings",
+    "Step",
     "TaskError",
     "TaskFailed",
     "Trace",
@@ -73,6 +78,8 @@ __all__ = [
 ]
 
 _HOMES = {
+    "ActionStream": "robot_client.streams.action_stream",
+    "CallFuture": "robot_client.execution.call_future",
     "Decision": "robot_client.policies",
     "Execution": "robot_client.sites.runner",
     "Expectation": "robot_client.policies.expectation",
@@ -85,14 +92,15 @@ _HOMES = {
     "Runner": "robot_client.sites.runner",
     "Savings": "robot_client.learning.savings",
     "Settings": "robot_client.settings",
+    "Step": "robot_client.streams.action_stream",
     "Trace": "robot_client.records.trace",
-    "check_wanted": "common.wanted",
+    "check_wanted": "common.task_call",
     "task": "common.tasks",
 }
 _ERRORS = "common.errors"  # the home of every other name
 
 _here = Path(__file__).parent
-if not (_here / "common").is_dir():  # a checkout; in the wheel, the packages are inside this folder
+if not (_here / "common").is_dir():  # a copy of a checkout that has lost its links
     __path__.append(str(_here.parent))
 
 

@@ -6,12 +6,42 @@ What a command does is in `check`, `common.security.keys` and `offboard/ros2`.
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from offboard.common.command_line import Command, CommandParser, add_flags, run_commands
-from offboard.common.config import resolve
+from offboard.common.config import check, resolve, setting
 
-ENDPOINT = "tcp://HOST:PORT of the server; dns://HOST:PORT or a sites file FILE.toml: each server there"
+ENDPOINT = (
+    "tcp://HOST:PORT of the server; dns://HOST:PORT or a sites file FILE.toml: each server there; "
+    "ws://, wss:// or groot://HOST:PORT: a policy server"
+)
+
+
+@dataclass(frozen=True)
+class CheckConfig:
+    """How a server is checked."""
+
+    keys: Path | None = setting(
+        None,
+        "folder with robot.key_secret and server.key, as for `Offloader.connect(keys=...)`",
+        metavar="DIR",
+    )
+    tasks: tuple[str, ...] = setting(
+        (),
+        "modules whose tasks must be the same on the server (default: the planner, if both sides have it)",
+        metavar="MODULE,MODULE",
+    )
+    observation: Path | None = setting(
+        None, "one observation for a policy server, saved by np.savez", metavar="FILE.npz"
+    )
+    site: str = setting("server", "the site whose token is in the folder of --keys, for a policy server")
+    timeout_s: float = setting(
+        5.0, "time that each step may take, in seconds", name="timeout", minimum=0.1, maximum=3600
+    )
+
+    def __post_init__(self) -> None:
+        check(self)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -20,8 +50,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _check(argv: Sequence[str]) -> int:
-    from offboard.robot_client.check.check_config import CheckConfig
-
     about = "Check step by step whether this robot can use a server. Each failed step comes with a remedy."
     parser = CommandParser(prog="robot-client check", description=about, operands="ENDPOINT")
     parser.add_argument("endpoint", metavar="ENDPOINT", help=ENDPOINT)
@@ -31,27 +59,61 @@ def _check(argv: Sequence[str]) -> int:
     sys.path.insert(0, str(Path.cwd()))  # so that task modules here are found, as with `python -m`
     import logging
 
-    from offboard.robot_client.check.outcome import FAIL
-    from offboard.robot_client.check.steps import Check
+    from offboard.robot_client.check.steps import FAIL, Check
     from offboard.robot_client.servers import read_servers
+    from offboard.robot_client.sites.endpoint import is_policy_server
 
     logging.disable(logging.WARNING)  # the lines say the same
+    if is_policy_server(flags.endpoint):
+        return _check_policy_server(flags.endpoint, config)
     failed = False
     servers = read_servers(flags.endpoint, config.keys)
     for server in servers:
         if len(servers) > 1:
             print(f"{server.site}: {server.endpoint}", flush=True)
-        check = Check(
+        steps = Check(
             server.endpoint,
             keys=config.keys,
             modules=config.tasks,
             timeout_s=config.timeout_s,
             key=server.key,
         )
-        for line in check.run():
+        for line in steps.run():
             print(line, flush=True)
             failed = failed or line.status == FAIL
     return int(failed)
+
+
+def _check_policy_server(endpoint: str, config: CheckConfig) -> int:
+    from offboard.common.security.keys import policy_token
+    from offboard.robot_client.check.policy_steps import PolicyCheck
+    from offboard.robot_client.check.steps import FAIL
+    from offboard.robot_client.sites.endpoint import check_policy_server
+
+    check_policy_server("ENDPOINT", endpoint, insecure=True)
+    failed = False
+    token = policy_token(config.keys, config.site)
+    steps = PolicyCheck(endpoint, token=token, observation=config.observation, timeout_s=config.timeout_s)
+    for line in steps.run():
+        print(line, flush=True)
+        failed = failed or line.status == FAIL
+    return int(failed)
+
+
+def _gateway(argv: Sequence[str]) -> int:
+    from offboard.robot_client.gateway.gateway_config import GatewayConfig
+
+    about = (
+        "Stand in front of policy servers: an unchanged client connects here, and the server that should be "
+        "sooner answers each observation, or onboard does."
+    )
+    parser = CommandParser(prog="robot-client gateway", description=about)
+    add_flags(parser, GatewayConfig, "ROBOT_GATEWAY")
+    flags = parser.parse_args(argv)
+    config = resolve(GatewayConfig, flags, environ=os.environ, prefix="ROBOT_GATEWAY")
+    from offboard.robot_client.gateway.gateway import run_gateway  # its library is an extra
+
+    return run_gateway(config)
 
 
 def _make_keys(argv: Sequence[str]) -> int:
@@ -69,6 +131,7 @@ def _ros2(argv: Sequence[str]) -> int:
 
 COMMANDS = {
     "check": Command("check whether this robot can use a server", _check),
+    "gateway": Command("answer clients of a policy server from several servers, or onboard", _gateway),
     "keys": Command("make the keys of this robot", _make_keys),
     "ros2": Command("plan paths for nav2, onboard or in the cloud", _ros2),
 }

@@ -49,13 +49,13 @@ class Lifetime:
             said = "this process was forked after its offloader was made; make a new one in this process"
             raise OffloadError(said)
 
-    def call_in_thread(self, call: Callable[[], T]) -> "Future[T]":
-        """Make a call of `submit` or `run`."""
-        return self._start(self._async_calls, call)
+    def call_in_thread(self, call: Callable[[], T], future: "Future[T]") -> None:
+        """Make a call of `submit` or `run`, for this future."""
+        self._start(self._async_calls, call, future)
 
     def call_beside(self, call: Callable[[], T]) -> "Future[T]":
         """Make a call whose caller may leave at a deadline. That caller may be a call of `submit`."""
-        return self._start(self._late_calls, call)
+        return self._start(self._late_calls, call, None)
 
     def leave(self, call: "Future[Any]") -> None:
         """Nobody waits for this call of `call_beside` any more; it still runs if there is a thread for it."""
@@ -80,13 +80,13 @@ class Lifetime:
         if self.recording is not None:
             self.recording.close()
 
-    def _start(self, calls: CallThreads, call: Callable[[], T]) -> "Future[T]":
+    def _start(self, calls: CallThreads, call: Callable[[], T], future: "Future[T] | None") -> "Future[T]":
         """The code of a task gets a thread of its own: the others may all wait for that task."""
         if not inside_a_task():
-            return calls.start(call)
+            return calls.start(call, call=future)
         own = CallThreads(1, ASYNC_NAME)
         try:
-            return own.start(call)
+            return own.start(call, call=future)
         finally:
             own.close(wait=False)
 

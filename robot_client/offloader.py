@@ -4,28 +4,28 @@ Each step is a subject of its own in `learning`, `policies`, `execution` and `re
 lock under which they meet.
 """
 
-import asyncio
 import itertools
 import secrets
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
-from typing import Any, Self, TypeVar, cast
+from typing import Any, Literal, TypeVar, overload
 
 from offboard.common.errors import ConfigError
-from offboard.common.live.robot_live import RobotLive
-from offboard.common.source.reading import kind_in_use
+from offboard.common.live.look import RobotLive
+from offboard.common.source.comparison import kind_in_use
 from offboard.common.tasks import Task
 from offboard.robot_client import policies
+from offboard.robot_client.calls import Calls, Options, R, Seconds
 from offboard.robot_client.discovery.present_sites import PresentSites
-from offboard.robot_client.execution.batch import Batch, Placed, arguments
+from offboard.robot_client.execution.batch import Batch, Placed
+from offboard.robot_client.execution.call_future import CallFuture, chunk_of
 from offboard.robot_client.execution.choice import check_where, decided, pinned, sites_at
-from offboard.robot_client.execution.crossing_check import CrossingCheck
-from offboard.robot_client.execution.race import answer_of
+from offboard.robot_client.execution.race import ROUNDING_S, answer_of
 from offboard.robot_client.learning.forecaster import Forecaster
 from offboard.robot_client.learning.learner import Learner, PendingTask
 from offboard.robot_client.learning.memories import Memories
@@ -42,16 +42,17 @@ from offboard.robot_client.policies.observe import Observe
 from offboard.robot_client.records.record import Record
 from offboard.robot_client.records.recording import Recording, record_of, tell
 from offboard.robot_client.settings import Settings, check_types
-from offboard.robot_client.sites.absence import Absent, absent_sites, present_sites, wait_for_sites
-from offboard.robot_client.sites.clock import Clock, SystemClock
+from offboard.robot_client.sites.absence import Absent, CrossingCheck, SiteView, absent_sites, wait_for_sites
 from offboard.robot_client.sites.outgoing import new_task
 from offboard.robot_client.sites.runner import ONBOARD, TIMEOUT_S, Execution, Runner, checked_timeout
+from offboard.robot_client.sites.waiting import Clock, SystemClock
+from offboard.robot_client.streams.counts import StreamMetrics
 from offboard.robot_client.task_runs import TaskRuns
 
-R = TypeVar("R")
+Own = TypeVar("Own", bound="Offloader")
 
 
-class Offloader:
+class Offloader(Calls):
     """Runs each task where its policy says, always gets an answer, and learns from what happened.
 
     `runners`: one runner for each site, with onboard among them; or sites that change.
@@ -83,13 +84,13 @@ class Offloader:
         self._observes = isinstance(policy, Observe)
         self._allowance = allowance or Allowance()
         self._timeout_s = checked_timeout(timeout_s)
-        self._observers = tuple(observers)
-        self._clock = clock or SystemClock()
+        self._observers, self._clock = tuple(observers), clock or SystemClock()
         self._flights = Flights()
         sites.in_flight = self._flights.count
         self._forecaster = Forecaster(self._flights, self._allowance, memories.weighing)
         self._learner = Learner(self._allowance, memories.weighing)
         self._crossing = CrossingCheck()
+        self._streams = StreamMetrics()
         self._lock = threading.Lock()
         self._life = Lifetime(sites, memories, self._lock)
         self._runs = TaskRuns(
@@ -105,7 +106,7 @@ class Offloader:
 
     @classmethod
     def connect(
-        cls,
+        cls: type[Own],
         endpoint: str | None = None,
         *,
         sites: Mapping[str, str] | Path | str | None = None,
@@ -117,7 +118,7 @@ class Offloader:
         trace: Path | str | None = None,
         observe: bool = False,
         settings: Settings | None = None,
-    ) -> Self:
+    ) -> Own:
         """An offloader for onboard, a server `cloud` at `endpoint` (tcp://HOST:PORT), and further servers.
 
         `sites`: the endpoint of each further server, by name: tcp://HOST:PORT; ws:// or wss://HOST:PORT, a
@@ -151,40 +152,22 @@ class Offloader:
             )
             opened.pop_all()
         offload._life.recording = recording
+        recording.show(offload._streams)
         if recording.live is not None:
             offload.show_on(recording.live)
         offload._life.close_when_dropped(offload)
         return offload
 
-    def __call__(
-        self,
-        function: Callable[..., R],
-        *args: Any,
-        where: str | None = None,
-        timeout_s: float | None = None,
-        deadline_s: float | None = None,
-        **kwargs: Any,
-    ) -> R:
-        """Run a `@task` function and return its result; TaskFailed if the function itself raised.
-
-        `where` pins the call to a site, or to `both` to measure all of them. `timeout_s` bounds the wait for
-        a remote site, after which the task runs onboard. `deadline_s` bounds the wait of the caller: after
-        it the call raises DeadlineMissed, and the task runs to its end in another thread.
-        """
-        if self._life.forked:
-            self._life.refuse_in_fork()
-        budget_s = self._timeout_s if timeout_s is None else checked_timeout(timeout_s)
-        kind = kind_in_use(function)
-        args = kind.bind(args, kwargs)
-        task = new_task(kind, args)
-        if deadline_s is None:
-            answer, _ = self._answer(where, budget_s, task)
-        else:
-            answer = self._answer_in_time(where, budget_s, task, checked_timeout(deadline_s, "deadline_s"))
-        if answer.failure is not None:
-            raise answer.failure
-        return cast("R", answer.value)
-
+    @overload
+    def map(
+        self, function: Callable[..., R], items: Iterable[Any], *,
+        where: str | None = ..., timeout_s: Seconds = ..., records: Literal[False] = ...,
+    ) -> list[R]: ...  # fmt: skip
+    @overload
+    def map(
+        self, function: Callable[..., R], items: Iterable[Any], *,
+        where: str | None = ..., timeout_s: Seconds = ..., records: Literal[True],
+    ) -> list[tuple[R, Record]]: ...  # fmt: skip
     def map(
         self,
         function: Callable[..., R],
@@ -192,67 +175,58 @@ class Offloader:
         *,
         where: str | None = None,
         timeout_s: float | None = None,
-    ) -> list[R]:
+        records: bool = False,
+    ) -> list[R] | list[tuple[R, Record]]:
         """Run a `@task` function on every item, on all sites at once, so that the last one ends soonest.
 
         An item is the argument, or a tuple of all arguments if the function takes several. The results come
-        in the order of the items. If tasks fail, the error of the first one is raised when all have ended.
-        `where` and `timeout_s` are those of a single call. Observers are called in threads of the batch.
+        in the order of the items; with `records`, each with the record of its call. If tasks fail, the error
+        of the first one is raised when all have ended. `where` and `timeout_s` are those of a single call.
+        Observers are called in threads of the batch. If the batch is left by Ctrl-C, its runs are left too.
         """
         self._life.refuse_in_fork()
         budget_s = self._timeout_s if timeout_s is None else checked_timeout(timeout_s)
         kind = kind_in_use(function)
-        tasks = [new_task(kind, args) for args in arguments(kind, items)]
+        tasks = [new_task(kind, kind.bind(kind.arguments_in(item), {})) for item in items]
         runners = self._sites.now
-        if self._observes:
-            where = where or ONBOARD
+        where = where or (ONBOARD if self._observes else None)
         if where is not None:
             check_where(where, kind, runners, changing=self._sites.changing)
-        batch = Batch(
+        caller = CallFuture[Any]()  # one for all tasks, so that the batch can leave all of them
+        return Batch(
             tasks,
             self._sites if where is None else (*sites_at(where, runners), ONBOARD)[:1],
             predict=partial(self._expect_in_batch, runners),
-            run=partial(self._answer, where, budget_s),
+            run=partial(self._answer, where, budget_s, caller=caller),
+            leave=caller.cancel,
             clock=self._clock,
             timeout_s=budget_s,
-        )
-        return batch.run()
-
-    def submit(self, function: Callable[..., R], *args: Any, **options: Any) -> "Future[R]":
-        """The same call in another thread: returns the future of its result at once.
-
-        At most ASYNC_CALLS_MAX calls are made at a time; further ones wait, and can be cancelled while they
-        do. `deadline_s` counts from when a call begins. A task that has begun runs to its end.
-        """
-        self._life.refuse_in_fork()
-        return self._life.call_in_thread(partial(self, function, *args, **options))
-
-    async def run(self, function: Callable[..., R], *args: Any, **options: Any) -> R:
-        """The same call for asyncio, as with `submit`; the event loop is free while the task runs.
-
-        If the caller is cancelled, it does not wait for the task, which runs to its end.
-        """
-        return await asyncio.wrap_future(self.submit(function, *args, **options))
+        ).run(records=records)
 
     def expect(
-        self, function: Callable[..., Any], *args: Any, deadline_s: float | None = None, **kwargs: Any
+        self, function: Callable[..., Any], /, *args: Any, deadline_s: float | None = None, **kwargs: Any
     ) -> dict[str, Expectation]:
         """What this call should take on each site, and how likely it is in time; nothing runs or counts."""
         self._life.refuse_in_fork()
-        if deadline_s is not None:
-            deadline_s = checked_timeout(deadline_s, "deadline_s")
         kind = kind_in_use(function)
-        args = kind.bind(args, kwargs)
-        task, runners = new_task(kind, args), self._sites.now
+        task, runners = new_task(kind, kind.bind(args, kwargs)), self._sites.now
         absent = absent_sites(runners, kind)
         with self._lock:
             memory, now_s = self._memories.of(kind, runners), self._clock.now_s()
-            sites = present_sites(runners, absent)
-            forecast = self._forecaster.forecast(memory, task, sites, now_s=now_s)
+            forecast = self._forecaster.forecast(memory, task, absent.others_of(runners), now_s=now_s)
             if deadline_s is not None:
                 slowest_s = memory.slowest_onboard_s(task.size) if self._pairs else None
-                forecast = by_deadline(forecast, deadline_s, slowest_s=slowest_s)
+                within_s = checked_timeout(deadline_s, "deadline_s")
+                forecast = by_deadline(forecast, within_s, slowest_s=slowest_s)
         return expectations(forecast, absent)
+
+    @property
+    def sites(self) -> Mapping[str, SiteView]:
+        """Each site as it is now, by its name: a copy that does not change."""
+        return self._sites.views()
+
+    def __repr__(self) -> str:
+        return f"<Offloader {'; '.join(f'{site}: {view}' for site, view in self.sites.items())}>"
 
     def savings(self) -> dict[str, Savings | None]:
         """With `observe`: what offloading would have saved, by name of the task; None while it is unknown."""
@@ -279,21 +253,37 @@ class Offloader:
         """Close all runners, trace and metrics, and save what was learnt. Safe to call twice."""
         self._life.close()
 
-    def __enter__(self) -> Self:
+    def __enter__(self: Own) -> Own:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def _answer_call(
+        self, task: Task, options: Options, caller: CallFuture[Any] | None
+    ) -> tuple[Execution, Record]:
+        where, timeout_s, deadline_s = options
+        budget_s = self._timeout_s if timeout_s is None else checked_timeout(timeout_s)
+        if deadline_s is None:
+            return self._finish(self._begin(task, where, budget_s, caller=caller))
+        within_s = checked_timeout(deadline_s, "deadline_s")
+        pending = self._begin(task, where, budget_s, deadline_s=within_s, caller=caller)
+        return self._answer_in_time(pending, within_s)
+
     def _answer(
-        self, where: str | None, budget_s: float, task: Task, placed: Placed | None = None
+        self,
+        where: str | None,
+        budget_s: float,
+        task: Task,
+        placed: Placed | None = None,
+        *,
+        caller: CallFuture[Any] | None = None,
     ) -> tuple[Execution, Record]:
         """One task from its arguments to its record; `placed` replaces the policy."""
-        return self._finish(self._begin(task, where, budget_s, placed=placed))
+        return self._finish(self._begin(task, where, budget_s, placed=placed, caller=caller))
 
-    def _answer_in_time(self, where: str | None, budget_s: float, task: Task, deadline_s: float) -> Execution:
+    def _answer_in_time(self, pending: PendingTask, deadline_s: float) -> tuple[Execution, Record]:
         """The answer to one task; DeadlineMissed if there is none after `deadline_s`."""
-        pending = self._begin(task, where, budget_s, deadline_s=deadline_s)
         until_s = pending.started_s + deadline_s
         answered = pending.answered = Future()
         call = self._life.call_beside(partial(self._finish, pending))
@@ -301,11 +291,16 @@ class Offloader:
         if call.done() and not answered.done():
             call.result()  # the error that kept it from an answer
         if answered.done():
-            answer, answered_s = answered.result()
-            if answered_s <= until_s:
-                return answer
+            answer, record, answered_s = answered.result()
+            if answered_s <= until_s or record.cancelled:
+                return answer, record
         self._life.leave(call)
-        raise missed(task.kind.name, deadline_s, pending.forecast, pending.absent)
+        executions = () if pending.so_far is None else pending.so_far()
+        ended_s = max(until_s + ROUNDING_S, self._clock.now_s())
+        error = missed(pending.task.kind.name, deadline_s, pending.forecast, pending.absent)
+        record = record_of(pending, executions, None, ended_s=ended_s)
+        error.record = record if pending.caller is None else pending.caller.keep(record)
+        raise error
 
     def _begin(
         self,
@@ -315,18 +310,18 @@ class Offloader:
         *,
         placed: Placed | None = None,
         deadline_s: float | None = None,
+        caller: CallFuture[Any] | None = None,
     ) -> PendingTask:
         """Predict and decide."""
         runners = self._sites.now
         if len(runners) > 1:
             self._crossing.check_arguments(task)
-        started_at, started_s, number = datetime.now(UTC), self._clock.now_s(), next(self._numbers)
+        started_at, started_s, number = datetime.now(timezone.utc), self._clock.now_s(), next(self._numbers)
         absent = absent_sites(runners, task.kind)
         with self._lock:
             self._allowance.begin(started_s)
-            memory = self._memories.of(task.kind, runners)
-            sites = present_sites(runners, absent)
-            forecast = self._forecaster.forecast(memory, task, sites, now_s=started_s)
+            memory, present = self._memories.of(task.kind, runners), absent.others_of(runners)
+            forecast = self._forecaster.forecast(memory, task, present, now_s=started_s)
             if self._sites.changing:
                 self._sites.count_task(finishes_of(forecast), started_s)
             within_s = self._memories.deadline_s if deadline_s is None else deadline_s
@@ -358,6 +353,7 @@ class Offloader:
             absent=absent,
             call=placed.call if placed else None,
             deadline_s=deadline_s,
+            caller=caller,
         )
 
     def _finish(self, pending: PendingTask) -> tuple[Execution, Record]:
@@ -366,24 +362,29 @@ class Offloader:
 
     def _end(self, pending: PendingTask, executions: tuple[Execution, ...]) -> tuple[Execution, Record]:
         task, answer = pending.task, answer_of(executions, pending.task.kind)
-        answered_s = None if pending.answered is None else self._clock.now_s()
+        answered_s = self._clock.now_s()
+        chunk = None if pending.caller is None else chunk_of(pending.caller, answer)
         with self._lock:
             self._runs.learn(pending, executions)
-            if not self._life.closed and self._memories.due(self._clock.now_s()):
+            if not self._life.closed and self._memories.due(answered_s):
                 self._memories.save_soon()
             late = self._runs.take_late() if self._runs.late else ()
             regret = self._learner.regret.estimate()
             saved = self._learner.savings().get(task.kind.name) if self._observes else None
-        ended_s = self._clock.now_s()
+        used = None if pending.cancelled else answer
+        ended_s = self._clock.now_s() if pending.deadline_s is None else answered_s
         record = self.last = record_of(
-            pending, executions, answer, ended_s=ended_s, late=late, regret=regret, savings=saved
+            pending, executions, used, ended_s=ended_s, late=late, regret=regret, savings=saved
         )
-        if pending.answered is not None and answered_s is not None:  # its caller waits for no observer
-            pending.answered.set_result((answer, answered_s))
+        record.chunk = chunk
+        if pending.answered is not None:  # its caller waits for no observer
+            pending.answered.set_result((answer, record, answered_s))
+        if pending.caller is not None:
+            pending.caller.keep(record)
         tell(self._observers, record)
         if len(executions) > 1:
             self._crossing.hear(task.kind, executions)
-        if len(pending.runners) > 1 and answer.failure is None:
+        if len(pending.runners) > 1 and answer.failure is None and not pending.cancelled:
             self._crossing.check_result(task.kind, answer.value)
             if self._observes and (site := pending.decision.measured) is not None:
                 self._life.call_beside(partial(self._runs.measure, pending, site))

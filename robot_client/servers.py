@@ -6,27 +6,24 @@ What a runner does is in `sites` and, for policy servers, in `openpi`; how lists
 
 import os
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
 from offboard.common.errors import ConfigError
-from offboard.common.security.keys import checked_key, robot_keys
+from offboard.common.security.keys import checked_key, policy_token, robot_keys
 from offboard.common.variants import group_of
-from offboard.robot_client.discovery.dns_name import DnsName, is_dns
-from offboard.robot_client.discovery.following import Following, Source
+from offboard.robot_client.cloud.cloud_runner import CloudRunner
 from offboard.robot_client.discovery.present_sites import PresentSites
 from offboard.robot_client.discovery.roster import Roster, Server
-from offboard.robot_client.discovery.sites_file import SitesFile
-from offboard.robot_client.openpi.endpoint import is_policy_server
+from offboard.robot_client.discovery.server_lists import DnsName, Following, SitesFile, Source
 from offboard.robot_client.policies import BOTH
 from offboard.robot_client.settings import Settings
-from offboard.robot_client.sites import heartbeat
-from offboard.robot_client.sites.background import Background
-from offboard.robot_client.sites.cloud import CloudRunner
+from offboard.robot_client.sites.endpoint import check_endpoint, is_dns, is_policy_server
+from offboard.robot_client.sites.heartbeat import EVERY_S, Background
 from offboard.robot_client.sites.onboard import OnboardRunner
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Runner, check_endpoint
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Runner
 
 Sites = Mapping[str, str] | Path | str
 
@@ -38,14 +35,8 @@ def connect_sites(
     keys: Path | str | None,
     policy: str,
     settings: Settings,
-    wrap: Callable[[Runner], Runner] = lambda runner: runner,
 ) -> PresentSites:
-    """The server at `endpoint`, the further ones in `sites`, and onboard.
-
-    `sites`: the endpoint of each by its name, or the file that lists them.
-    `keys`: the folder with the keys (None: no encryption). `policy`: the name of the policy.
-    `wrap`: makes of each runner the one that is used.
-    """
+    """The server at `endpoint`, the further ones in `sites`, and onboard; see `Offloader.connect`."""
     named = {} if isinstance(sites, Path | str) else dict(sites)
     if endpoint is not None and CLOUD in named:
         raise ConfigError(f"sites: {CLOUD!r} is the name of the server at {endpoint}; choose another one")
@@ -59,7 +50,7 @@ def connect_sites(
     sources: list[Source] = [DnsName(site, servers[site], key_of(site, None)) for site in sorted(names)]
     if isinstance(sites, Path | str):
         sources.append(SitesFile(Path(sites), key_of, {ONBOARD, BOTH, *fixed}))
-    heartbeat_s = heartbeat.EVERY_S if settings.beats(policy) else 0.0
+    heartbeat_s = EVERY_S if settings.beats(policy) else 0.0
     background = Background()
     connect = partial(
         _connect, keys=folder, heartbeat_s=heartbeat_s, settings=settings, background=background
@@ -67,15 +58,15 @@ def connect_sites(
     with ExitStack() as opened:  # also after Ctrl-C, no thread or socket is left
         runners: list[Runner] = []
         for site, one in fixed.items():
-            runners.append(wrap(connect(Server(site, one))))
+            runners.append(connect(Server(site, one)))
             opened.callback(runners[-1].close)
-        runners.append(wrap(OnboardRunner(states=settings.states, background=background)))
+        runners.append(OnboardRunner(states=settings.states, background=background))
         opened.callback(runners[-1].close)
         seed = f"{settings.seed} {socket.gethostname()} {os.getpid()}"  # the robots of a fleet spread out
         present = PresentSites(
             runners,
             roster=Roster(settings.known, seed) if sources else None,
-            connect=lambda server: wrap(connect(server)),
+            connect=connect,
             tended=True,
         )
         opened.callback(present.close)
@@ -103,7 +94,9 @@ def _connect(
     server: Server, *, keys: Path | None, heartbeat_s: float, settings: Settings, background: Background
 ) -> Runner:
     if is_policy_server(server.endpoint):
-        from offboard.robot_client.openpi.policy_server import PolicyServerRunner  # its library is an extra
+        from offboard.robot_client.policy_servers.policy_server import (
+            PolicyServerRunner,
+        )  # its library is an extra
 
         return PolicyServerRunner(
             server.endpoint,
@@ -111,6 +104,7 @@ def _connect(
             heartbeat_s=heartbeat_s,
             seed=settings.seed,
             insecure=settings.insecure,
+            token=settings.tokens.get(server.site) or policy_token(keys, server.site),
             background=background,
         )
     return CloudRunner(

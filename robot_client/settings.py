@@ -1,46 +1,140 @@
-"""The options of `Offloader.connect` that few robots need.
+"""The options of `Offloader.connect` that few robots need, and of how a robot decides, with help and limits.
 
-The common options are keywords of `Offloader.connect` itself.
+The common options are keywords of `Offloader.connect` itself. Flags, scenarios, the ROS 2 node and summaries
+of runs read those of how a robot decides.
 """
 
-import math
 import typing
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from functools import partial
 from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any
 
+from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError
 from offboard.common.task_states import TaskStates
 from offboard.robot_client import policies, predictors
 from offboard.robot_client.discovery.roster import KNOWN_MAX
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.learning.store import Store
-from offboard.robot_client.policies import Policy
+from offboard.robot_client.policies import Policy, objectives
 from offboard.robot_client.policies.allowance import DUPLICATES, Allowance
 from offboard.robot_client.policies.decision import Named
-from offboard.robot_client.policies.objectives import S_PER_QUALITY, Energy, Mean, Objective
-from offboard.robot_client.predictors.window import WINDOW, checked_length
+from offboard.robot_client.policies.objectives import MEAN, OBJECTIVE, S_PER_QUALITY, Energy, Mean, Objective
+from offboard.robot_client.predictors.window import WINDOW, WINDOW_MAX, checked_length
 from offboard.robot_client.sites.runner import checked_timeout
 
+DECISIONS = "decisions"  # the heading in the help
+_decision_setting = partial(setting, group=DECISIONS, rare=True)
+_limit_setting = partial(setting, group="limits", rare=True, minimum=0.0)
+_objective_setting = partial(setting, group=OBJECTIVE, rare=True)
+# The objectives that each setting belongs to; the first one cannot do without it.
+USED_BY = {
+    "deadline_s": ("deadline",),
+    "s_per_joule": ("energy", "metered"),
+    "s_per_megabyte": ("metered", "energy"),
+}
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
-    """Rare options of an offloader; the defaults suit most robots.
 
-    `predictor`: how times are predicted, by name (None: the predictor that the policy is meant for).
-    `window`: the last times of each kind on each site that predictors with a window use.
-    `heartbeats`: whether to ask each server that is used if it is there (None: as the policy needs it).
+@dataclass(frozen=True, kw_only=True)
+class DecisionOptions:
+    """What a robot learns with, and what it may spend."""
+
+    window: int = setting(
+        WINDOW, "executions remembered for each site", group=DECISIONS, minimum=2, maximum=WINDOW_MAX
+    )
+    predictor: str | None = _decision_setting(
+        None,
+        f"predictor to use instead of the one that the policy is meant for: {predictors.HELP}",
+        metavar="NAME",
+    )
+    heartbeats: bool | None = _decision_setting(
+        None,
+        "ask each server that is used if it is there (default: unless the policy is meant to do without)",
+    )
+    memory: Path | str | None = _decision_setting(
+        None, "file that keeps what the robot learns, and is read at start"
+    )
+    s_per_quality: float = _objective_setting(
+        S_PER_QUALITY,
+        "for tasks with variants: seconds that the whole quality of an answer is worth",
+        minimum=0.0,
+        maximum=1e6,
+    )
+    duplicates: float = _limit_setting(
+        DUPLICATES,
+        "share of tasks that may run on two sites, as probes or hedges",
+        maximum=1.0,
+        metavar="SHARE",
+    )
+    bytes_a_minute: float | None = _limit_setting(
+        None, "bytes that may be sent and received in a minute; puts budget around the policy", maximum=1e15
+    )
+    joules_a_minute: float | None = _limit_setting(
+        None,
+        "joules that tasks may take from the battery in a minute; puts budget around the policy",
+        maximum=1e9,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectiveOptions(Energy):
+    """What the policy makes small, with the weights and the watts of that."""
+
+    objective: str = _objective_setting(
+        MEAN,
+        "what the policy minimises: mean time, the time that 95 % of the tasks stay below (p95), missed "
+        "deadlines, or time plus what energy (energy) and data (metered) are worth",
+        choices=objectives.OBJECTIVES,
+    )
+    deadline_s: float | None = _objective_setting(
+        None,
+        "with --objective deadline: time that a task may take, in seconds",
+        name="deadline",
+        minimum=0.001,
+        maximum=3600,
+    )
+    s_per_joule: float | None = _objective_setting(
+        None, "with --objective energy or metered: seconds that one joule is worth", minimum=0.0, maximum=1e6
+    )
+    s_per_megabyte: float | None = _objective_setting(
+        None,
+        "with --objective metered or energy: seconds that a million bytes, sent or received, are worth",
+        minimum=0.0,
+        maximum=1e6,
+    )
+
+    def make(self, name: str | None = None) -> Objective:
+        """The objective of this name, or the chosen one; ConfigError if what it needs is not given."""
+        return objectives.make(
+            name or self.objective,
+            deadline_s=self.deadline_s,
+            s_per_joule=self.s_per_joule,
+            s_per_megabyte=self.s_per_megabyte,
+        )
+
+    def check_objective(self, shown: Callable[[str], str]) -> None:
+        """ConfigError unless the objective has what it needs, and no more.
+
+        `shown`: how users write the name of a field.
+        """
+        for name, names in USED_BY.items():
+            value = getattr(self, name)
+            if self.objective == names[0] and value is None:
+                raise ConfigError(f"{shown('objective')}: {names[0]} needs {shown(name)}")
+            if self.objective not in names and value is not None:
+                raise ConfigError(f"{shown(name)}: {value:g} needs {shown('objective')} {' or '.join(names)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings(DecisionOptions):
+    """Rare options of an offloader; the defaults suit most robots. Those of `DecisionOptions` come first.
+
     `objective`: what the policy makes small; see `policies.objectives`.
-    `s_per_quality`: what the whole quality of an answer is worth, in seconds, for tasks with variants.
     `energy`: what computing, waiting and sending take from the battery, in watts and joules per byte.
-    `duplicates`: second runs per task in the long run, from 0 to 1: probes, hedges, warm-up.
-    `bytes_a_minute`: the most bytes that tasks may send and receive in a minute (None: no cap).
-    `joules_a_minute`: the most joules that tasks may take in a minute (None: no cap).
-    `memory`: the file in which what was learnt outlives the process (None: a new process knows nothing).
     `compress`: whether large arguments are compressed where that should save time.
     `states`: what setups make; offloaders of one process that share it load each model once (None: its own).
     `insecure`: whether a policy server beyond this computer may be used by ws://, which is not encrypted, and
@@ -48,29 +142,22 @@ class Settings:
     `known`: how many servers of a group of equal ones the robot uses at a time, 2 or more.
     `reread_s`: seconds between two reads of a list of servers.
     `seed`: for policies and predictors that draw; the same seed draws the same numbers.
+    `tokens`: what policy servers want to see, by site, in place of NAME.token in the folder of the keys.
     """
 
-    predictor: str | None = None
-    window: int = WINDOW
-    heartbeats: bool | None = None
     objective: Objective = Mean()
-    s_per_quality: float = S_PER_QUALITY
     energy: Energy = Energy()
-    duplicates: float = DUPLICATES
-    bytes_a_minute: float | None = None
-    joules_a_minute: float | None = None
-    memory: Path | str | None = None
     compress: bool = True
     states: TaskStates | None = None
     insecure: bool = False
     known: int = KNOWN_MAX
     reread_s: float = 2.0
     seed: int = 0
+    tokens: Mapping[str, str] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
-        check_types(Settings, {name: getattr(self, name) for name in self.__slots__})
-        if not 0 <= self.s_per_quality < math.inf:
-            raise ConfigError(f"s_per_quality {self.s_per_quality}: must be a time of 0 s or more")
+        check_types(Settings, {field.name: getattr(self, field.name) for field in fields(self)})
+        check(self, "")
         checked_timeout(self.reread_s, "reread_s")
 
     def allowance(self) -> Allowance:
@@ -113,11 +200,12 @@ def check_types(of: Callable[..., Any], given: Mapping[str, Any]) -> None:
     """ConfigError unless each value has the type that is annotated for it in `of`."""
     for name, hint in typing.get_type_hints(of).items():
         if name in given and not _fits(given[name], hint):
-            kinds = typing.get_args(hint) if isinstance(hint, UnionType) else (hint,)
+            kinds = typing.get_args(hint) if _class_of(hint) in _UNIONS else (hint,)
             allowed = " or ".join(_SHOWN.get(kind := _class_of(one), kind.__name__) for one in kinds)
             raise ConfigError(f"{name} {given[name]!r:.200}: must be {allowed}")
 
 
+_UNIONS = (UnionType, typing.Union)  # the second if a default is None, in Python 3.10
 _SHOWN = {
     bool: "True or False",
     float: "a number",
@@ -132,7 +220,7 @@ _SHOWN = {
 
 def _fits(value: object, hint: Any) -> bool:
     kind, parts = _class_of(hint), typing.get_args(hint)
-    if kind is UnionType:
+    if kind in _UNIONS:
         return any(_fits(value, one) for one in parts)
     if kind in (int, float):  # numbers of numpy too
         return isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)

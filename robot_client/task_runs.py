@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Sequence
 from functools import partial
 
-from offboard.common.errors import Overtaken
+from offboard.common.errors import Overtaken, TaskError
 from offboard.robot_client.execution.choice import plan_of
 from offboard.robot_client.execution.race import Plan, Race, result_of
 from offboard.robot_client.learning.learner import Learner, PendingTask
@@ -17,8 +17,8 @@ from offboard.robot_client.lifetime import Lifetime
 from offboard.robot_client.policies import PINNED, Hedge
 from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.records.record import Late
-from offboard.robot_client.sites.clock import Clock
 from offboard.robot_client.sites.runner import ONBOARD, Execution
+from offboard.robot_client.sites.waiting import Clock
 
 LATE_MAX = 64  # executions that ended after their task was answered, kept for the next record
 
@@ -51,12 +51,24 @@ class TaskRuns:
     def execute(self, pending: PendingTask) -> tuple[Execution, ...]:
         """Run the task on the sites of its decision."""
         race, plan = self.race(pending)
+        if pending.deadline_s is not None:  # its caller may ask before the race has ended
+            pending.so_far = partial(race.runs.so_far, self._clock)
+        caller = pending.caller
         try:
-            return race.run(plan)
-        except BaseException:  # closed during the task, or Ctrl-C: nobody waits for what still runs
+            if caller is None:
+                return race.run(plan)
+            caller.withdraw.add(race.cancel)
+            executions = race.run(plan, caller)
+            pending.cancelled = caller.stop.done()
+            return executions
+        except BaseException:  # closed, or Ctrl-C: nobody waits for what still runs
+            race.cancel()
             with self._lock:
                 self._flights.end_all(pending.task.id, now_s=self._clock.now_s())
             raise
+        finally:
+            if caller is not None:
+                caller.withdraw.discard(race.cancel)
 
     def race(self, pending: PendingTask) -> tuple[Race, Plan]:
         """The runs of the task, before the first one starts."""
@@ -68,23 +80,27 @@ class TaskRuns:
             pending.timeout_s,
             begun=partial(self._begun, pending),
             task_for=pending.task_for,
-            allowed=self._take_duplicate,
+            allowed=partial(self._allowed, pending),
             late=partial(self._ended_late, pending),
         )
         hurried = pending.deadline_s is not None
         plan = plan_of(decision, pending.forecast, pending.call, hurried=hurried)
-        if plan.latest is not None and plan.latest.after_s <= 0 and not self._take_duplicate():
+        plan.falls_back = pending.caller is None or pending.caller.falls_back
+        latest = plan.latest
+        if latest is not None and latest.after_s <= 0 and not self._allowed(pending, latest.site):
             plan.latest = None
         if plan.latest is not None:  # it counts from the beginning of the call
             left_s = plan.latest.after_s - (self._clock.now_s() - pending.started_s)
             plan.latest = Hedge(plan.latest.site, left_s)
         if decision.both and decision.policy != PINNED:  # not if the caller measures all sites
-            self._take_duplicates(len(plan.first) - 1)
+            with self._lock:
+                for _ in plan.first[1:]:
+                    self._allowance.duplicate()
         return race, plan
 
     def measure(self, pending: PendingTask, site: str) -> None:
         """Run a task that was answered on another site too, if a second run may start, and learn its time."""
-        if not self._take_duplicate():
+        if not self._allowed(pending, site):
             return
         before = self._begun_onboard
         busy = self._flights.count(ONBOARD) > 0
@@ -123,15 +139,13 @@ class TaskRuns:
             )
             self._begun_onboard += site == ONBOARD
 
-    def _take_duplicates(self, count: int) -> None:
+    def _allowed(self, pending: PendingTask, site: str) -> bool:
+        """Whether a second run may start on this site; it is then counted. A fallback needs no permission."""
         with self._lock:
-            for _ in range(count):
-                self._allowance.duplicate()
-
-    def _take_duplicate(self) -> bool:
-        """Whether a second run may start; it is then counted. A fallback needs no permission."""
-        with self._lock:
-            return self._allowance.take_duplicate()
+            allowed = self._allowance.take_duplicate()
+        if not allowed:
+            pending.refused = site
+        return allowed
 
     def _ended_late(
         self, pending: PendingTask, site: str, execution: Execution, *, bound: bool | None = None
@@ -139,6 +153,7 @@ class TaskRuns:
         """A run has ended after its task was answered; called in any thread."""
         with self._lock:
             self._flights.end(site, pending.task.id, now_s=self._clock.now_s())
-            if execution.started and not self._life.closed:
+            ran = execution.started or isinstance(execution.failure, TaskError)  # or its setup failed
+            if ran and not self._life.closed:
                 self._learner.learn_late(pending, execution, bound=bound)
             self.late.append(Late(pending.id, execution.without_value()))

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from offboard.common.tasks import Kind, kinds, load_modules
+from offboard.common.source.task_modules import load_modules
+from offboard.common.tasks import Kind, kinds
 from offboard.loadgen.scenario.event_timeline import Event
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.testbed.local_testbed import COMMANDS, LocalTestbed

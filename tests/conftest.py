@@ -23,6 +23,72 @@ settings.register_profile("offboard", deadline=None)
 settings.load_profile("offboard")
 
 PROBES = {"tasks": "tests.probes", "workers": 1}
+TESTS = Path(__file__).parent
+# What `make test` leaves out, and `make test-all` runs: it takes long, or needs other programs.
+LONG = (
+    *("chaos", "compose", "state"),
+    *(f"integration/{name}" for name in ("openpi", "prometheus", "toxiproxy")),
+    *(f"integration/keys/test_{name}.py" for name in ("key_changes", "key_commands", "page_examples")),
+    *(f"integration/server/test_{name}.py" for name in ("ended_connections", "forked_copies", "live_server")),
+    *(
+        f"integration/test_{name}.py"
+        for name in (
+            *("alone", "asking", "attacks", "batch", "changing_sites", "check", "child_processes", "compare"),
+            *("cost", "covers", "crashes", "crossing", "dataset", "demo", "examples_run", "export"),
+            *("fairness", "faults", "first_calls", "forked_and_dropped", "fuzz", "leftovers", "live_robot"),
+            *(
+                "load",
+                "local_testbed",
+                "locked_wheels",
+                "make_figures",
+                "own_task",
+                "packing",
+                "recorded_run",
+            ),
+            *("robot_workload", "scarce", "servers_on_loopback", "silent_outage"),
+            *("stream_faults", "task_cost"),
+            *("terminal", "values_cross", "wan_recording", "watch", "wheel"),
+        )
+    ),
+    *(
+        f"unit/test_{name}.py"
+        for name in ("ablations", "datasets", "footprint", "report", "report_charts", "search")
+    ),
+    *("unit/test_simulation_checks.py", "unit/test_simulation_compare.py", "unit/test_simulated_sets.py"),
+)
+# What measures times that a busy machine would change: no other test runs next to it.
+ALONE = (
+    "browser",
+    "chaos/test_scenarios.py",
+    *(
+        f"integration/test_{name}.py"
+        for name in ("testbed", "three_sites", "variants", "wan", "wan_effects", "wan_speed")
+    ),
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark tests as `long` or `alone`."""
+    for item in items:
+        place = item.path.relative_to(TESTS).as_posix()
+        for mark, places in (("long", LONG), ("alone", ALONE)):
+            if place.startswith(places):
+                item.add_marker(mark)
+
+
+@pytest.hookimpl(optionalhook=True)  # some environments have no xdist
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Tests of a file share its servers, and those with containers the engine: one process runs them all."""
+    if config.getvalue("dist") != "load":  # another way was asked for
+        return None
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByFile(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            place = nodeid.partition("::")[0]
+            return "engine" if "tests/compose" in place or "docker" in nodeid else place
+
+    return ByFile(config, log)
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ PLACES = (
     "robot_client/predictors",
     "robot_client/policies",
     "robot_client/sites/heartbeat.py",
-    "robot_client/sites/background.py",
+    "robot_client/streams",
 )
 NAME = re.compile(r"_?[A-Z][A-Z0-9_]*")
 NUMBERS = (ast.Constant, ast.Name, ast.BinOp, ast.UnaryOp, ast.Tuple, ast.operator, ast.unaryop, ast.Load)

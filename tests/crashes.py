@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.common.task_call import check_wanted
 from offboard.common.tasks import task
-from offboard.common.wanted import check_wanted
 
 _hoard: list[NDArray[np.uint8]] = []
 _pieces: list[str] = []

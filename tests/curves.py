@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import zmq
 import zmq.utils.monitor
@@ -105,7 +105,7 @@ class Dealer:
         assert self.socket.poll(int(WAIT_S * 1000)), "no answer"
         return wire.unpack(self.socket.recv_multipart())
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Dealer":
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from offboard.cloud_server.executors.executor import Executor
-from offboard.cloud_server.executors.task_run import Call, Outcome
+from offboard.cloud_server.executors.executor import Call, Executor, Outcome
 from offboard.common.wire.messages import StoredBlob, decode, encode
 
 WAIT_S = 8
@@ -13,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 MODULE = '''
 import asyncio, dataclasses, os, pathlib, threading, time
 from offboard.common.tasks import task
-from offboard.common.wanted import check_wanted
+from offboard.common.task_call import check_wanted
 
 warmed = []
 

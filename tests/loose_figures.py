@@ -1,15 +1,15 @@
 """Finds measured figures that stand in a page without their commit.
 
-Figures belong to docs/results.md and to the blocks that `make figures` fills. Elsewhere a paragraph with a
-measured figure must name its commit, or link to the results page. Settings, limits and examples are no
-measured figures; the patterns below tell them apart by the words around a number.
+Figures belong to docs/figures and to the blocks that `make figures` fills. Elsewhere a paragraph with a
+measured figure must name its commit, or link to the results page or a page of figures. Settings, limits and
+examples are no measured figures; the patterns below tell them apart by the words around a number.
 """
 
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from benchmarks.figures.page import BLOCK, RESULTS
+from benchmarks.figures.page import BLOCK
 
 ROOT = Path(__file__).parents[1]
 NUMBER = r"\d[\d,]*(?:\.\d+)?"
@@ -37,14 +37,14 @@ MEASURED = re.compile(
 CELL = re.compile(rf"[-+]?{NUMBER} ?(?:{UNIT}|times)?")
 CELLS = 2  # a table holds figures if a row has two cells with numbers, one of them with a fraction
 COMMIT = re.compile(r"\b(?=[0-9a-f]*\d)(?=[0-9a-f]*[a-f])[0-9a-f]{7,12}\b")
+FIGURES = re.compile(r"\]\((?:docs/)?(?:results|figures/\w+)\.md")
 # What is printed there is no measurement of ours: the published table, and an example worked out by hand.
 ALLOWED = {"docs/evaluation.md": ("The paper's own table", "Twelve rows by hand")}
 
 
 def pages() -> list[Path]:
-    """The pages for users; the results page has no place for a loose figure."""
-    found = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), ROOT / "loadgen/datasets/README.md"]
-    return sorted(path for path in found if path != ROOT / RESULTS)
+    """The pages for users; those of docs/figures are generated as a whole."""
+    return sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), ROOT / "loadgen/datasets/README.md"])
 
 
 def loose_figures(text: str, allowed: tuple[str, ...] = ()) -> Iterator[str]:
@@ -59,7 +59,7 @@ def loose_figures(text: str, allowed: tuple[str, ...] = ()) -> Iterator[str]:
 
 def named(paragraph: str) -> bool:
     """Whether a paragraph says where its figures come from."""
-    return f"({RESULTS.name}" in paragraph or f"({RESULTS}" in paragraph or bool(COMMIT.search(paragraph))
+    return bool(FIGURES.search(paragraph) or COMMIT.search(paragraph))
 
 
 def is_figures(paragraph: str) -> bool:

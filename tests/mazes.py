@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from offboard.common.planning import planner, search
+from offboard.common.planning import ASTAR, DIJKSTRA, JPS, planner, search
 from offboard.common.planning.map_files import read_map
 from offboard.common.planning.maps import GridMap
-from offboard.common.planning.planner_names import ASTAR, DIJKSTRA, JPS
 
 Cell = tuple[int, int]
 SAMPLES = Path(__file__).parent / "samples"

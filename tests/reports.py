@@ -1,10 +1,10 @@
-"""Files of measured times for the tests of reports, and the names of the charts."""
+"""Files of measured times for the tests of reports, and the names of the charts of the paper."""
 
 from pathlib import Path
 
 from tests.table_loops import Line, csv_of
 
-CHARTS = ("times", "decisions", "errors", "accuracy", "ecdf")
+CHARTS = ("times", "errors", "accuracy")
 
 
 def write_rows(folder: Path, rows: list[Line]) -> Path:

@@ -178,7 +178,7 @@ def shown_flags(root: Path, command: tuple[str, ...]) -> int | None:
     if said.returncode:
         return None
     shown = set(re.findall(r"^\s+(?:-\w, )?(--[a-z][a-z-]*)", said.stdout, re.MULTILINE))
-    return len(shown - {"--help", "--help-all"})
+    return len(shown - {"--help", "--help-all", "--version"})
 
 
 def glossary_entries(root: Path) -> int:

@@ -75,7 +75,7 @@ def expected_line(rows: list[Line], label: str, feedback: str) -> list[str]:
         true = [row[side] for row in scored]
         mean_t, mean_p = sum(true) / count, sum(predicted) / count
         cells += [printed(mean_t), printed(mean_p), printed(mean_p - mean_t)]
-        percents[side] = f"{100 * (mean_p - mean_t) / mean_t:z.2f}"
+        percents[side] = f"{round(100 * (mean_p - mean_t) / mean_t, 2) + 0.0:.2f}"
         errors[side] = sorted(abs(p - t) for p, t in zip(predicted, true, strict=True))
     rank = math.ceil(Fraction(95, 100) * count)
     right, *rule = rule_cells(scored, [step.cloud for step in steps])

@@ -1,9 +1,10 @@
 """Calls of an offloader, with the types that a type checker must see. Mypy reads this file; it never runs."""
 
-from concurrent.futures import Future
-from typing import Any, assert_type
+from typing import Any
 
-from offboard import Expectation, Offloader, Savings, TaskFailed, task
+from typing_extensions import assert_type
+
+from offboard import Expectation, Offloader, Record, Savings, TaskFailed, task
 
 
 class Detector:
@@ -38,7 +39,11 @@ async def calls(offload: Offloader) -> None:
     assert_type(offload(untyped, 5), Any)
     assert_type(offload.map(count, [1, (2, 3.0)]), list[str])
     assert_type(offload.map(detect, [b"frame"], where="both"), list[list[int]])
-    assert_type(offload.submit(count, 5, deadline_s=1.0), Future[str])
+    assert_type(offload.submit(count, 5, deadline_s=1.0).result(), str)
+    assert_type(offload.submit(detect, b"frame").record, Record | None)
+    assert_type(offload.call(count, 5, where="cloud"), tuple[str, Record])
+    assert_type(offload.call(detect, b"frame"), tuple[list[int], Record])
+    assert_type(offload.map(count, [1], records=True), list[tuple[str, Record]])
     assert_type(offload.expect(count, 5, deadline_s=1.0), dict[str, Expectation])
     assert_type(offload.savings(), dict[str, Savings | None])
     assert_type(await offload.run(count, 5, where="onboard"), str)

@@ -1,51 +1,32 @@
 """Virtual time for unit tests, and runners that work in it: the test decides what happens when."""
 
-import heapq
-import itertools
+import math
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from concurrent.futures import Future
 from typing import Any
 
 from offboard.common.errors import CloudTimeout, OffloadError, Overtaken, SiteClosed
 from offboard.common.tasks import Kind, Task
 from offboard.robot_client.sites.runner import ONBOARD, UNMEASURED, Condition, Execution, Sending
+from offboard.testing import virtual_clock
 
 
-class VirtualClock:
-    """Time passes only while a caller waits, from one planned event to the next."""
+class VirtualClock(virtual_clock.VirtualClock):
+    """The virtual clock of the library; it remembers the timeout of each wait."""
 
     def __init__(self) -> None:
-        self._now_s = 0.0
-        self._plans: list[tuple[float, int, Callable[[], None]]] = []
-        self._numbers = itertools.count()
+        super().__init__()
         self.waits: list[float | None] = []
-
-    def now_s(self) -> float:
-        return self._now_s
-
-    def after(self, seconds: float, act: Callable[[], None]) -> None:
-        heapq.heappush(self._plans, (self._now_s + seconds, next(self._numbers), act))
 
     def wait(self, pending: "Collection[Future[Any]]", timeout_s: float | None = None) -> None:
         self.waits.append(timeout_s)
-        until_s = float("inf") if timeout_s is None else self._now_s + timeout_s
-        while not any(run.done() for run in pending):
-            assert self._plans or timeout_s is not None, "waits forever"
-            if not self._plans or self._plans[0][0] > until_s:
-                self._now_s = until_s
-                return
-            self._step()
+        super().wait(pending, timeout_s)
 
     def run_out(self) -> None:
         """Make all planned events happen."""
-        while self._plans:
-            self._step()
-
-    def _step(self) -> None:
-        at_s, _, act = heapq.heappop(self._plans)
-        self._now_s = max(self._now_s, at_s)
-        act()
+        while self._due:
+            self.step(math.inf)
 
 
 class VirtualRunner:

@@ -17,7 +17,7 @@ from offboard.common.command_line import CommandParser, add_flags, run_command
 from offboard.common.config import check, resolve, setting
 from offboard.common.errors import ConfigError, OffloadError
 from offboard.common.toml_file import unknown
-from offboard.loadgen.play.code_commit import changed_code, commit_here
+from offboard.loadgen.play.machine import changed_code, commit_here
 from offboard.loadgen.table.measured_rows import write_whole
 
 PROG = "python -m benchmarks.figures"

@@ -23,10 +23,11 @@ class MarkdownTable:
     def chosen(self, where: Mapping[str, Sequence[str]], shown: Sequence[str]) -> "MarkdownTable":
         """The rows whose cells are among those of `where`, and the columns `shown`, or all of them."""
         for heading in (*where, *shown):
-            if heading not in self.headings:
-                raise DataError(f"there is no column {heading!r} in {', '.join(self.headings)}")
+            if (count := self.headings.count(heading)) != 1:
+                many = "more than one" if count else "no"
+                raise DataError(f"there is {many} column {heading!r} in {', '.join(self.headings)}")
         at = {heading: number for number, heading in enumerate(self.headings)}
-        columns = [at[heading] for heading in shown or self.headings]
+        columns = [at[heading] for heading in shown] or [*range(len(self.headings))]
         rows = [row for row in self.rows if all(row[at[name]] in cells for name, cells in where.items())]
         return MarkdownTable(
             tuple(self.headings[one] for one in columns),
@@ -91,6 +92,27 @@ def first_table(lines: Sequence[str]) -> MarkdownTable:
     if not tables:
         raise DataError("no table was printed")
     return tables[0]
+
+
+def table_below(title: str, lines: Sequence[str]) -> MarkdownTable:
+    """The first table below the heading with this text."""
+    for number, line in enumerate(lines):
+        if line.startswith("#") and line.lstrip("#").strip() == title:
+            return first_table(lines[number:])
+    raise DataError(f"there is no heading {title!r}")
+
+
+def stacked(outputs: Sequence[Sequence[str]]) -> MarkdownTable:
+    """The first tables of several outputs below each other; they must have the same columns."""
+    first, *others = map(first_table, outputs)
+    for other in others:
+        if other.headings != first.headings:
+            raise DataError(
+                f"tables have other columns: {', '.join(first.headings)}; {', '.join(other.headings)}"
+            )
+    return MarkdownTable(
+        first.headings, first.rule, tuple(row for one in (first, *others) for row in one.rows)
+    )
 
 
 def joined(heading: str, outputs: Mapping[str, Sequence[str]]) -> MarkdownTable:

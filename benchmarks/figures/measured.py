@@ -15,14 +15,14 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import IO
 
 from benchmarks.figures.step import OUT, ROOT, Step, Unit
 from offboard.common.errors import ConfigError, DataError, OffloadError
+from offboard.loadgen.play.machine import StolenCpuTime
 from offboard.loadgen.play.machine import machine as this_machine
-from offboard.loadgen.play.stolen_cpu_time import StolenCpuTime
 from offboard.loadgen.table.measured_rows import write_whole
 
 # A command is ended after LIMIT_FACTOR times the minutes that its step is expected to take, and LIMIT_MORE_S.
@@ -71,7 +71,7 @@ def measure(unit: Unit, commit: str, *, again: bool = False) -> Measured:
         _prepare(unit, commit, again=again)
     here = machine_of(_environment(unit.step))
     reads, stolen, began = unit.reads(ROOT), StolenCpuTime(), time.monotonic()
-    date, output = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}", ""
+    date, output = f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ}", ""
     for command in unit.commands():
         output += _run(unit, command)
     if not output.strip():
@@ -126,10 +126,11 @@ def read_all(units: Sequence[Unit], root: Path = ROOT) -> dict[str, Measured]:
 
 def machine_of(environment: Mapping[str, str]) -> dict[str, str | int | float]:
     """The machine and the Python of an environment; OffloadError if it runs the code of another checkout."""
-    code = "import platform, offboard; print(platform.python_version(), offboard.__file__)"
+    code = "import sys; del sys.path[0]\n"  # what a program of the environment imports, whatever the folder
+    code += "import platform, offboard; print(platform.python_version(), offboard.__file__)"
     python = shutil.which("python", path=environment["PATH"]) or "python"
-    asked = subprocess.run(  # -P: what a program of the environment imports, whatever the folder
-        [python, "-P", "-c", code],
+    asked = subprocess.run(
+        [python, "-c", code],
         env=environment,
         capture_output=True,
         text=True,
@@ -221,7 +222,7 @@ def _started(
         stdout=stdout,
         stderr=stderr,
         text=True,
-        process_group=0,
+        start_new_session=True,
     )
     try:
         yield process

@@ -1,90 +1,128 @@
-"""The pages: docs/results.md as a whole, and the marked blocks of other pages, from the files of the steps.
+"""The pages: those of docs/figures, and the marked blocks of other pages, from the files of the steps.
 
-A block is a line `<!-- figure: NAME | COLUMN: CELL, .. | show: COLUMN, .. -->` and a line `<!-- end -->`.
-What is between them comes from the first table of the step, or of its part with NAME/PART, and only rows with
-these cells are shown.
+A block is a line `<!-- figure: NAME | table: TITLE | COLUMN: CELL, .. | show: COLUMN, .. -->` and a line
+`<!-- end -->`. What is between them comes from the first table of the step, or of its part with NAME/PART,
+or from the table below the heading TITLE; only rows with these cells are shown.
 """
 
+import os.path
 import re
 import textwrap
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from benchmarks.figures.markdown_tables import MarkdownTable, blocks_of, first_table, joined, notes_of
+from benchmarks.figures.markdown_tables import (
+    MarkdownTable,
+    blocks_of,
+    joined,
+    notes_of,
+    stacked,
+    table_below,
+)
 from benchmarks.figures.measured import OTHER_FILES, Measured, of_other_files
-from benchmarks.figures.step import Section, Step, Unit, units_of
+from benchmarks.figures.step import FOLDER, Section, Step, Unit, units_of
 from offboard.common.errors import DataError
 from offboard.loadgen.table.table_columns import WIDTH
 
-RESULTS = Path("docs/results.md")
+OVERVIEW = FOLDER / "README.md"  # git hosts show it with the folder
 BLOCK = re.compile(r"<!-- figure: (?P<what>[^\n]*?) -->\n(?P<shown>.*?)<!-- end -->", re.DOTALL)
-SHOW = "show"
+SHOW, TABLE = "show", "table"
 DAY = len("2026-11-26")  # characters of a date that are the day
+WRITTEN = (
+    "<!-- `make figures` writes this page from docs/figures/. Change docs/figures/steps.toml instead. -->"
+)
 ABOUT = """\
-<!-- `make figures` writes this page from docs/figures/. Change docs/figures/steps.toml instead. -->
+# All figures
 
-# Results
-
-This page holds the measured figures. A figure on another page names its commit, or links to this page.
-`make figures` measures them, and writes this page from what the commands printed.
-Each section names its commit, date, machine and commands. Later commits may give other figures, also because
+[Results](../results.md) shows the figures that matter most. The pages of this folder hold all of them.
+`make figures` measures them, and writes these pages from what the commands printed
+([how](../performance.md#all-figures-of-the-docs)).
+Each table names its commit, date, machine and commands. Later commits may give other figures, also because
 a scenario was changed: `git log -1 -- loadgen/scenarios/NAME.toml` shows when.
-[performance.md](performance.md), [scenarios.md](scenarios.md) and [evaluation.md](evaluation.md) explain
-what is measured.
 """
+BACK = "[All figures](README.md) lists the other pages, and says which figures are of an older commit."
 NOT_YET = "Not measured yet."
 
 
 def pages(root: Path, sections: Sequence[Section], files: Mapping[str, Measured]) -> dict[Path, str]:
     """Every page that holds figures, as it should be, by its path from the root."""
-    found = {RESULTS: results(sections, files)}
+    found = {OVERVIEW: overview(sections, files)}
+    found |= {section.path: section_page(section, files) for section in sections}
     steps = {step.name: step for section in sections for step in section.steps}
+    places = {step.name: section.path for section in sections for step in section.steps}
     for path in [*sorted((root / "docs").glob("*.md")), root / "README.md"]:
         name, text = path.relative_to(root), path.read_text()
-        if name != RESULTS and BLOCK.search(text):
-            found[name] = filled(text, name, steps, files)
+        if BLOCK.search(text):
+            found[name] = filled(text, name, steps, files, places)
     return found
 
 
-def results(sections: Sequence[Section], files: Mapping[str, Measured]) -> str:
-    """The results page."""
-    lines = [*ABOUT.splitlines(), "", *_commits(sections, files), ""]
+def overview(sections: Sequence[Section], files: Mapping[str, Measured]) -> str:
+    """The page that lists all pages of figures, and what is of which commit."""
+    lines = [WRITTEN, "", *ABOUT.splitlines(), "", "| page | holds |", "| --- | --- |"]
     for section in sections:
-        lines.append(f"- {_link(section.title)}: {', '.join(_link(step.title) for step in section.steps)}")
-    for section in sections:
-        lines += ["", f"## {section.title}", *(["", section.about] if section.about else [])]
-        for step in section.steps:
-            lines += ["", f"### {step.title}", "", *_section(step, files)]
+        steps = ", ".join(_link(step.title, section) for step in section.steps)
+        lines.append(f"| [{section.title}]({section.path.name}) | {steps} |")
+    return "\n".join([*lines, "", "## State", "", *_commits(sections, files)]) + "\n"
+
+
+def section_page(section: Section, files: Mapping[str, Measured]) -> str:
+    """The page of a section."""
+    lines = [
+        WRITTEN,
+        "",
+        f"# {section.title}",
+        "",
+        *section.about.splitlines(),
+        *([""] if section.about else []),
+    ]
+    lines.append(BACK)
+    for step in section.steps:
+        lines += ["", f"## {step.title}", "", *_section(step, files)]
     return "\n".join(lines) + "\n"
 
 
-def filled(text: str, page: Path, steps: Mapping[str, Step], files: Mapping[str, Measured]) -> str:
-    """The page with its blocks as they should be."""
+def filled(
+    text: str,
+    page: Path,
+    steps: Mapping[str, Step],
+    files: Mapping[str, Measured],
+    places: Mapping[str, Path],
+) -> str:
+    """The page with its blocks as they should be; `places` has the page of each step."""
 
     def block(found: "re.Match[str]") -> str:
-        shown = "\n".join(_block(found["what"], page, steps, files))
+        shown = "\n".join(_block(found["what"], page, steps, files, places))
         return f"<!-- figure: {found['what']} -->\n\n{shown}\n\n<!-- end -->"
 
     return BLOCK.sub(block, text)
 
 
-def _block(what: str, page: Path, steps: Mapping[str, Step], files: Mapping[str, Measured]) -> list[str]:
+def _block(
+    what: str,
+    page: Path,
+    steps: Mapping[str, Step],
+    files: Mapping[str, Measured],
+    places: Mapping[str, Path],
+) -> list[str]:
     name, *filters = (one.strip() for one in what.split("|"))
     where = {key.strip(): cells for key, cells in map(_filter, filters)}
-    shown = where.pop(SHOW, ())
+    shown, titles = where.pop(SHOW, ()), where.pop(TABLE, ())
     name, _, part = name.partition("/")
     if name not in steps or (part and part not in steps[name].parts):
         raise DataError(f"{page}: <!-- figure: {what} -->: there is no such step")
     step = steps[name]
     there = {unit: one for unit, one in _there(step, files).items() if part in ("", unit.part)}
+    link = f"{os.path.relpath(places[name], page.parent)}#{_anchor(step.title)}"
     if not there:
-        return [NOT_YET]
-    link = f"{RESULTS.name if page.parent == RESULTS.parent else RESULTS}#{_anchor(step.title)}"
+        return [f"{NOT_YET} [How it is measured]({link})."]
     conditions = [f"{line} [All figures]({link})." for line in _conditions(there)]
-    pictures = [line for unit in there for line in _pictures(unit, page.parent)]
+    some = there if part or not step.parts else {}  # a table of several parts stands alone
+    pictures = [line for unit in some for line in _pictures(unit, page.parent)]
     try:
-        return [*pictures, *_table(step, there).chosen(where, shown).lines(), "", *conditions]
+        table = _table(step, there, ", ".join(titles)).chosen(where, shown)
+        return [*pictures, *table.lines(), "", *conditions]
     except DataError as error:
         raise DataError(f"{page}: <!-- figure: {what} -->: {error}") from None
 
@@ -94,9 +132,12 @@ def _filter(text: str) -> tuple[str, list[str]]:
     return key, [cell.strip() for cell in cells.split(",")]
 
 
-def _table(step: Step, there: Mapping[Unit, Measured]) -> MarkdownTable:
-    """The table that other pages may show."""
-    return _merged(step, there) if step.merge else first_table(next(iter(there.values())).output)
+def _table(step: Step, there: Mapping[Unit, Measured], title: str) -> MarkdownTable:
+    """The table that other pages may show: the one below this heading, or the first one of each part."""
+    if step.merge:
+        return _merged(step, there)
+    outputs = [one.output for one in there.values()]
+    return table_below(title, outputs[0]) if title else stacked(outputs)
 
 
 def _merged(step: Step, there: Mapping[Unit, Measured]) -> MarkdownTable:
@@ -113,6 +154,7 @@ def _there(step: Step, files: Mapping[str, Measured]) -> dict[Unit, Measured]:
 def _commits(sections: Sequence[Section], files: Mapping[str, Measured]) -> Iterator[str]:
     """Which commit the figures are of, which ones are of another commit, and which ones are missing."""
     units = units_of(sections)
+    of = {step.name: section for section in sections for step in section.steps}
     there = [(unit, files[unit.name]) for unit in units if unit.name in files]
     if not there:
         yield "Nothing is measured yet."
@@ -132,16 +174,16 @@ def _commits(sections: Sequence[Section], files: Mapping[str, Measured]) -> Iter
     missing = [unit for unit in units if unit.name not in files]
     for why, some in (*others.items(), ("not measured yet", missing)):
         if some:
-            yield from ("", f"{why[0].upper()}{why[1:]}:", "", *(f"- {one}" for one in _named(some)))
+            yield from ("", f"{why[0].upper()}{why[1:]}:", "", *(f"- {one}" for one in _named(some, of)))
 
 
-def _named(units: Sequence[Unit]) -> Iterator[str]:
+def _named(units: Sequence[Unit], of: Mapping[str, Section]) -> Iterator[str]:
     """The sections of these measurements, with their parts if not all of them are meant."""
     for step in dict.fromkeys(unit.step.name for unit in units):
         some = [unit for unit in units if unit.step.name == step]
         one = some[0].step
         parts = "" if len(some) == len(list(one.units())) else f" ({', '.join(unit.part for unit in some)})"
-        yield f"{_link(one.title)}{parts}"
+        yield f"{_link(one.title, of[step])}{parts}"
 
 
 def _section(step: Step, files: Mapping[str, Measured]) -> Iterator[str]:
@@ -160,13 +202,13 @@ def _section(step: Step, files: Mapping[str, Measured]) -> Iterator[str]:
         return
     for unit, one in there.items():
         if unit.part:
-            yield from ("", f"#### {unit.step.title}: {unit.part}")
-        yield from ("", *_pictures(unit, RESULTS.parent), *_output(step, one))
+            yield from ("", f"### {unit.step.title}: {unit.part}")
+        yield from ("", *_pictures(unit, FOLDER), *_output(step, one))
 
 
 def _pictures(unit: Unit, folder: Path) -> Iterator[str]:
     for path in unit.copies().values():
-        yield from (f"![{unit.step.title}: {unit.part or unit.name}]({path.relative_to(folder)})", "")
+        yield from (f"![{unit.step.title}: {unit.part or unit.name}]({os.path.relpath(path, folder)})", "")
 
 
 def _commands(step: Step) -> Iterator[str]:
@@ -229,8 +271,8 @@ def _span(some: Sequence[Measured]) -> str:
     return dates[0] if dates[0] == dates[-1] else f"{dates[0]} to {dates[-1]}"
 
 
-def _link(title: str) -> str:
-    return f"[{title}](#{_anchor(title)})"
+def _link(title: str, section: Section) -> str:
+    return f"[{title}]({section.path.name}#{_anchor(title)})"
 
 
 def _anchor(title: str) -> str:

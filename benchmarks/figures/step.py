@@ -5,7 +5,6 @@
 
 import hashlib
 import json
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from offboard.common.errors import DataError, OffloadError
-from offboard.common.toml_file import unknown
+from offboard.common.toml_file import read_toml, unknown
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario, shipped
 from offboard.loadgen.simulation.simulated_testbed import check_simulated
 
@@ -24,13 +23,13 @@ PART = "{part}"  # in a command: the name of the part
 OUT = "{out}"  # in a command: the folder that belongs to the step or part
 WORK = Path("out/figures/work")
 SCENARIOS = (Path("loadgen/scenarios"), Path("loadgen/links"))
-DATASETS = ("paper", "congested", "apriltags")  # in the order of the page
+DATASETS = ("paper", "congested", "apriltags")  # in the order of their page
 SOAK = "soak"  # half an hour: `make chaos` plays it
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One section of the results page, and what measures it.
+    """One part of a page of figures, and what measures it.
 
     - `run`: commands as a user types them; what they print is shown. {out} is a folder of their
       own, and holds only what the same commands have left there at the same commit
@@ -125,30 +124,40 @@ class Unit:
 
 @dataclass(frozen=True)
 class Section:
-    """A chapter of the results page."""
+    """A page of figures: docs/figures/PAGE.md."""
 
+    page: str
     title: str
     about: str
     steps: tuple[Step, ...]
 
+    @property
+    def path(self) -> Path:
+        """Where it is, from the root of the checkout."""
+        return FOLDER / f"{self.page}.md"
+
 
 def read_sections(path: Path) -> list[Section]:
-    """The steps in the order of the page; DataError if the file is wrong."""
+    """The steps in the order of the pages; DataError if the file is wrong."""
     try:
-        tables = tomllib.loads(path.read_text())["section"]
+        tables = read_toml(path)["section"]
         sections = [
             Section(
+                one["page"],
                 one["title"],
                 one.get("about", "").strip(),
                 tuple(_step(one["title"], table) for table in one["step"]),
             )
             for one in tables
         ]
-    except (OSError, tomllib.TOMLDecodeError, KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError) as error:
         raise DataError(f"{path}: {error!r}") from None
     names = [step.name for section in sections for step in section.steps]
     if doubled := {name for name in names if names.count(name) > 1}:
         raise DataError(f"{path}: two steps are named {', '.join(sorted(doubled))}")
+    pages = [section.page for section in sections]
+    if doubled := {page for page in pages if pages.count(page) > 1}:
+        raise DataError(f"{path}: two sections have the page {', '.join(sorted(doubled))}")
     return sections
 
 

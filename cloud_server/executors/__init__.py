@@ -1,6 +1,7 @@
 """Where the tasks of a server run: the executors by name. Each is loaded when it is made."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from offboard.cloud_server.executors.executor import Executor
 
@@ -21,19 +22,10 @@ def _processes(
     return WorkerPool(workers, modules, blob_bytes_max, *memory_bytes_max)
 
 
-def _ray(
-    workers: int,
-    modules: Sequence[str],
-    blob_bytes_max: int,
-    memory_bytes_max: int,
-    *,
-    ray_address: str,
-    ray_resources: Mapping[str, float],
-) -> Executor:
+def _ray(*settings: Any, **of_ray: Any) -> Executor:
     from offboard.cloud_server.executors.ray_executor import make
 
-    limits = (blob_bytes_max, memory_bytes_max)
-    return make(workers, modules, *limits, address=ray_address, resources=ray_resources)
+    return make(*settings, **of_ray)
 
 
 EXECUTORS: dict[str, Callable[..., Executor]] = {"threads": _threads, "processes": _processes, "ray": _ray}

@@ -1,7 +1,4 @@
-"""What runs in a Ray actor: one task after the other, and meanwhile the calls that stop or measure it.
-
-`ray_worker` is the other end, in the server. This file does not import Ray, which only carries the calls.
-"""
+"""What runs in a Ray actor: one task after the other. `ray_worker` is the other end. Ray is not imported."""
 
 import faulthandler
 import os
@@ -13,15 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from offboard.cloud_server.executors.task_run import Call, Outcome, run_task, warm_kinds
-from offboard.cloud_server.executors.worker_process import bounded, full, limit_memory
+from offboard.cloud_server.executors.executor import Call, Outcome, bounded, run_task, warm_kinds
+from offboard.cloud_server.executors.worker_process import ANSWER_BYTES_MAX, full, limit_memory
 from offboard.common import VERSION, tasks
+from offboard.common.cpu_time import SELF, process_s
 from offboard.common.errors import TaskFailed, describe
-from offboard.common.host.cgroup import SELF
-from offboard.common.host.cpu_time import process_s
-from offboard.common.host.load import SERVER_EVERY_S, Load
-from offboard.common.host.load_watch import LoadWatch
-from offboard.common.source.reading import read_files_of_server
+from offboard.common.load import SERVER_EVERY_S, Load, LoadWatch
+from offboard.common.source.comparison import read_files_of_server
+from offboard.common.source.task_modules import load_modules
 from offboard.common.task_states import TaskStates
 from offboard.common.wire.blobs import StoredBlob
 
@@ -84,7 +80,7 @@ class RayActor:
         limit_memory(setup.memory_bytes_max)
         sys.path += [one for one in setup.path if one not in sys.path and Path(one).exists()]
         try:
-            tasks.load_modules(setup.modules)
+            load_modules(setup.modules)
             read_files_of_server()
             warm_kinds(self._states)
         except TaskFailed as failure:
@@ -114,7 +110,8 @@ class RayActor:
         for digest, data in zip(new, blobs, strict=True):
             self._blobs[digest] = StoredBlob(memoryview(data))
         known = {digest: self._blobs[digest] for digest in digests}
-        outcome = bounded(run_task(Call(kind, frames, known, lambda: self._stopped != number), self._states))
+        call = Call(kind, frames, known, lambda: self._stopped != number)
+        outcome = bounded(run_task(call, self._states), ANSWER_BYTES_MAX)
         outcome.frames = [bytes(frame) for frame in outcome.frames]
         self._load.hurry()  # the load during the task, not before it
         outcome.load = self._load.latest()

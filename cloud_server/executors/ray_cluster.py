@@ -1,7 +1,4 @@
-"""The Ray cluster: connects to it, starts actors on it, and calls them. Only this file imports Ray.
-
-`ray_executor` decides what runs where. Ray's own errors become ours here.
-"""
+"""Talks to the Ray cluster, and turns its errors into ours. Only this file imports Ray."""
 
 import contextlib
 import json
@@ -132,7 +129,6 @@ def call(
 
 
 def end(actor: Any) -> None:
-    """Kill an actor, with what it runs."""
     with contextlib.suppress(Exception):  # it is dead already, or its cluster is
         ray.kill(actor)
 

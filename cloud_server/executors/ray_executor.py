@@ -1,14 +1,11 @@
-"""The executor that runs tasks on the nodes of a Ray cluster.
-
-`ray_worker` keeps one actor alive; `ray_cluster` is what talks to Ray.
-"""
+"""The executor that runs tasks on a Ray cluster; `ray_worker` keeps one actor alive."""
 
 import contextlib
 import logging
 import sys
 import threading
 import time
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from queue import Empty, SimpleQueue
@@ -17,9 +14,9 @@ from typing import Any
 from offboard.cloud_server.executors.ray_actor import ActorSetup
 from offboard.cloud_server.executors.ray_cluster import RayCluster
 from offboard.cloud_server.executors.ray_worker import RayWorker
-from offboard.cloud_server.executors.task_run import Blobs, Call, Outcome
-from offboard.cloud_server.executors.worker import LOOK_S, START_S_MAX, Assignment, Died
-from offboard.common.errors import CloudBroken, ConfigError
+from offboard.cloud_server.executors.worker import LOOK_S, START_S_MAX
+from offboard.cloud_server.executors.worker_set import Assignment, Died, PinnedBlobs, WorkerSet
+from offboard.common.errors import CloudBroken, ConfigError, OffloadError
 
 PLACE_S_MAX = 30.0  # until the server starts with fewer workers, if the nodes have no room for more
 IDLE_LOOK_S = 0.1  # between two checks of the workers while no task runs
@@ -31,30 +28,27 @@ CLOSE_S_MAX = 5.0  # until the thread that owns the workers has ended
 log = logging.getLogger("offboard.cloud_server")
 
 
-class RayExecutor:
+class RayExecutor(WorkerSet[RayWorker, Any]):
     """Runs tasks in actors on the nodes of a Ray cluster, one task each at a time.
 
-    An actor that dies takes only its own task with it, and another actor takes its place. Blobs are put into
-    the object store of Ray once, and leave it when `blob_bytes_max` is exceeded. Actors that find no room
-    wait for a node to join. While the head is silent, no worker is up.
+    Another actor takes the place of one that dies. Blobs are put into the object store of Ray once, and leave
+    it when `blob_bytes_max` is exceeded. Actors that find no room wait for a node to join. While the head is
+    silent, no worker is up.
     """
 
     name = "ray"
+    no_room = "the blobs do not fit into Ray"
 
     def __init__(self, cluster: RayCluster, workers: int, setup: ActorSetup, blob_bytes_max: int) -> None:
-        self.workers = workers
+        super().__init__(
+            workers, PinnedBlobs(blob_bytes_max, lambda _, blob: cluster.put(blob), lambda _: None)
+        )
         self._cluster = cluster
-        self._objects = _Objects(cluster, blob_bytes_max)
-        self._changed: Callable[[str], None] = lambda _: None
-        self._started: Future[None] = Future()
         self._events: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._workers = [
             RayWorker(cluster, setup, post=self._events.put, free=self._free, died=self._died)
             for _ in range(workers)
         ]
-        self._lock = threading.Lock()  # protects the next two
-        self._up: set[RayWorker] = set()
-        self._idle: list[RayWorker] = []
         self._closing = threading.Event()
         self._head_at_s = self._looked_at_s = time.monotonic()
         self._headless = False
@@ -63,7 +57,7 @@ class RayExecutor:
 
     @property
     def up(self) -> int:
-        return 0 if self._headless else len(self._up)
+        return 0 if self._headless else super().up
 
     def places(self) -> dict[str, int]:
         with self._lock:
@@ -74,9 +68,8 @@ class RayExecutor:
             loads = [worker.load for worker in self._up]
         if not loads:
             return None
-        return sum(load for load, _ in loads) / len(loads), sum(capacity for _, capacity in loads) / len(
-            loads
-        )
+        load, capacity = (sum(numbers) / len(loads) for numbers in zip(*loads, strict=True))
+        return load, capacity
 
     def warm(self, changed: Callable[[str], None] = lambda _: None) -> "Future[None]":
         self._changed = changed
@@ -84,27 +77,6 @@ class RayExecutor:
         self._watch_head()
         self._thread.start()
         return self._started
-
-    def submit(self, call: Call, done: "Callable[[Future[Outcome]], None]") -> "Future[Outcome]":
-        assignment = Assignment(call)
-        try:
-            references = self._objects.pin(call.blobs)
-        except OSError as error:
-            assignment.answer.add_done_callback(done)
-            assignment.answer.set_result(Outcome("busy", f"the blobs do not fit into Ray: {error}"))
-            return assignment.answer
-        assignment.answer.add_done_callback(lambda _: self._objects.unpin(call.blobs))
-        assignment.answer.add_done_callback(done)
-        with self._lock:
-            worker = self._idle.pop() if self._idle else None
-            if worker is not None:
-                worker.give(assignment, references, self._objects.keeps)
-        if worker is None:
-            assignment.answer.set_result(Outcome("busy", "a worker died, and the next one is not ready yet"))
-        return assignment.answer
-
-    def run(self, call: Call, *, meanwhile: Callable[[], None] | None) -> None:  # noqa: ARG002
-        return None
 
     def used_s(self) -> float:
         return time.process_time() + sum(worker.used_s for worker in self._workers)
@@ -117,7 +89,7 @@ class RayExecutor:
         for worker in self._workers:
             worker.end()
             worker.abandon()
-        self._objects.clear()
+        self._blobs.clear()
         self._cluster.disconnect()
 
     def _tend(self) -> None:
@@ -164,7 +136,7 @@ class RayExecutor:
             worker.lose("head", "was lost with the head of the cluster")
         self._cluster.disconnect()
         while not self._closing.wait(HEAD_EVERY_S):
-            self._objects.clear()  # also those of a connection that failed half-way
+            self._blobs.clear()  # also those of a connection that failed half-way
             with contextlib.suppress(ConfigError):
                 self._cluster.connect()
                 break
@@ -195,71 +167,18 @@ class RayExecutor:
             if self._cluster.answers() and session == self._session:
                 self._head_at_s = time.monotonic()
 
-    def _free(self, worker: RayWorker) -> None:
-        with self._lock:
-            self._idle.append(worker)
-            known = worker in self._up
-            self._up.add(worker)
-        if not known:
-            log.info("worker %d on %s is up", worker.pid, worker.host)
-            self._changed("")
+    def _give(self, worker: RayWorker, assignment: Assignment, references: dict[bytes, Any]) -> None:
+        worker.give(assignment, references, self._blobs.keeps)
 
-    def _died(self, worker: RayWorker, death: Died) -> None:
-        with self._lock:
-            self._up.discard(worker)
-            if worker in self._idle:
-                self._idle.remove(worker)
-        if not self._started.done() and death.failure is not None:
-            self._started.set_exception(death.failure)
-            return
+    def _came_up(self, worker: RayWorker) -> None:
+        log.info("worker %d on %s is up", worker.pid, worker.host)
+
+    def _start_failure(self, death: Died) -> OffloadError | None:
+        return death.failure
+
+    def _log_death(self, worker: RayWorker, death: Died) -> None:
         text = "worker %d on %s %s; another one takes its place; remedy: look at its task, limits and node"
         log.warning(text, worker.pid, worker.host or "the Ray cluster", death)
-        self._changed(death.reason)
-
-
-class _Objects:
-    """The blobs in the object store of Ray, each put once.
-
-    Beyond `bytes_max` the least recently used leave, but none that a worker may still read.
-    """
-
-    def __init__(self, cluster: RayCluster, bytes_max: int) -> None:
-        self._cluster = cluster
-        self._bytes_max = bytes_max
-        self._references: OrderedDict[bytes, tuple[Any, int]] = OrderedDict()  # with their sizes
-        self._byte_count = 0
-        self._pins: Counter[bytes] = Counter()
-        self._lock = threading.Lock()
-
-    def pin(self, blobs: Blobs) -> dict[bytes, Any]:
-        """The references of these blobs, which are kept until `unpin`."""
-        with self._lock:
-            for digest, blob in blobs.items():
-                if digest not in self._references:
-                    self._references[digest] = self._cluster.put(blob), blob.data.nbytes
-                    self._byte_count += blob.data.nbytes
-                self._references.move_to_end(digest)
-            self._pins.update(blobs.keys())
-            self._trim()
-            return {digest: self._references[digest][0] for digest in blobs}
-
-    def unpin(self, blobs: Blobs) -> None:
-        with self._lock:
-            self._pins -= Counter(blobs.keys())
-
-    def keeps(self, digest: bytes) -> bool:
-        return digest in self._references
-
-    def clear(self) -> None:
-        with self._lock:
-            self._references.clear()
-            self._byte_count = 0
-
-    def _trim(self) -> None:
-        for digest in [one for one in self._references if not self._pins[one]]:
-            if self._byte_count <= self._bytes_max:
-                return
-            self._byte_count -= self._references.pop(digest)[1]
 
 
 def make(
@@ -268,11 +187,11 @@ def make(
     blob_bytes_max: int,
     memory_bytes_max: int,
     *,
-    address: str,
-    resources: Mapping[str, float],
+    ray_address: str,
+    ray_resources: Mapping[str, float],
 ) -> RayExecutor:
-    """Connect to the cluster at `address`. ConfigError if no actor could ever start there."""
-    cluster = RayCluster(address, resources)
+    """Connect to the cluster at `ray_address`. ConfigError if no actor could ever start there."""
+    cluster = RayCluster(ray_address, ray_resources)
     cluster.connect()
     try:
         cluster.check_resources()

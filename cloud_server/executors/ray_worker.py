@@ -14,10 +14,11 @@ from functools import partial
 from typing import Any
 
 from offboard.cloud_server.executors import ray_cluster
+from offboard.cloud_server.executors.executor import Outcome
 from offboard.cloud_server.executors.ray_actor import NOTHING, ActorSetup, Measured, Ran, Started
 from offboard.cloud_server.executors.ray_cluster import RayCluster
-from offboard.cloud_server.executors.task_run import Outcome
-from offboard.cloud_server.executors.worker import FAILED_PAUSE_S, OVERTIME_S, Assignment, Died
+from offboard.cloud_server.executors.worker import FAILED_PAUSE_S, OVERTIME_S
+from offboard.cloud_server.executors.worker_set import Assignment, Died
 from offboard.common import VERSION, tasks
 from offboard.common.errors import ConfigError, TaskFailed, describe
 

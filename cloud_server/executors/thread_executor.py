@@ -2,23 +2,21 @@
 
 import contextlib
 import threading
-import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from functools import partial
 from queue import Empty, SimpleQueue
 
-from offboard.cloud_server.executors.executor import THIS_COMPUTER
-from offboard.cloud_server.executors.task_run import Call, Outcome, run_task, warm_kinds
+from offboard.cloud_server.executors.executor import Call, Executor, Outcome, run_task, warm_kinds
+from offboard.common.task_call import join_all
 from offboard.common.task_states import TaskStates
-from offboard.common.threads import join_all
 
 # To wait for threads whose tasks are abandoned. This may be short: `--drain-s` was the time for those tasks,
 # and if some still run, `cloud-server` ends without the teardown in which native code could crash.
 CLOSE_WAIT_S = 1.0
 
 
-class ThreadExecutor:
+class ThreadExecutor(Executor):
     """Runs tasks in threads of this process: for tasks that release the interpreter lock.
 
     A task that crashes takes the server with it, and a task that never ends takes a thread.
@@ -27,7 +25,7 @@ class ThreadExecutor:
     name = "threads"
 
     def __init__(self, workers: int) -> None:
-        self.workers = self.up = workers
+        self.workers = workers
         self._states = TaskStates(workers)
         self._calls: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._threads = [
@@ -48,19 +46,10 @@ class ThreadExecutor:
         self._calls.put(lambda: outcome.set_result(run_task(call, self._states)))
         return outcome
 
-    def places(self) -> dict[str, int]:
-        return {THIS_COMPUTER: self.up}
-
-    def load(self) -> None:
-        return None
-
     def run(self, call: Call, *, meanwhile: Callable[[], None] | None) -> Outcome | None:
         if meanwhile is not None:
             self._calls.put(meanwhile)
         return run_task(call, self._states)
-
-    def used_s(self) -> float:
-        return time.process_time()
 
     def close(self) -> None:
         with contextlib.suppress(Empty):

@@ -18,16 +18,15 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future
-from dataclasses import dataclass, field
 from typing import Any, NoReturn
 
 import msgpack
 
-from offboard.cloud_server.executors.task_run import Call, Outcome
+from offboard.cloud_server.executors.executor import Call, Outcome
 from offboard.cloud_server.executors.worker_process import CHUNK_BYTES, STOPS, Setup, new_unpacker
-from offboard.common.errors import OffloadError, TaskFailed, describe
-from offboard.common.wanted import always
+from offboard.cloud_server.executors.worker_set import Assignment, Died
+from offboard.common.errors import TaskFailed, describe
+from offboard.common.task_call import always
 
 START_S_MAX = 300.0  # until a worker is ready, compilation included
 RESTART_PAUSE_S = 1.0  # at least, between two starts of one worker
@@ -39,37 +38,6 @@ LEAVE_S_MAX = 2.0  # until an idle process has ended by itself
 END_S_MAX = 5.0  # until a process has ended that was killed or has closed its pipe
 # Signals that others send: the kernel if memory is short, or an operator.
 FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Assignment:
-    """A call for a worker, and the future of its answer, which never holds an exception."""
-
-    call: Call
-    answer: "Future[Outcome]" = field(default_factory=Future)
-
-
-class Died(Exception):
-    """A worker process has ended, or must be ended.
-
-    `reason` is one word. `outcome` is the outcome of its task, if the task ended before the process did.
-    `failure`: why the process could not start, for example what a task raised when it was prepared.
-    """
-
-    def __init__(
-        self,
-        reason: str,
-        text: str,
-        *,
-        server_fault: bool = False,
-        outcome: Outcome | None = None,
-        failure: OffloadError | None = None,
-    ) -> None:
-        super().__init__(text)
-        self.reason = reason
-        self.server_fault = server_fault
-        self.outcome = outcome
-        self.failure = failure
 
 
 class Worker:

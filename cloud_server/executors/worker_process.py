@@ -1,7 +1,4 @@
-"""What runs in a worker process: one task after the other, within a limit of memory.
-
-`worker` is the other end of the pipe, in the server.
-"""
+"""What runs in a worker process: one task after the other. `worker` is the other end of the pipe."""
 
 import ctypes
 import faulthandler
@@ -13,27 +10,24 @@ import socket
 import sys
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import msgpack
 
-from offboard.cloud_server.executors.task_run import Call, Outcome, run_task, warm_kinds
-from offboard.common import tasks
+from offboard.cloud_server.executors.executor import Call, Outcome, bounded, run_task, warm_kinds
 from offboard.common.errors import TaskFailed, describe
+from offboard.common.source.task_modules import load_modules
 from offboard.common.task_states import TaskStates
 from offboard.common.wire.blobs import BlobStore, StoredBlob
-from offboard.common.wire.messages import ERROR_LENGTH_MAX, byte_count
 
 CHUNK_BYTES = 1 << 16
 ANSWER_BYTES_MAX = (1 << 31) - (1 << 20)  # no message is larger
 PR_SET_PDEATHSIG = 1
-STOPS = (
-    signal.SIGINT,
-    signal.SIGTERM,
-)  # Ctrl-C, and some service managers, reach all processes of the server
+# Ctrl-C, and some service managers, reach all processes of the server.
+STOPS = (signal.SIGINT, signal.SIGTERM)
 # Prepared in advance, for the case that no memory is left to build an answer.
 NOTHING_LEFT: bytes = msgpack.packb(
     ["failed", "MemoryError: too little memory is left for an answer", 0.0, None, [], True, False, "", True]
@@ -67,7 +61,7 @@ def work(parent: int, pipe_fd: int, flag: int, setup: Setup) -> None:
     pipe, stop = socket.socket(fileno=pipe_fd), mmap.mmap(flag, 1)
     states = TaskStates(workers=1)
     try:
-        tasks.load_modules(setup.modules)
+        load_modules(setup.modules)
         warm_kinds(states)
     except TaskFailed as failure:
         pipe.sendall(msgpack.packb([str(failure), failure.traceback], unicode_errors="replace"))
@@ -102,7 +96,6 @@ def limit_memory(bytes_max: int) -> None:
 
 
 def _receive(pipe: socket.socket) -> Any | None:
-    """The next message; None if the pipe is closed."""
     unpacker = new_unpacker()
     while data := pipe.recv(CHUNK_BYTES):
         unpacker.feed(data)
@@ -141,21 +134,11 @@ def _blob(store: BlobStore, folder: Path, digest: bytes) -> StoredBlob:
 
 
 def _message(outcome: Outcome) -> bytes:
-    kept, outcome = full(outcome.error), bounded(outcome)
+    kept, outcome = full(outcome.error), bounded(outcome, ANSWER_BYTES_MAX)
     fields = [outcome.status, outcome.error, outcome.run_s, outcome.cpu_s, outcome.frames]
     fields += [outcome.server_fault, outcome.crashed, outcome.traceback]
     message: bytes = msgpack.packb([*fields, kept], unicode_errors="replace")
     return message
-
-
-def bounded(outcome: Outcome) -> Outcome:
-    """The same outcome, or one that says that its result is too large."""
-    size = byte_count(outcome.frames)
-    if size > ANSWER_BYTES_MAX:
-        error = f"BadValue: the result takes {size} bytes, at most {ANSWER_BYTES_MAX} are allowed"
-        outcome = replace(outcome, status="failed", error=error, frames=[], server_fault=True, traceback="")
-    outcome.error = outcome.error[:ERROR_LENGTH_MAX]
-    return outcome
 
 
 def full(error: str) -> bool:

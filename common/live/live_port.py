@@ -18,10 +18,11 @@ from offboard.common.errors import ConfigError, MissingExtra
 from offboard.common.live.live_files import LIVE, LOOKS, PATHS, page_file
 from offboard.common.live.look import EVERY_S, Source, Viewers, encode
 from offboard.common.security.address import address as host_and_port
-from offboard.common.security.exposure import on_loopback
+from offboard.common.security.address import on_loopback
 from offboard.common.security.http_guard import HEADERS, PAGE_CSP, from_foreign_page
 
 STALL_S = 10.0  # a client that neither sends nor reads for this long is left
+WAITING_MAX = 64  # connections not yet accepted; a browser opens six, and one too many waits a second
 
 
 class LivePort:
@@ -52,9 +53,8 @@ class LivePort:
 
 
 class _Server(ThreadingHTTPServer):
-    """Has a thread for each connection."""
-
     daemon_threads = True
+    request_queue_size = WAITING_MAX
 
     def __init__(self, address: tuple[str, int], source: Source, registry: CollectorRegistry | None) -> None:
         self.address_family = AF_INET6 if ":" in address[0] else AF_INET
@@ -73,8 +73,6 @@ class _Server(ThreadingHTTPServer):
 
 
 class _Handler(MetricsHandler):
-    """One request."""
-
     server: _Server
     timeout = STALL_S
 

@@ -1,7 +1,4 @@
-"""Compiled kernels on whole grids: blocking the discs of hits, inflation, and connected components.
-
-The searches themselves are in `dijkstra`, `a_star` and `jump_points`.
-"""
+"""Compiled kernels on whole grids: blocking the discs of hits, inflation, and connected components."""
 
 from typing import Any
 

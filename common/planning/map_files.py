@@ -1,7 +1,4 @@
-"""Reads map files: a ROS map.yaml with its image, as nav2's map_server does, or a MovingAI `.map`.
-
-`maps` says what a grid is.
-"""
+"""Reads map files: a ROS map.yaml with its image, as nav2's map_server does, or a MovingAI `.map`."""
 
 import logging
 import math

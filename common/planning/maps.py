@@ -1,7 +1,4 @@
-"""Occupancy grids: cells and metres, passable cells, the paper's input size, and finer grids.
-
-`map_files` reads grids from files; `planner` plans on them.
-"""
+"""Occupancy grids: cells and metres, passable cells, the paper's input size, and finer grids."""
 
 import math
 from dataclasses import dataclass
@@ -10,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.common.errors import DataError
-from offboard.common.planning import grid_kernels
+from offboard.common.planning.grid_kernels import inflate, largest_component
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100
 CELLS_MAX = 2**26  # 67 million: 410 m x 410 m at 0.05 m
@@ -85,17 +82,12 @@ def passable(grid: GridMap, radius_m: float = 0.0) -> NDArray[np.bool_]:
     known = grid.cells >= FREE
     if radius_m <= 0:
         return known & (grid.cells < OCCUPIED)
-    return known & ~grid_kernels.inflate(grid.cells >= OCCUPIED, in_cells(grid, radius_m))
+    return known & ~inflate(grid.cells >= OCCUPIED, in_cells(grid, radius_m))
 
 
 def in_cells(grid: GridMap, radius_m: float) -> float:
     """The radius in cells. The small addition keeps 3 cells at 3: in floats, 0.3 / 0.1 is below 3."""
     return radius_m / grid.resolution + 1e-6
-
-
-def largest_component(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The largest connected part of the passable cells. A robot that cuts no corners reaches all of it."""
-    return grid_kernels.largest_component(cells)
 
 
 def free_pairs(grid: GridMap, count: int, seed: int, radius_m: float = 0.0) -> NDArray[np.int32]:

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.common.planning import search
+from offboard.common.planning import DIJKSTRA, check_planner, search
 from offboard.common.planning.maps import CELLS_MAX, GridMap, in_cells, passable, path_size
-from offboard.common.planning.planner_names import DIJKSTRA, check_planner
 from offboard.common.tasks import task
 
 RADIUS_M = 0.2
@@ -158,13 +157,12 @@ def _prepared(grid: GridMap, radius_m: float) -> search.Field:
         if key not in _fields:
             _fields[key] = (weakref.ref(grid.cells), search.Field(passable(grid, radius_m)))
         _fields.move_to_end(key)
-        while len(_fields) > PREPARED_MAX or (len(_fields) > 1 and _prepared_cells() > PREPARED_CELLS_MAX):
+        while len(_fields) > 1 and (
+            len(_fields) > PREPARED_MAX
+            or sum(field.size for _, field in _fields.values()) > PREPARED_CELLS_MAX
+        ):
             _fields.popitem(last=False)
         return _fields[key][1]
-
-
-def _prepared_cells() -> int:
-    return sum(field.size for _, field in _fields.values())
 
 
 def _check(

@@ -1,10 +1,8 @@
-"""The arrays of one search at a time, and the steps around the kernels of Dijkstra's algorithm.
-
-`informed_workspaces` adds A* and jump point search; `search` lends workspaces to threads.
-"""
+"""Input, result and arrays of one search, and the steps around the kernels of Dijkstra's algorithm."""
 
 import math
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,9 +22,9 @@ from offboard.common.planning.dijkstra import (
     flood_weighted,
 )
 from offboard.common.planning.grid_kernels import load, stamp
-from offboard.common.planning.route import Cell, Hits, Route, no_route
-from offboard.common.wanted import check_wanted
+from offboard.common.task_call import check_wanted
 
+Cell = tuple[int, int]  # row, column
 # Factor of entering a cell of cost 0 to 252, as NavFn weighs it; 253 and above are blocked.
 FACTORS = (50.0 + 0.8 * np.arange(256)) / 50.0
 # Rounded to 32 binary places (1e-10), sums of moves are exact in any order, so that equal paths tie.
@@ -34,14 +32,45 @@ FACTORS = (50.0 + 0.8 * np.arange(256)) / 50.0
 MOVES = np.round(np.stack((FACTORS, FACTORS * math.sqrt(2))) * 2.0**32) / 2.0**32
 
 
+@dataclass(frozen=True, slots=True)
+class Hits:
+    """Cells that a scan saw occupied. The robot cannot be within `reach` cells of them."""
+
+    rows: NDArray[np.int64]
+    cols: NDArray[np.int64]
+    reach: NDArray[np.float64]
+
+
+NO_HITS = Hits(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float64))
+
+
+@dataclass(frozen=True, slots=True)
+class Route:
+    """A path over cells, or the reason why there is none.
+
+    `cells` are (row, column) from start to goal; they are empty unless `status` is NONE. `cost` is in cells.
+    """
+
+    status: str
+    cells: NDArray[np.int32]
+    cost: float
+    expanded: int
+
+
+def no_route(status: str, expanded: int = 0) -> Route:
+    return Route(status, np.zeros((0, 2), np.int32), 0.0, expanded)
+
+
 class Workspace(ABC):
     """The arrays that one search needs besides the map."""
 
-    _width: np.uint64
     _distance: NDArray[Any]
     _buckets: NDArray[np.uint32]
     _counts: NDArray[Any]
     _state: NDArray[np.int64]  # `_state[1]` is the number of expanded cells
+
+    def __init__(self, template: NDArray[np.uint32], width: int) -> None:
+        self._template, self._width = template, np.uint64(width)
 
     def _search(self, source: np.uint64, target: np.uint64) -> int:
         """Run the kernel to its end. At each pause the task may stop, if nobody waits for it any more."""
@@ -70,7 +99,7 @@ class PlainWorkspace(Workspace):
     """
 
     def __init__(self, template: NDArray[np.uint32], width: int) -> None:
-        self._template, self._width = template, np.uint64(width)
+        super().__init__(template, width)
         self._distance = template.copy()
         self._buckets = np.zeros((3, first_capacity(template, width)), np.uint32)
         self._state = np.zeros(8, np.int64)
@@ -134,7 +163,7 @@ class WeightedWorkspace(Workspace):
     """
 
     def __init__(self, template: NDArray[np.uint32], width: int) -> None:
-        self._template, self._width = template, np.uint64(width)
+        super().__init__(template, width)
         self._distance = np.zeros(template.size, np.float64)
         self._costs = np.zeros(template.size, np.uint8)
         self._buckets = np.zeros((WHEEL, first_capacity(template, width)), np.uint32)

@@ -1,7 +1,4 @@
-"""HTTP connections with limits: how long one may take, and how many are open.
-
-`http_guard` decides which requests are answered.
-"""
+"""HTTP connections with limits: how long one may take, and how many are open."""
 
 import asyncio
 from typing import Any
@@ -30,7 +27,8 @@ class BoundedHttp(H11Protocol):
         super().connection_made(transport)
         self._limit_time()
         if len(self.connections) > CONNECTIONS_MAX:
-            self._most_silent().end()
+            ours = (one for one in self.connections if isinstance(one, BoundedHttp))
+            min(ours, key=lambda one: one._since).end()  # that with the oldest last request
 
     def connection_lost(self, exc: Exception | None) -> None:
         if self._limit is not None:
@@ -66,8 +64,3 @@ class BoundedHttp(H11Protocol):
         if self._limit is not None:
             self._limit.cancel()
         self._limit = self.loop.call_later(REQUEST_S, self.end)
-
-    def _most_silent(self) -> "BoundedHttp":
-        """The connection with the oldest last request."""
-        ours = (one for one in self.connections if isinstance(one, BoundedHttp))
-        return min(ours, key=lambda one: one._since)

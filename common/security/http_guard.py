@@ -1,7 +1,4 @@
-"""HTTP middleware: asks for the token, refuses foreign web pages, and adds security headers.
-
-`bounded_http` limits the connections themselves.
-"""
+"""HTTP middleware: asks for the token, refuses foreign web pages, and adds security headers."""
 
 import hmac
 import json
@@ -9,18 +6,14 @@ from collections.abc import Awaitable, Callable, Collection
 from typing import Any
 from urllib.parse import urlsplit
 
-from offboard.common.security.exposure import on_loopback
+from offboard.common.security.address import on_loopback
 
 _CSP = "default-src 'none'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
 # Of our own pages. The library for charts sets styles inline, and makes pictures from data.
 PAGE_CSP = (
     f"{_CSP}; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; connect-src 'self'"
 )
-HEADERS = {
-    "x-content-type-options": "nosniff",
-    "x-frame-options": "DENY",
-    "referrer-policy": "no-referrer",
-}
+HEADERS = {"x-content-type-options": "nosniff", "x-frame-options": "DENY", "referrer-policy": "no-referrer"}
 _NO_CACHE = (b"cache-control", b"no-store")
 
 Message = dict[str, Any]

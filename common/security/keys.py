@@ -1,8 +1,4 @@
-"""Makes, reads and checks the key files of robots and servers (CurveZMQ).
-
-The files have the format of `zmq.auth.certs`, so other tools can read them. Which robots a server accepts is
-decided in the server.
-"""
+"""Makes, reads and checks the key files of robots and servers, in the format of `zmq.auth.certs`."""
 
 import argparse
 import contextlib
@@ -11,7 +7,7 @@ import re
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from pathlib import Path
 
 import zmq
@@ -20,13 +16,14 @@ from zmq.utils import z85
 from offboard.common.command_line import CommandParser, add_flags
 from offboard.common.config import resolve, setting
 from offboard.common.errors import ConfigError
-from offboard.common.security.private_files import PRIVATE_BYTES_MAX, read_private
+from offboard.common.security.plain_files import PRIVATE_BYTES_MAX, read_private
 
-PUBLIC, PRIVATE = ".key", ".key_secret"
+PUBLIC, PRIVATE, TOKEN = ".key", ".key_secret", ".token"
 SERVER, ROBOT = "server", "robot"  # names of the key files
 ITEMS = ("public-key", "secret-key")
 
 _KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
+_TOKEN = re.compile(r"[!-~]+( [!-~]+)?")  # a scheme may come before it
 _BANNERS = {
     PUBLIC: "#   ZeroMQ CURVE public certificate: may be copied, but must not be changed.",
     PRIVATE: "#   ZeroMQ CURVE **secret** certificate: do not share it, and keep its mode at 0600.",
@@ -95,7 +92,6 @@ def make_keys(folder: Path, name: str) -> tuple[Path, Path]:
 
 
 def server_keys(folder: Path) -> KeyPair:
-    """The keys in the folder of a server's --keys."""
     return _read_pair("--keys", folder / f"{SERVER}{PRIVATE}")
 
 
@@ -114,6 +110,17 @@ def robot_keys(folder: Path, site: str, server: bytes | None = None) -> RobotKey
     if server == own.public:
         raise ConfigError(f"{path}: this is the robot's own key; copy the server's {SERVER}{PUBLIC} here")
     return RobotKeys(own, server)
+
+
+def policy_token(folder: Path | None, site: str) -> str | None:
+    """What a policy server wants to see: the text of SITE.token, a private file; None: nothing."""
+    path = None if folder is None else folder / f"{site}{TOKEN}"
+    if path is None or not path.exists():
+        return None
+    token = read_private("keys", path).strip()
+    if not _TOKEN.fullmatch(token):
+        raise ConfigError(f"keys: {path} must hold one token: printable letters in one line")
+    return token
 
 
 def read_public(path: Path) -> bytes:
@@ -181,7 +188,8 @@ def checked_key(where: str, text: str) -> bytes:
 
 def _write(path: Path, mode: int, public_key: bytes, secret_key: bytes | None = None) -> None:
     """Write a new file that has its mode from the start."""
-    lines = [_BANNERS[path.suffix], f"#   Made {datetime.now(UTC):%Y-%m-%d %H:%M} UTC by Offboard", ""]
+    made = datetime.now(timezone.utc)
+    lines = [_BANNERS[path.suffix], f"#   Made {made:%Y-%m-%d %H:%M} UTC by Offboard", ""]
     lines += ["metadata", "curve", f'    public-key = "{public_key.decode()}"']
     if secret_key is not None:
         lines.append(f'    secret-key = "{secret_key.decode()}"')

@@ -1,15 +1,25 @@
 """Whether a server may take a task of this robot: the hashes of its `hello` against those here.
 
-`source_hash` says what a hash covers.
+Covered files are read on a robot at the first use of a task, on a server at its start. What no hash covers is
+said in words: above all the helpers that a task calls in its own module.
 """
 
-from collections.abc import Mapping
+import dis
+import inspect
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from types import CodeType
+from typing import Any
 
 from offboard.common import VERSION
-from offboard.common.source.source_hash import HASH_LENGTH
-from offboard.common.tasks import Kind
+from offboard.common.source.covers import HASH_LENGTH, CoveredFiles
+from offboard.common.source.normal_form import function_of
+from offboard.common.tasks import Kind, kind_of, kinds
+from offboard.common.variants import ONBOARD
 
 SOFTWARE_SHOWN = 40  # characters of the version of the other side
+HELPERS_SHOWN = 20
+LOADS = frozenset({"LOAD_GLOBAL", "LOAD_NAME"})
 
 
 def difference(kind: Kind, site: str, there: Mapping[str, str], software: str = VERSION) -> str | None:
@@ -77,3 +87,114 @@ def _other_files(one: Kind, known: str) -> str | None:
         which = names[0] if len(names) == 1 else f"one of the files {', '.join(names)}"
         return f"{which}, which {one.name} covers, differs on the server"
     return None
+
+
+def kind_in_use(function: Callable[..., Any]) -> Kind:
+    """The kind of a function that a robot uses now: a thread begins to read the files that it covers.
+
+    UnknownTask if the function is not registered, ConfigError if a file is missing.
+    """
+    kind = kind_of(function)
+    if kind.variants or kind.covers.files is not None:
+        for files, needed in _on_robot(kind):
+            files.begin(needed=needed)
+    return kind
+
+
+def is_reading(kind: Kind) -> bool:
+    """Whether files that the kind or one of its variants covers are being read."""
+    return any(files.reading for files, _ in _on_robot(kind))
+
+
+def read_files_of_robot(kind: Kind) -> None:
+    """Read the files that the kind covers, and wait until that is done. ConfigError if one is missing."""
+    for files, needed in _on_robot(kind):
+        files.read(needed=needed)
+
+
+def read_files_of_server() -> None:
+    """Read the files that all tasks of a server cover. ConfigError if one is missing."""
+    for kind in kinds():
+        for one in (kind, *kind.on_servers()):
+            if one.covers.files is not None:
+                one.covers.files.read()
+
+
+def _on_robot(kind: Kind) -> Iterator[tuple[CoveredFiles, bool]]:
+    """The files of the kind and of its variants, and whether a robot needs them."""
+    if kind.covers.files is not None:
+        yield kind.covers.files, True
+    for site, one in kind.variants.items():
+        if one.covers.files is not None and one.present:
+            yield one.covers.files, site == ONBOARD
+
+
+def not_compared(chosen: Sequence[Kind]) -> str:
+    """What a comparison of these kinds on a robot leaves out."""
+    helpers = uncovered(chosen)
+    more = f" and {len(helpers) - HELPERS_SHOWN} more" if len(helpers) > HELPERS_SHOWN else ""
+    called = f"{', '.join(helpers[:HELPERS_SHOWN])}{more} (called, but in no covers=); " if helpers else ""
+    variants = [one for kind in chosen for one in kind.variants.values()]
+    lacking = [one.name for one in variants if one.covers.files is not None and one.covers.files.lacking]
+    files = f"{', '.join(lacking)} (its files are not on this robot); " if lacking else ""
+    return f"{called}{files}constants, other modules, libraries, and files in no covers="
+
+
+def uncovered(chosen: Iterable[Kind]) -> list[str]:
+    """Each function and class that one of these kinds calls and does not cover, once, as MODULE.NAME.
+
+    Helpers of other modules, and those that are called through an attribute, are not found.
+    """
+    found = {name: None for kind in chosen for name in _uncovered(kind)}
+    return list(found)
+
+
+def _uncovered(kind: Kind) -> Iterator[str]:
+    module = function_of(kind.function).__module__
+    parts = [
+        part
+        for one in (kind, *kind.variants.values())
+        for part in (one.function, one.setup, one.pack, one.unpack, *one.types, *one.covers.code)
+    ]
+    todo = [function_of(one) for one in parts if one is not None]
+    seen = set(map(id, todo))
+    compared = {id(function_of(one.function)) for one in kinds()}  # they have hashes of their own
+    while todo:
+        for one in _called(todo.pop()):
+            if id(one) in seen or id(one) in compared or getattr(one, "__module__", None) != module:
+                continue
+            seen.add(id(one))
+            todo.append(one)
+            yield f"{module}.{one.__qualname__}"
+
+
+def _called(of: Any) -> Iterator[Any]:
+    """The functions and classes that the code of a function or class names."""
+    for function in _functions(of):
+        for name in _names(function.__code__):
+            try:
+                one = function_of(function.__globals__.get(name))
+            except Exception:  # noqa: BLE001 - an object of the user that answers to every attribute
+                continue
+            if inspect.isclass(one) or inspect.isfunction(one):
+                yield one
+
+
+def _functions(of: Any) -> Iterator[Any]:
+    if inspect.isfunction(of) or inspect.ismethod(of):
+        yield of
+    elif inspect.isclass(of) and of.__module__ in sys.modules:
+        for member in vars(of).values():
+            inner = getattr(member, "fget", None) or function_of(member)
+            if inspect.isfunction(inner):
+                yield inner
+
+
+def _names(code: CodeType) -> Iterator[str]:
+    """The global names that code reads, also in functions within it."""
+    for one in dis.get_instructions(code):
+        if one.opname in LOADS:
+            yield str(one.argval)
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _names(constant)

@@ -1,6 +1,6 @@
 """The source of a function or class in a form in which comments, docstrings and formatting do not count.
 
-The form is the same on every Python from 3.11 on; only the standard library is imported, so that a test can
+The form is the same on every Python from 3.10 on; only the standard library is imported, so that a test can
 load this file with each of them. `source_hash` makes a hash of it.
 """
 
@@ -32,7 +32,8 @@ def normal_form(of: Any) -> str:
     elif (code := of.__code__).co_name == "<lambda>":
         found = [one for one in _statements(tree) if _has_lambda(one, code.co_firstlineno)]
     else:
-        found = [one for name, one in _definitions(tree) if name == code.co_qualname]
+        qualified = getattr(code, "co_qualname", of.__qualname__)  # Python 3.10 has no co_qualname
+        found = [one for name, one in _definitions(tree) if name == qualified]
     return "\n".join(map(_form, found))
 
 

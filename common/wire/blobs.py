@@ -1,7 +1,4 @@
-"""Blobs, which are large arguments named by their SHA-256: digests, a bounded store, and array views.
-
-`values` decides which arguments become blobs.
-"""
+"""Blobs, which are large arguments named by their SHA-256: digests, a bounded store, and array views."""
 
 import hashlib
 import math
@@ -64,14 +61,10 @@ class BlobStore:
             self._owned[owner] += byte_length(data)
             self.byte_count += byte_length(data)
         while self.byte_count > self.bytes_max:
-            self._drop(self._dispensable(digest))
+            owned = self._owned - Counter({owner: byte_length(data)})  # this blob does not count
+            heaviest = max(owned, key=owned.__getitem__)
+            self._drop(next(one for one in self._blobs if self._owners[one] == heaviest and one != digest))
         return digest
-
-    def _dispensable(self, kept: bytes) -> bytes:
-        """The oldest blob of the owner with the most bytes; `kept` does not count."""
-        owned = self._owned - Counter({self._owners[kept]: self._blobs[kept].data.nbytes})
-        heaviest = max(owned, key=owned.__getitem__)
-        return next(one for one in self._blobs if self._owners[one] == heaviest and one != kept)
 
     def _drop(self, digest: bytes) -> None:
         count, owner = self._blobs.pop(digest).data.nbytes, self._owners.pop(digest)
@@ -90,7 +83,6 @@ class BlobStore:
         return len(self._blobs)
 
     def bytes_of(self, owner: bytes) -> int:
-        """The bytes of the blobs of one owner."""
         return self._owned[owner]
 
 

@@ -96,9 +96,7 @@ class Channel:
 
     def wake(self) -> None:
         """End the current `wait`, or else the next one. Any thread may call this at any time."""
-        with contextlib.suppress(
-            OSError
-        ):  # if full, the reader is awake already; if closed, there is no reader
+        with contextlib.suppress(OSError):  # full: the reader is awake already; closed: there is none
             self._waker.send(b"\0")
 
     def close(self) -> None:
@@ -148,5 +146,4 @@ def check_room(where: str) -> None:
 
 
 def readable(of: "zmq.Socket[bytes]") -> bool:
-    """True if there is a message."""
     return bool(int(of.getsockopt(zmq.EVENTS)) & _POLLIN)

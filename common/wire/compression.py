@@ -1,7 +1,6 @@
 """Compresses large arguments with Zstandard, and refuses compressed bytes that are not what they announce.
 
-Python 3.14 has the library; for older versions `backports.zstd` is the same code. Which arguments are worth
-it is decided in `robot_client`.
+Python 3.14 has the library; for older versions `backports.zstd` is the same code.
 """
 
 import sys

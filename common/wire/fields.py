@@ -1,7 +1,4 @@
-"""Checks the fields of a message header, which may come from anyone.
-
-`messages` says which fields a message has.
-"""
+"""Checks the fields of a message header, which may come from anyone."""
 
 import math
 from typing import Any

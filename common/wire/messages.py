@@ -1,7 +1,6 @@
 """The messages between robot and server, version 1: a small msgpack header, then raw frames.
 
 Frame 0 is `[VERSION, type, fields]`. A reader ignores unknown fields, so version 1 can get more of them.
-Arguments and results are encoded in `values`; this module offers its main names too.
 """
 
 import dataclasses
@@ -12,41 +11,14 @@ from typing import get_args
 import msgpack
 
 from offboard.common.errors import BadValue, ProtocolError
+from offboard.common.task_call import TRACEBACK_LENGTH_MAX, bounded
 from offboard.common.tasks import NAME_LENGTH_MAX
-from offboard.common.tracebacks import TRACEBACK_LENGTH_MAX, bounded
 from offboard.common.wire.blobs import BlobStore, Buffer, StoredBlob
 from offboard.common.wire.fields import IDLE, TEXT_LENGTH_MAX, Fields
-from offboard.common.wire.values import (
-    ARRAYS_MAX,
-    BLOB_BYTES_MIN,
-    Body,
-    decode,
-    encode,
-    unpack_bounded,
-)
+from offboard.common.wire.values import ARRAYS_MAX, BLOB_BYTES_MIN, Body, decode, encode, unpack_bounded
 
-__all__ = [
-    "BLOB_BYTES_MIN",
-    "VERSION",
-    "Blob",
-    "BlobStore",
-    "Body",
-    "Buffer",
-    "Cancel",
-    "Hello",
-    "Message",
-    "Ping",
-    "Pong",
-    "Reply",
-    "Request",
-    "StoredBlob",
-    "VersionMismatch",
-    "byte_count",
-    "decode",
-    "encode",
-    "pack",
-    "unpack",
-]
+# What is defined elsewhere: a message holds encoded values, and the store their large arguments.
+__all__ = ["BLOB_BYTES_MIN", "BlobStore", "Body", "Buffer", "StoredBlob", "decode", "encode"]
 
 VERSION = 1
 HEADER_BYTES_MAX = 64 * 1024
@@ -197,25 +169,18 @@ def unpack(frames: Sequence[Buffer]) -> Message:
         raise VersionMismatch(f"the other side speaks wire version {header[0]}, this side {VERSION}")
     if len(header) != 3 or not isinstance(header[1], str) or not isinstance(header[2], dict):
         raise ProtocolError("header is not [version, type, fields]")
-    read = _READERS.get(header[1])
+    name, rest = header[1], list(frames[1:])
+    read = _READERS.get(name)
     if read is None:
-        raise ProtocolError(f"unknown message type {header[1]!r:.80}")
-    return read(Fields(header[1], header[2]), list(frames[1:]))
+        raise ProtocolError(f"unknown message type {name!r:.80}")
+    if len(rest) != _FRAMES.get(name, len(rest)):
+        raise ProtocolError(f"{name} with {len(rest)} frames after the header; it must have {_FRAMES[name]}")
+    return read(Fields(name, header[2]), rest)
 
 
 def byte_count(frames: Iterable[Buffer]) -> int:
     """The bytes in all frames, without the headers of the transport."""
     return sum([f.nbytes if isinstance(f, memoryview) else len(f) for f in frames])
-
-
-def _hello(fields: Fields, rest: list[Buffer]) -> Hello:
-    _frame_count("hello", rest, 0)
-    return Hello(
-        fields.tasks("tasks"),
-        fields.text("software", TEXT_LENGTH_MAX),
-        fields.whole("message_bytes_max", 1, COUNT_MAX),
-        fields.words("compressions"),
-    )
 
 
 def _request(fields: Fields, rest: list[Buffer]) -> Request:
@@ -252,32 +217,6 @@ def _reply(fields: Fields, rest: list[Buffer]) -> Reply:
     )
 
 
-def _ping(fields: Fields, rest: list[Buffer]) -> Ping:
-    _frame_count("ping", rest, 0)
-    return Ping(fields.whole("id", 0, ID_MAX))
-
-
-def _pong(fields: Fields, rest: list[Buffer]) -> Pong:
-    _frame_count("pong", rest, 0)
-    queue = fields.whole("queue_depth", 0, COUNT_MAX)
-    return Pong(fields.whole("id", 0, ID_MAX), queue, fields.share("load"), fields.share("capacity"))
-
-
-def _cancel(fields: Fields, rest: list[Buffer]) -> Cancel:
-    _frame_count("cancel", rest, 0)
-    return Cancel(fields.whole("id", 0, ID_MAX))
-
-
-def _blob(fields: Fields, rest: list[Buffer]) -> Blob:
-    _frame_count("blob", rest, 1)
-    return Blob(rest[0], fields.whole("size", 1, COUNT_MAX) if "size" in fields.values else None)
-
-
-def _frame_count(name: str, rest: list[Buffer], wanted: int) -> None:
-    if len(rest) != wanted:
-        raise ProtocolError(f"{name} with {len(rest)} frames after the header; it must have {wanted}")
-
-
 _RAW = ("body", "data")  # fields that follow the header as frames
 # Fields that are not sent while they have this value.
 _OPTIONAL: dict[str, object] = {**IDLE, "cpu_s": None, "traceback": "", "compressions": (), "size": None}
@@ -290,12 +229,25 @@ _FIELDS: dict[type, tuple[str, list[str], list[tuple[str, object]]]] = {
     )
     for kind, names in _NAMES.items()
 }
+_FRAMES = {"hello": 0, "ping": 0, "pong": 0, "cancel": 0, "blob": 1}  # after the header; others: any number
 _READERS: dict[str, Callable[[Fields, list[Buffer]], Message]] = {
-    "hello": _hello,
+    "hello": lambda fields, _: Hello(
+        fields.tasks("tasks"),
+        fields.text("software", TEXT_LENGTH_MAX),
+        fields.whole("message_bytes_max", 1, COUNT_MAX),
+        fields.words("compressions"),
+    ),
     "request": _request,
     "reply": _reply,
-    "ping": _ping,
-    "pong": _pong,
-    "cancel": _cancel,
-    "blob": _blob,
+    "ping": lambda fields, _: Ping(fields.whole("id", 0, ID_MAX)),
+    "pong": lambda fields, _: Pong(
+        queue_depth=fields.whole("queue_depth", 0, COUNT_MAX),
+        id=fields.whole("id", 0, ID_MAX),
+        load=fields.share("load"),
+        capacity=fields.share("capacity"),
+    ),
+    "cancel": lambda fields, _: Cancel(fields.whole("id", 0, ID_MAX)),
+    "blob": lambda fields, rest: Blob(
+        rest[0], fields.whole("size", 1, COUNT_MAX) if "size" in fields.values else None
+    ),
 }

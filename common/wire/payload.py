@@ -1,7 +1,4 @@
-"""Estimates how many bytes a value takes in a message, without encoding it.
-
-A prediction needs the bytes before it is decided whether the value is sent at all. `values` encodes it.
-"""
+"""Estimates how many bytes a value takes in a message, before it is decided whether the value is sent."""
 
 import contextlib
 import dataclasses

@@ -1,7 +1,4 @@
-"""Encodes arguments and results: msgpack, raw buffers of arrays, and blobs named by their SHA-256.
-
-`messages` puts the encoded frames into requests and replies.
-"""
+"""Encodes arguments and results: msgpack, raw buffers of arrays, and blobs named by their SHA-256."""
 
 import contextlib
 import hashlib
@@ -84,7 +81,10 @@ def encode(
     except _TooManyItems as error:  # no part of the value is to blame
         raise BadValue(f"{name or 'the value'} has {error}") from None
     except BadValue as error:
-        place = name + _shortened(_place_of_bad(value, encoder, 0))
+        place = _place_of_bad(value, encoder, 0)
+        if len(place) > PLACE_LENGTH_MAX:
+            place = place[: PLACE_LENGTH_MAX - 3] + "..."
+        place = name + place
         raise BadValue(f"{place}: {error}" if place else str(error)) from error
     if len(main) > VALUE_BYTES_MAX:
         raise BadValue(
@@ -125,12 +125,7 @@ class _Encoder:
     """Turns a value into a tree for msgpack, and collects the frames of arrays and the blobs."""
 
     def __init__(
-        self,
-        types: Sequence[type],
-        *,
-        use_blobs: bool,
-        along: _Along,
-        array_bytes_max: int,
+        self, types: Sequence[type], *, use_blobs: bool, along: _Along, array_bytes_max: int
     ) -> None:
         self.types = types
         self.use_blobs = use_blobs
@@ -260,10 +255,6 @@ def _parts(value: Any, types: Sequence[type], depth: int) -> Iterator[tuple[str,
     elif kind in types:
         with contextlib.suppress(BadValue):
             yield from ((f".{name}", one, depth + DATACLASS_LEVELS) for name, one in fields_of(value).items())
-
-
-def _shortened(place: str) -> str:
-    return place if len(place) <= PLACE_LENGTH_MAX else place[: PLACE_LENGTH_MAX - 3] + "..."
 
 
 class _Decoder:

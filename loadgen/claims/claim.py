@@ -1,4 +1,4 @@
-"""One claim of the paper next to our figure, and the rule that says whether they agree.
+"""One claim of the paper next to our figure, the rule that says whether they agree, and the settings for it.
 
 The figures are computed in the other files of this folder.
 """
@@ -9,15 +9,56 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from offboard.common.text.wording import rounded
-from offboard.loadgen.table.confidence_intervals import Blocks, Picks
+from offboard.common.config import check, part_of, setting
+from offboard.common.wording import rounded
+from offboard.loadgen import rivals
+from offboard.loadgen.table.confidence_intervals import Blocks, Picks, block_length
 from offboard.loadgen.table.measured_rows import Column
 from offboard.loadgen.table.table_formats import UNDEFINED, Heading
+from offboard.loadgen.table.table_settings import ALL, FULL_WINDOW, RowsConfig, TableConfig
+from offboard.robot_client.predictors import LEAST_SQUARES
 
 YES, NO, UNCLEAR = "yes", "no", "unclear"
 BLOCKS_MIN = 5  # in a resample; resamples of fewer blocks hardly differ from each other
 DIGITS, INTERVAL_DIGITS = 4, 3  # of the figures in Markdown and LaTeX
 ROUNDING = 1e-9  # a bound this near to a limit is at the limit: sums of a thousand rows are not exact
+
+
+@dataclass(frozen=True)
+class ClaimsConfig(RowsConfig):
+    """With which windows and predictors the claims are checked."""
+
+    windows: tuple[str, ...] = setting(
+        ("10", "50", "100", FULL_WINDOW),
+        "window lengths N; full: fit on the first 80 % of the rows, scored on the rest",
+        metavar="N,N,..",
+    )
+    predictors: tuple[str, ...] = setting(
+        (ALL,),
+        f"predictors to compare with {LEAST_SQUARES}: {rivals.PREDICTOR_HELP}; or {ALL}",
+        metavar="NAME,NAME,..",
+    )
+
+    def __post_init__(self) -> None:
+        check(self)
+        self.of_table()
+
+    def of_table(self) -> TableConfig:
+        """The settings with which `loadgen table` scores the same predictors."""
+        return part_of(TableConfig, self)
+
+    def lengths(self) -> tuple[int, ...]:
+        """The windows that are a number of rows, shortest first."""
+        return tuple(sorted({int(window) for window in self.windows if window != FULL_WINDOW}))
+
+    def rivals(self) -> tuple[str, ...]:
+        """The predictors that least squares is compared with."""
+        return tuple(name for name in self.of_table().names() if name != LEAST_SQUARES)
+
+    def blocks(self, rows: int, *, overlap: int = 1) -> Blocks:
+        """The resamples of this many values; neighbours within `overlap` share rows, and a block."""
+        length = max(overlap, self.block or (block_length(rows) if rows else 1))
+        return Blocks(rows, length=length, seed=self.seed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +168,6 @@ def claim(
 
 
 def unknown(number: int, words: str, why: str) -> Claim:
-    """A line without a figure."""
     return replace(claim(number, words, Figure(None), note=why), agrees=UNDEFINED)
 
 
@@ -143,12 +183,10 @@ def bootstrapped(blocks: Blocks, figure: Callable[[Picks], Column]) -> Figure:
         return Figure(None)
     if blocks.rows < BLOCKS_MIN * blocks.length:
         return Figure(value)
-    low, high = blocks.intervals(lambda picks: {"it": figure(picks)})
-    return Figure(value, low.get("it"), high.get("it"))
+    return Figure(value, *blocks.interval(figure))
 
 
 def mean_of(blocks: Blocks, values: Column) -> Figure:
-    """The mean of one value for each row."""
     return bootstrapped(blocks, lambda picks: values[picks].mean(-1))
 
 

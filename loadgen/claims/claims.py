@@ -8,13 +8,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from offboard.loadgen.claims.claim import HEADINGS, Claim
-from offboard.loadgen.claims.claims_settings import ClaimsConfig
+from offboard.loadgen.claims.claim import HEADINGS, Claim, ClaimsConfig
 from offboard.loadgen.claims.computing_time import ROUNDS, computing_time
-from offboard.loadgen.claims.prediction_claims import K_MEANS, RIVALS, PredictionClaims
-from offboard.loadgen.claims.sample_order import sample_order
-from offboard.loadgen.claims.several_inputs import Inputs, read_inputs, several_inputs
-from offboard.loadgen.claims.significance import significance
+from offboard.loadgen.claims.correlation_claims import sample_order, significance
+from offboard.loadgen.claims.prediction_claims import (
+    K_MEANS,
+    RIVALS,
+    Inputs,
+    PredictionClaims,
+    read_inputs,
+    several_inputs,
+)
 from offboard.loadgen.progress import Progress, progress
 from offboard.loadgen.table.measured_rows import Rows
 from offboard.loadgen.table.measurement_notes import read_noted
@@ -38,16 +42,15 @@ def run_claims(paths: Sequence[Path], config: ClaimsConfig) -> int:
     read = [(path, read_noted(path, config.kind), read_inputs(path)) for path in paths]
     with progress("claims", len(paths) * _steps(config)) as shown:
         tables = [_table(path, rows, claims(rows, inputs, config, shown)) for path, rows, inputs in read]
-    sys.stdout.write(ColumnSettings().text(tables, config.format))
+    sys.stdout.write(ColumnSettings(format=config.format).text(tables))
     return 0
 
 
 def _table(path: Path, rows: Rows, found: Iterator[Claim]) -> Table:
     lines = [replace(one, more=MORE.get(one.number, "docs/claims.md").format(file=path)) for one in found]
-    left_out = f" ({rows.left_out} tasks without both times left out)" if rows.left_out else ""
     return Table(
-        caption=f"{path}: {len(rows)} rows{left_out}. The numbers are those of the claims in docs/claims.md.",
-        about={"source": str(path), "rows": len(rows), "left_out": rows.left_out},
+        caption=f"{path}: {rows.counted()}. The numbers are those of the claims in docs/claims.md.",
+        about=rows.about(path),
         headings=HEADINGS,
         lines=lines,
         notes=(

@@ -3,12 +3,10 @@
 import statistics
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 
 from offboard.common.errors import MissingExtra
 from offboard.loadgen import rivals
-from offboard.loadgen.claims.claim import ABOVE_ONE, Claim, Figure, claim, unknown
-from offboard.loadgen.claims.claims_settings import ClaimsConfig
+from offboard.loadgen.claims.claim import ABOVE_ONE, Claim, ClaimsConfig, Figure, claim, unknown
 from offboard.loadgen.table.measured_rows import Rows
 from offboard.robot_client.predictors import LEAST_SQUARES, Model
 from offboard.robot_client.predictors.base import Call, Run
@@ -17,15 +15,8 @@ from offboard.robot_client.predictors.plain import model_of
 CLAIM = 6
 # The median of six rounds lies between the least and the greatest with a probability of 1 - 2 / 2^6 = 97 %.
 ROUNDS = 6
+TRAINING, PREDICTION = "training", "prediction"
 CLAIMED = ("lstm", "lstm-sequence")  # the paper compares itself only with an LSTM
-
-
-@dataclass
-class Times:
-    """The seconds of one predictor in each round: all training, and one prediction."""
-
-    training_s: list[float] = field(default_factory=list)
-    prediction_s: list[float] = field(default_factory=list)
 
 
 def computing_time(
@@ -43,30 +34,30 @@ def computing_time(
         yield unknown(CLAIM, "computing time", "not enough rows")
         return
     times, missing = measured(rows, split, config, step)
-    line = times.pop(LEAST_SQUARES)
-    yield claim(CLAIM, f"{LEAST_SQUARES}: training, ms", _median([1e3 * s for s in line.training_s]))
-    yield claim(CLAIM, f"{LEAST_SQUARES}: prediction, ms", _median([1e3 * s for s in line.prediction_s]))
+    line = times[LEAST_SQUARES]
+    for part, taken_s in line.items():
+        yield claim(CLAIM, f"{LEAST_SQUARES}: {part}, ms", _median([1e3 * one for one in taken_s]))
     for name in config.rivals():
         if name in missing:
             yield unknown(CLAIM, f"{name}: times", missing[name])
             continue
         theirs, claimed = ("> 1", ABOVE_ONE) if name in CLAIMED else (None, None)
-        for words, own, base in (
-            ("training", times[name].training_s, line.training_s),
-            ("prediction", times[name].prediction_s, line.prediction_s),
-        ):
-            if not all(base):
-                yield unknown(CLAIM, f"{words}, {name}", "the CPU clock is too coarse")
+        for part, taken_s in times[name].items():
+            if not all(line[part]):
+                yield unknown(CLAIM, f"{part}, {name}", "the CPU clock is too coarse")
                 continue
-            ratios = [one / other for one, other in zip(own, base, strict=True)]
-            yield claim(CLAIM, f"{words}, {name}", _median(ratios), theirs=theirs, claimed=claimed)
+            ratios = [one / other for one, other in zip(taken_s, line[part], strict=True)]
+            yield claim(CLAIM, f"{part}, {name}", _median(ratios), theirs=theirs, claimed=claimed)
 
 
 def measured(
     rows: Rows, split: int, config: ClaimsConfig, step: Callable[[], object]
-) -> tuple[dict[str, Times], dict[str, str]]:
-    """The times of each predictor, and why the others could not be made. The first round does not count."""
-    times: dict[str, Times] = {}
+) -> tuple[dict[str, dict[str, list[float]]], dict[str, str]]:
+    """The seconds of each predictor in each round, for all training and for one prediction.
+
+    Also why the others could not be made. The first round does not count.
+    """
+    times: dict[str, dict[str, list[float]]] = {}
     missing: dict[str, str] = {}
     for turn in range(ROUNDS + 1):
         for name in (LEAST_SQUARES, *config.rivals()):
@@ -79,10 +70,10 @@ def measured(
                 continue
             training_s, prediction_s = _timed(model, rows, split)
             if turn:
-                times[name].training_s.append(training_s)
-                times[name].prediction_s.append(prediction_s)
+                times[name][TRAINING].append(training_s)
+                times[name][PREDICTION].append(prediction_s)
             else:
-                times[name] = Times()
+                times[name] = {TRAINING: [], PREDICTION: []}
         step()
     return times, missing
 

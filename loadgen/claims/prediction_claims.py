@@ -1,7 +1,12 @@
-"""Claims 3, 4, 5, 8 and 9: errors and accuracy of least squares, its rivals, and the time that it saves."""
+"""Claims 3, 4, 5, 7, 8 and 9: errors and accuracy of least squares, its rivals, and the time that it saves.
 
-from collections.abc import Iterator
+Claim 7 is that least squares also takes several inputs (n-dimensional regression), if the dataset has them.
+Only what is known before a task is an input: what is measured of its site, and the bytes that it sends.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 
@@ -11,30 +16,33 @@ from offboard.loadgen.claims.claim import (
     POSITIVE,
     Claim,
     Claimed,
+    ClaimsConfig,
     Figure,
     claim,
     mean_of,
     ratio,
     unknown,
 )
-from offboard.loadgen.claims.claims_settings import ClaimsConfig
-from offboard.loadgen.table import published_table_two
-from offboard.loadgen.table.measured_rows import Column, Rows
-from offboard.loadgen.table.predictor_evaluation import Evaluation, predict
+from offboard.loadgen.replay.dataset_file import FEATURES
+from offboard.loadgen.table.measured_rows import Column, Rows, is_csv, number, read_cells
 from offboard.loadgen.table.table_settings import CHOSEN, FULL, FULL_WINDOW
-from offboard.loadgen.table.table_two_figures import Score, Scored
+from offboard.loadgen.table.table_two import Evaluation, predict
+from offboard.loadgen.table.table_two_figures import LSTM_PERCENT, PUBLISHED, Score, Scored, Sides
 from offboard.robot_client.predictors import LEAST_SQUARES
+from offboard.robot_client.predictors.least_squares import LeastSquares
 from offboard.robot_client.predictors.window import WINDOW
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
-ERROR, ACCURACY, RIVALS, K_MEANS, SAVING = 3, 4, 5, 8, 9  # the claims
+ERROR, ACCURACY, RIVALS, INPUTS, K_MEANS, SAVING = 3, 4, 5, 7, 8, 9  # the claims
 ERROR_FROM = 41  # rows: the paper's claim is about N > 40
 ERROR_MAX = 2.0  # per cent
+RESIDUAL, MAE = "residual", "MAE"
 ENOUGH = "not enough rows"
 SITES = (CLOUD, ONBOARD)
-PUBLISHED = {score.window: score for score in published_table_two.SCORES}
-RIVAL_PERCENTS = {"lstm": published_table_two.LSTM_PERCENT, "lstm-sequence": published_table_two.LSTM_PERCENT}
+RIVAL_PERCENTS = {"lstm": LSTM_PERCENT, "lstm-sequence": LSTM_PERCENT}
 FOLLOWING = ("lstm-sequence",)  # predict from the rows just before, so they see those after the split, too
+
+Inputs = Mapping[str, Sequence[float | None]]  # the values of each column; None: an empty cell
 
 
 class PredictionClaims:
@@ -51,9 +59,9 @@ class PredictionClaims:
             if length < ERROR_FROM:
                 continue
             for feedback in (CHOSEN, FULL):
-                yield from self._residuals(length, feedback)
+                yield from self._errors(RESIDUAL, length, feedback)
         for feedback in (CHOSEN, FULL):
-            yield from self._mean_errors(feedback)
+            yield from self._errors(MAE, WINDOW, feedback)
 
     def accuracy(self) -> Iterator[Claim]:
         """The accuracy for each N, and how much it rises from each N to the next one."""
@@ -66,7 +74,7 @@ class PredictionClaims:
             if scored is None:
                 yield unknown(ACCURACY, words, ENOUGH)
                 continue
-            ours = mean_of(self._config.blocks(len(scored.to_cloud)), 100.0 * right(scored))
+            ours = mean_of(self._config.blocks(len(scored.to_cloud)), np.where(scored.right, 100.0, 0.0))
             claimed = None if theirs is None else Claimed(low=theirs)
             yield claim(ACCURACY, words, ours, theirs=theirs, claimed=claimed)
         for earlier, later in pairwise(windows):
@@ -100,41 +108,31 @@ class PredictionClaims:
         if scored is None:
             yield unknown(SAVING, "time", ENOUGH)
             return
-        spent_s = np.where(scored.to_cloud, scored.cloud_s, scored.onboard_s)
-        blocks = self._config.blocks(len(spent_s))
+        blocks = self._config.blocks(len(scored.to_cloud))
         for words, other_s, claimed in (
             ("time / always onboard", scored.onboard_s, BELOW_ONE),
             ("time / always cloud", scored.cloud_s, BELOW_ONE),
-            ("time / oracle", np.minimum(scored.onboard_s, scored.cloud_s), None),
+            ("time / oracle", scored.best_s, None),
         ):
             theirs = None if claimed is None else "< 1"
-            ours = ratio(blocks, spent_s, other_s)
+            ours = ratio(blocks, scored.spent_s, other_s)
             yield claim(SAVING, f"{words}, N = {WINDOW}", ours, theirs=theirs, claimed=claimed)
 
-    def _residuals(self, length: int, feedback: str) -> Iterator[Claim]:
+    def _errors(self, measure: str, length: int, feedback: str) -> Iterator[Claim]:
         scored = self._scored(str(length), feedback=feedback)
         for site in SITES:
-            words = f"{site} residual %, N = {length}, {feedback}"
+            words = f"{site} {measure} %, N = {length}, {feedback}"
             if scored is None:
                 yield unknown(ERROR, words, ENOUGH)
                 continue
             error_s, true_s = errors_of(scored, site)
+            theirs, claimed = None, Claimed(high=ERROR_MAX)
+            if measure == MAE:
+                error_s = abs(error_s)
+            else:
+                theirs, claimed = _published_residual(length, site), Claimed(-ERROR_MAX, ERROR_MAX)
             ours = ratio(self._config.blocks(len(true_s)), error_s, true_s).times(100)
-            score = _published(str(length))
-            residual_s, mean_s = getattr(score, f"{site}_residual_s"), getattr(score, f"{site}_s")
-            theirs = None if residual_s is None else 100 * residual_s / mean_s
-            yield claim(ERROR, words, ours, theirs=theirs, claimed=Claimed(-ERROR_MAX, ERROR_MAX))
-
-    def _mean_errors(self, feedback: str) -> Iterator[Claim]:
-        scored = self._scored(str(WINDOW), feedback=feedback)
-        for site in SITES:
-            words = f"{site} MAE %, N = {WINDOW}, {feedback}"
-            if scored is None:
-                yield unknown(ERROR, words, ENOUGH)
-                continue
-            error_s, true_s = errors_of(scored, site)
-            ours = ratio(self._config.blocks(len(true_s)), abs(error_s), true_s).times(100)
-            yield claim(ERROR, words, ours, claimed=Claimed(high=ERROR_MAX))
+            yield claim(ERROR, words, ours, theirs=theirs, claimed=claimed)
 
     def _scored(self, window: str, name: str = LEAST_SQUARES, feedback: str = CHOSEN) -> Scored | None:
         return self._evaluation.predictions(name, window, feedback)
@@ -142,24 +140,85 @@ class PredictionClaims:
     def _following(self, name: str) -> Scored:
         """As `full`, but both sites go on to learn; it is not fitted again before the rows end."""
         length = len(self._rows) * 4 // 5
-        p_onboard, p_cloud = predict(
-            self._rows, length, predictor=name, feedback=FULL, seed=self._config.seed
-        )
-        rows = self._rows.since(length)
-        return Scored(rows.onboard_s, rows.cloud_s, p_cloud < p_onboard)
+        predicted = predict(self._rows, length, predictor=name, feedback=FULL, seed=self._config.seed)
+        return Scored.predicted(self._rows.since(length), *predicted)
 
     def _gain(self, one: Scored, other: Scored) -> Figure:
         """The accuracy of `one` minus that of `other`, in points, on the rows that both scored."""
         count = min(len(one.to_cloud), len(other.to_cloud))
-        gain = 100.0 * (right(one)[-count:] - right(other)[-count:])
-        return mean_of(self._config.blocks(count), gain)
+        return mean_of(self._config.blocks(count), _points(one.right[-count:], other.right[-count:]))
 
 
-def right(scored: Scored) -> Column:
-    """1 for each row that went to the faster site, otherwise 0. On a tie, either site is right."""
-    chosen_s = np.where(scored.to_cloud, scored.cloud_s, scored.onboard_s)
-    found: Column = (chosen_s == np.minimum(scored.cloud_s, scored.onboard_s)).astype(np.float64)
+def several_inputs(read: Inputs | None, rows: Rows, config: ClaimsConfig) -> Iterator[Claim]:
+    """All inputs against the size alone, at 80:20: accuracy in points, and the ratio of the mean errors."""
+    split = len(rows) * 4 // 5
+    inputs = {
+        name: _filled(values)
+        for name, values in (read or {}).items()
+        if any(one is not None for one in values[:split])
+    }
+    if read is None:
+        why = "only a dataset has inputs: loadgen export RUN --csv FILE"
+    elif not 2 <= split < len(rows):
+        why = ENOUGH
+    else:
+        why = "" if inputs else "only sizes are known in the first 80 % of the rows"
+    if why:
+        yield unknown(INPUTS, "several inputs", why)
+        return
+    alone, several = _predicted(rows, split, {}), _predicted(rows, split, inputs)
+    blocks = config.blocks(len(rows) - split)
+    gain = mean_of(blocks, _points(several.right, alone.right))
+    names = ", ".join(inputs)
+    yield claim(INPUTS, "several inputs: accuracy points", gain, note=f"the size and {names}")
+    for site in SITES:
+        if any(name in inputs for name in of_site(site)):
+            (error_s, _), (alone_s, _) = errors_of(several, site), errors_of(alone, site)
+            ours = ratio(blocks, abs(error_s), abs(alone_s))
+            yield claim(INPUTS, f"several inputs: {site} MAE, ratio", ours)
+
+
+def read_inputs(path: Path) -> Inputs | None:
+    """The columns of a dataset that are known before a task; None: it is a trace."""
+    if not is_csv(path):
+        return None
+    names = [name for site in SITES for name in of_site(site)]
+    found: dict[str, list[float | None]] = {}
+    for where, cells in read_cells(path, names):
+        for name in filter(cells.__contains__, names):
+            text = cells[name].strip()
+            found.setdefault(name, []).append(number(where, name, text) if text else None)
     return found
+
+
+def of_site(site: str) -> tuple[str, ...]:
+    """The columns that may be inputs for the time of one site."""
+    sent = (f"{site}_send_bytes",) if site != ONBOARD else ()
+    return (*(f"{site}.{name}" for name in FEATURES[site]), *sent)
+
+
+def _predicted(rows: Rows, split: int, inputs: Mapping[str, Column]) -> Scored:
+    """The rows after the split, predicted by least squares on the rows before it."""
+    predicted = {}
+    for site in SITES:
+        columns = [rows.size, *(inputs[name] for name in of_site(site) if name in inputs)]
+        sizes = list(zip(*(column.tolist() for column in columns), strict=True))
+        line = LeastSquares(split)
+        for size, seconds in zip(sizes[:split], getattr(rows, f"{site}_s").tolist(), strict=False):
+            line.learn(size, seconds)
+        found = [line.predict(size) for size in sizes[split:]]
+        predicted[site] = np.array([one.seconds for one in found if one is not None])
+    return Scored.predicted(rows.since(split), predicted[ONBOARD], predicted[CLOUD])
+
+
+def _filled(values: Sequence[float | None]) -> Column:
+    """Each unknown value is the one before; at the start, the first known one."""
+    last = next(one for one in values if one is not None)
+    filled = []
+    for one in values:
+        last = last if one is None else one
+        filled.append(last)
+    return np.array(filled)
 
 
 def errors_of(scored: Scored, site: str) -> tuple[Column, Column]:
@@ -169,6 +228,19 @@ def errors_of(scored: Scored, site: str) -> tuple[Column, Column]:
     return predicted_s - true_s, true_s
 
 
+def _points(right: Sides, others: Sides) -> Column:
+    """How many points of accuracy each row brings: 100, 0 or -100."""
+    found: Column = 100.0 * (right.astype(np.float64) - others)
+    return found
+
+
 def _published(window: str) -> Score:
     """The line of the paper; an empty one if it has none."""
     return PUBLISHED.get(window, Score(LEAST_SQUARES, window))
+
+
+def _published_residual(length: int, site: str) -> float | None:
+    """In per cent of the mean time."""
+    score = _published(str(length))
+    residual_s, mean_s = getattr(score, f"{site}_residual_s"), getattr(score, f"{site}_s")
+    return None if residual_s is None else 100 * residual_s / mean_s

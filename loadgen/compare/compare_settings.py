@@ -1,25 +1,29 @@
 """The settings of `loadgen compare`, and the policy names that it accepts."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError
 from offboard.loadgen import rivals
-from offboard.loadgen.compare.resume import PLAYS_MAX
 from offboard.loadgen.play.play_scenario import TESTBEDS
-from offboard.loadgen.table.table_columns import ColumnSettings
-from offboard.loadgen.table.table_formats import FORMATS
+from offboard.loadgen.policy_name import split_objective
+from offboard.loadgen.scenario.outcome import Outcome
+from offboard.loadgen.scenario.scenario import Scenario
+from offboard.loadgen.table.table_columns import ColumnSettings, FormatSettings
 from offboard.robot_client import policies
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 SEEDS_MAX = 1000
+PLAYS_MAX = 5  # attempts to play one run while the host takes too much CPU time
 JOBS_MAX = 256
 SIMULATION = "simulation"
 CONSTANTS = (ONBOARD, CLOUD)  # the policies that always choose one site; the better one is the divisor
 NAMES = "NAME,NAME,.."
 POLICIES = (
-    f"policies to play: {rivals.POLICY_HELP}; POLICY@PREDICTOR uses another predictor than its own,"
+    f"policies to play: {policies.HELP}; POLICY@PREDICTOR uses another predictor than its own,"
     " and POLICY+OBJECTIVE, such as default+mean, decides by another objective than the scenario's"
 )
 OUT = (
@@ -29,7 +33,7 @@ OUT = (
 
 
 @dataclass(frozen=True)
-class RunsConfig:
+class RunsConfig(FormatSettings):
     """The settings that `compare` and `checks` share: which runs are played, and where."""
 
     policies: tuple[str, ...] = setting((policies.ALIAS,), POLICIES, metavar=NAMES)
@@ -43,17 +47,13 @@ class RunsConfig:
         "local", "where to play: in local processes or in Docker containers", choices=tuple(TESTBEDS)
     )
     out: Path = setting(Path("out/checks"), OUT, metavar="DIR")
-    format: str = setting("md", "output format", choices=FORMATS)
     simulate: bool = setting(
         False,
         "simulate the runs: virtual time and modelled sites, no processes are started; checks that need real"
         " processes are left out",
     )
     jobs: int | None = setting(
-        None,
-        "with --simulate: number of processes (default: one for each CPU)",
-        minimum=1,
-        maximum=JOBS_MAX,
+        None, "with --simulate: number of processes (default: one for each CPU)", minimum=1, maximum=JOBS_MAX
     )
 
     def __post_init__(self) -> None:
@@ -73,6 +73,23 @@ class RunsConfig:
     def where(self) -> str:
         """The testbed that tables name."""
         return SIMULATION if self.simulate else self.testbed
+
+    @property
+    def place(self) -> str:
+        """The same in a sentence."""
+        return f"in {SIMULATION}" if self.simulate else f"on the {self.testbed} testbed"
+
+    @property
+    def count_of_seeds(self) -> str:
+        return "1 seed" if self.seeds == 1 else f"{self.seeds} seeds"
+
+    def seeded(self, scenario: Scenario) -> list[Scenario]:
+        return [scenario.changed(seed=scenario.seed + n) for n in range(self.seeds)]
+
+    def strategies(self) -> dict[str, dict[str, Any]]:
+        """What each policy changes of a scenario, as arguments of `Scenario.changed`."""
+        keys = ("policy", "predictor")
+        return {name: dict(zip(keys, split_strategy(name), strict=True)) for name in self.policies}
 
 
 @dataclass(frozen=True)
@@ -99,10 +116,7 @@ class CompareConfig(ColumnSettings, RunsConfig):
         metavar="FOLDER",
     )
     rate: float | None = setting(
-        None,
-        "with --recordings: tasks per second, instead of one at a time",
-        rare=True,
-        minimum=0.001,
+        None, "with --recordings: tasks per second, instead of one at a time", rare=True, minimum=0.001
     )
     from_task: int = setting(0, "first task that counts, for example the first one after warm-up", minimum=0)
     stolen_max: float | None = setting(
@@ -126,6 +140,11 @@ class CompareConfig(ColumnSettings, RunsConfig):
             named = ",".join(self.policies)
             raise ConfigError(f"--policies: {named}: --recordings needs {ONBOARD} and {CLOUD} among them")
 
+    def counted(self, scenario: Scenario, runs: Mapping[str, Sequence[Outcome]]) -> dict[str, list[Outcome]]:
+        """The outcomes by policy, only with the tasks that count."""
+        robots = scenario.compared()
+        return {name: [run.of(robots).between(self.from_task) for run in of] for name, of in runs.items()}
+
 
 def split_strategy(name: str) -> tuple[str, str | None]:
     """The policy, with its objective if one is named, and the predictor of POLICY+OBJECTIVE@PREDICTOR.
@@ -133,7 +152,7 @@ def split_strategy(name: str) -> tuple[str, str | None]:
     None: the predictor that the policy brings.
     """
     policy, at, predictor = name.partition("@")
-    rivals.policy(rivals.split_objective(policy, "--policies")[0], "--policies")
+    split_objective(policy, "--policies")
     if at:
         rivals.predictor(predictor, "--policies")
     return policy, predictor if at else None

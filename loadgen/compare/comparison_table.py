@@ -1,108 +1,29 @@
 """The table of a comparison: one line of figures for each policy, with 95 % intervals.
 
-It starts from the outcomes of the runs; `compare` plays them, `simulated_tables` simulates them.
-The sentence below the table is in `comparison_in_words`.
+`compare` plays or simulates the runs; `comparison_line` puts the result into one sentence.
 """
 
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from offboard.loadgen.compare.compare_settings import CONSTANTS, SIMULATION, CompareConfig
-from offboard.loadgen.compare.comparison_in_words import in_words
-from offboard.loadgen.compare.machine_speed import at_one_speed, speed_slope
+from offboard.loadgen.compare.compare_settings import CONSTANTS, CompareConfig
+from offboard.loadgen.compare.comparison_line import BY_COST, COST, FIRST, HEADINGS, Line, in_words
 from offboard.loadgen.progress import progress
 from offboard.loadgen.scenario.interval_coverage import interval_columns, interval_figures
-from offboard.loadgen.scenario.outage_recovery import median_recovery
-from offboard.loadgen.scenario.outcome import Answered, Outcome
+from offboard.loadgen.scenario.outcome import Answered, Costing, Outcome
 from offboard.loadgen.scenario.scenario import Scenario
-from offboard.loadgen.scenario.task_cost import Costing
+from offboard.loadgen.scenario.site_shares import median_recovery
 from offboard.loadgen.table.confidence_intervals import BOUNDS, Blocks, Picks, percentiles
 from offboard.loadgen.table.measured_rows import Column
-from offboard.loadgen.table.table_formats import Heading, Table
-from offboard.loadgen.table.table_two_figures import known_mean, quantile
+from offboard.loadgen.table.table_formats import Table
+from offboard.loadgen.table.table_two_figures import divided, known_mean, plain, quantile
 from offboard.robot_client.policies.objectives import MEAN
 from offboard.robot_client.sites.runner import CLOUD
 
-
-@dataclass(frozen=True, slots=True)
-class Line:
-    """The figures of one policy over the tasks of all its runs; None: undefined.
-
-    - `cost`: what the scenario's objective makes small, per task; `quality`: of the variants that answered
-    - `cost_over_constant`, `over_constant`: cost and mean time, over those of the better one of the policies
-      `onboard` and `cloud`, on the same tasks; the better one has the lower cost
-    - `server_over_constant`: the same for the server's own run time, on tasks that both sent to the cloud
-    - `at_one_speed`: `over_constant` without the difference in machine speed (`machine_speed`)
-    - `recovery`: number of tasks until recovery from an outage
-    - `coverage_percent`, `relative_width`, `width_over_constant`: of the prediction intervals
-    - `time_over_oracle`, `regret_ms`: over the `referenced` tasks, which also ran on each site alone
-    """
-
-    policy: str
-    bound: str = ""
-    tasks: int = 0
-    lost: int | None = None
-    mean_ms: float | None = None
-    over_constant: float | None = None
-    at_one_speed: float | None = None
-    server_over_constant: float | None = None
-    cost: float | None = None
-    cost_over_constant: float | None = None
-    quality: float | None = None
-    p95_ms: float | None = None
-    p99_ms: float | None = None
-    late_percent: float | None = None
-    cloud_percent: float | None = None
-    twice_percent: float | None = None
-    recovery: float | None = None
-    coverage_percent: float | None = None
-    relative_width: float | None = None
-    width_over_constant: float | None = None
-    referenced: int = 0
-    time_over_oracle: float | None = None
-    regret_ms: float | None = None
-    note: str = ""
-
-
-HEADINGS: dict[str, Heading] = {
-    "policy": Heading("policy", "policy", None),
-    "bound": Heading("bound", "bound", None),
-    "tasks": Heading("tasks", "tasks", 0),
-    "lost": Heading("lost", "lost", 0),
-    "mean_ms": Heading("mean ms", "mean ms", 1),
-    "over_constant": Heading("mean / better constant", "mean / better constant", 3),
-    "at_one_speed": Heading("mean / better constant at equal machine speed", "at equal speed", 3),
-    "server_over_constant": Heading("server time / better constant", "server time / better constant", 3),
-    "cost": Heading("cost", "cost", 4),
-    "cost_over_constant": Heading("cost / better constant", "cost / better constant", 3),
-    "quality": Heading("quality", "quality", 3),
-    "p95_ms": Heading("P95 ms", "P95 ms", 1),
-    "p99_ms": Heading("P99 ms", "P99 ms", 1),
-    "late_percent": Heading("late %", r"late \%", 2),
-    "cloud_percent": Heading("sent to cloud %", r"to cloud \%", 1),
-    "twice_percent": Heading("ran on both sites %", r"on both sites \%", 1),
-    "recovery": Heading("recovery tasks", "recovery tasks", 1),
-    "coverage_percent": Heading("times within interval %", r"within interval \%", 1),
-    "relative_width": Heading("interval width / prediction", "width / prediction", 2),
-    "width_over_constant": Heading("interval width / best constant width", "width / constant", 2),
-    "referenced": Heading("reference tasks", "reference tasks", 0),
-    "time_over_oracle": Heading("time / oracle", "time / oracle", 3),
-    "regret_ms": Heading("regret ms", "regret ms", 1),
-}
-FIRST = (  # the most important columns
-    *("tasks", "lost", "mean_ms", "over_constant", "p95_ms", "p99_ms"),
-    *("late_percent", "cloud_percent", "time_over_oracle", "recovery"),
-)
-
-COST = ("cost", "cost_over_constant", "quality")
-BY_COST = (  # if a scenario has an objective or variants: its cost comes first, and mean times judge nothing
-    *("tasks", "lost", "mean_ms", "p95_ms"),
-    *("late_percent", "cloud_percent", "twice_percent"),
-)
+SLOPES = (0.0, 1.0)  # a machine that is twice as slow makes no task faster, and none more than twice as long
 
 
 def comparison_table(
@@ -115,7 +36,7 @@ def comparison_table(
 
     `each` is `map`, or a replacement that uses several processes.
     """
-    names, costing = config.policies, scenario.costing()
+    names, costing = config.policies, scenario.costing
     constant = _better_constant(runs, costing)
     divisor = runs[constant] if constant else ()
     lines: list[Line] = []
@@ -125,9 +46,8 @@ def comparison_table(
             lines.extend(found)
             shown.step()
     span = f", counted from task {config.from_task} on" if config.from_task else ""
-    place = f"in {SIMULATION}" if config.simulate else f"on the {config.testbed} testbed"
     caption = (
-        f"Scenario {scenario.name} {place}: {_runs_and_seeds(scenario.seed, config.seeds)},"
+        f"Scenario {scenario.name} {config.place}: {_runs_and_seeds(scenario.seed, config.seeds)},"
         f" {scenario.workload.tasks} tasks for each robot{span}."
         " Below each policy are the bounds of its 95 % intervals, from blocks of neighbouring tasks."
         f" {scenario.recorded_text()}"
@@ -185,61 +105,48 @@ def _lines(policy: str, runs: Sequence[Outcome], constant: Sequence[Outcome], co
     if counts["referenced"]:
         more = Blocks(counts["referenced"]).intervals(lambda picks: _reference_figures(referenced, picks))
         bounds = tuple({**bound, **other} for bound, other in zip(bounds, more, strict=True))
-    measured = counts | {name: _plain(value[0]) for name, value in measured.items()}
+    measured = counts | plain({name: value[0] for name, value in measured.items()})
     measured["recovery"], note = median_recovery(runs)
     ends = [Line(policy, name, **counts, **bound) for name, bound in zip(BOUNDS, bounds, strict=True)]
     return [Line(policy, lost=lost, note=note, **measured), *ends]
 
 
-@dataclass(frozen=True, slots=True)
-class _Pair:
-    """One task of a policy, the same task of the better constant if answered there, and the deadline."""
-
-    mine: Answered
-    constant: Answered | None
-    deadline_s: float | None
-
-
-def _pairs(runs: Sequence[Outcome], constant: Sequence[Outcome]) -> list[_Pair]:
-    """`constant` is empty if there is no better constant."""
-    found = []
-    for run, other in itertools.zip_longest(runs, constant):
-        theirs = {(one.robot, one.i): one for one in other.answered} if other else {}
-        for one in sorted(run.answered, key=lambda one: (one.robot, one.i)):
-            found.append(_Pair(one, theirs.get((one.robot, one.i)), run.deadline_s))
-    return found
-
-
 def _columns(runs: Sequence[Outcome], constant: Sequence[Outcome], costing: Costing) -> dict[str, Column]:
-    """Columns with one value for each task; NaN where a task has no value."""
+    """Columns with one value for each task; NaN where a task has no value.
 
-    def column(value: Callable[[_Pair], float | None]) -> Column:
-        return np.array([value(pair) for pair in pairs], dtype=float)
+    `constant`: the same runs of the better constant; empty if there is none.
+    """
+    mine: list[Answered] = []
+    theirs: list[Answered | None] = []  # None: the better constant did not answer this task
+    late: list[float | None] = []
+    for run, other in itertools.zip_longest(runs, constant):
+        answered = {(one.robot, one.i): one for one in other.answered} if other else {}
+        for one in sorted(run.answered, key=lambda one: (one.robot, one.i)):
+            mine.append(one)
+            theirs.append(answered.get((one.robot, one.i)))
+            late.append(None if run.deadline_s is None else float(one.response_s > run.deadline_s))
 
-    pairs = _pairs(runs, constant)
+    def column(tasks: Iterable[Answered | None], value: Callable[[Answered], float | None]) -> Column:
+        return np.array([None if one is None else value(one) for one in tasks], dtype=float)
+
     return {
-        "response_s": column(lambda pair: pair.mine.response_s),
-        "constant_s": column(lambda pair: pair.constant.response_s if pair.constant else None),
-        "server_s": column(lambda pair: pair.mine.server_s),
-        "constant_server_s": column(lambda pair: pair.constant.server_s if pair.constant else None),
-        "cost": column(lambda pair: pair.mine.cost(costing)),
-        "constant_cost": column(lambda pair: pair.constant.cost(costing) if pair.constant else None),
-        "quality": column(lambda pair: pair.mine.quality),
-        "late": column(_late),
-        "cloud": column(_sent_to_cloud),
-        "twice": column(lambda pair: len(pair.mine.sites) > 1),
-        **interval_columns([pair.mine.intervals for pair in pairs]),
+        "response_s": column(mine, lambda one: one.response_s),
+        "constant_s": column(theirs, lambda one: one.response_s),
+        "server_s": column(mine, lambda one: one.server_s),
+        "constant_server_s": column(theirs, lambda one: one.server_s),
+        "cost": column(mine, lambda one: one.cost(costing)),
+        "constant_cost": column(theirs, lambda one: one.cost(costing)),
+        "quality": column(mine, lambda one: one.quality),
+        "late": np.array(late, dtype=float),
+        "cloud": column(mine, _sent_to_cloud),
+        "twice": column(mine, lambda one: len(one.sites) > 1),
+        **interval_columns([one.intervals for one in mine]),
     }
 
 
-def _late(pair: _Pair) -> float | None:
-    return None if pair.deadline_s is None else float(pair.mine.response_s > pair.deadline_s)
-
-
-def _sent_to_cloud(pair: _Pair) -> float | None:
+def _sent_to_cloud(one: Answered) -> float | None:
     """1 if the policy sent the task to the cloud, 0 if not; None if it chose both sites or is unknown."""
-    mine = pair.mine
-    return None if mine.both or not mine.chosen else float(mine.chosen == CLOUD)
+    return None if one.both or not one.chosen else float(one.chosen == CLOUD)
 
 
 def _referenced(runs: Sequence[Outcome]) -> dict[str, Column]:
@@ -250,8 +157,8 @@ def _referenced(runs: Sequence[Outcome]) -> dict[str, Column]:
     }
 
 
+# Figures for each resample, which is one row of `picks`.
 def _task_figures(columns: Mapping[str, Column], picks: Picks, costing: Costing) -> dict[str, Column]:
-    """The figures over all tasks, for each resample (one row of `picks`)."""
     cost, constant_cost = columns["cost"][picks], columns["constant_cost"][picks]
     shared = np.where(np.isnan(constant_cost), np.nan, cost)
     response, constant = columns["response_s"][picks], columns["constant_s"][picks]
@@ -261,7 +168,7 @@ def _task_figures(columns: Mapping[str, Column], picks: Picks, costing: Costing)
         "over_constant": _ratio(response, constant),
         "server_over_constant": _ratio(server, constant_server),
         "cost": costing.over(cost),
-        "cost_over_constant": _over(costing.over(shared), costing.over(constant_cost)),
+        "cost_over_constant": divided(costing.over(shared), costing.over(constant_cost)),
         "quality": known_mean(columns["quality"][picks]),
         "p95_ms": 1e3 * quantile(response, 95),
         "p99_ms": 1e3 * quantile(response, 99),
@@ -273,27 +180,38 @@ def _task_figures(columns: Mapping[str, Column], picks: Picks, costing: Costing)
 
 
 def _reference_figures(columns: Mapping[str, Column], picks: Picks) -> dict[str, Column]:
-    """The figures over the reference tasks, for each resample (one row of `picks`)."""
     sent, oracle = columns["sent_s"][picks], columns["oracle_s"][picks]
-    return {
-        "time_over_oracle": _ratio(sent, oracle),
-        "regret_ms": 1e3 * (sent - oracle).mean(axis=-1),
-    }
+    return {"time_over_oracle": _ratio(sent, oracle), "regret_ms": 1e3 * (sent - oracle).mean(axis=-1)}
 
 
 def _ratio(over: Column, under: Column) -> Column:
     """The ratio of the sums of each row, over the tasks that both have; NaN if there are none."""
     both = ~(np.isnan(over) | np.isnan(under))
     upper, lower = np.where(both, over, 0.0).sum(axis=-1), np.where(both, under, 0.0).sum(axis=-1)
-    ratio: Column = np.divide(upper, lower, where=lower > 0, out=np.full(len(over), np.nan))
-    return ratio
+    return divided(upper, lower)
 
 
-def _over(cost: Column, constant: Column) -> Column:
-    """NaN where the better constant costs nothing, or answered none of these tasks."""
-    ratio: Column = np.divide(cost, constant, where=constant > 0, out=np.full(len(cost), np.nan))
-    return ratio
+def speed_slope(resampled: Mapping[str, Column]) -> float:
+    """The exponent with which `over_constant` follows `server_over_constant`; 0 if that never differs.
+
+    The time that a planning server needs for a task does not depend on the policy of the robot that asks. If
+    the server was slower in the runs of one policy, the machine was slower then. The ratio of mean times is
+    corrected by how strongly the two ratios vary together over resamples of the tasks (control variates;
+    Lavenberg and Welch 1981, "A perspective on the use of control variables to increase the efficiency of
+    Monte Carlo simulations").
+    """
+    server, over = (np.log(resampled[name]) for name in ("server_over_constant", "over_constant"))
+    known = np.isfinite(server) & np.isfinite(over)
+    if not known.any() or not np.ptp(server[known]):
+        return 0.0
+    spread, together = np.cov(server[known], over[known])[0]
+    return float(np.clip(together / spread, *SLOPES))
 
 
-def _plain(value: Any) -> float | None:
-    return None if np.isnan(value) else float(value)
+def at_one_speed(figures: Mapping[str, Column], slope: float) -> Column:
+    """`over_constant` of each resample, as if the server had been equally fast in the runs of both policies.
+
+    NaN if no task was sent to the cloud by both.
+    """
+    found: Column = figures["over_constant"] * np.exp(-slope * np.log(figures["server_over_constant"]))
+    return found

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from offboard.loadgen.compare.compare_settings import CompareConfig
-from offboard.loadgen.compare.recording_figures import CONSTANTS, MEAN_BEHIND, P99_BEHIND, USABLE, Figures
+from offboard.common.config import REQUIRED
+from offboard.loadgen.compare.compare_settings import CONSTANTS, CompareConfig
+from offboard.loadgen.compare.recordings import MEAN_BEHIND, P99_BEHIND, USABLE, Figures
 from offboard.loadgen.table.confidence_intervals import BOUNDS, Blocks, Picks
 from offboard.loadgen.table.measured_rows import Column
-from offboard.loadgen.table.table_columns import MARKDOWN
-from offboard.loadgen.table.table_formats import Heading, Table
+from offboard.loadgen.table.table_formats import MARKDOWN, Table, column, headings_of
 
 LEVEL = 0.01  # a mean that differs by less is called level
 CSV = "csv"
@@ -40,65 +40,44 @@ class FamilyLine:
     - `over_oracle`: geometric mean of time / oracle, where the simulation knows it
     """
 
-    family: str
-    policy: str
-    bound: str = ""
-    recordings: int = 0
-    mean_ratio: float | None = None
-    worst_mean: float | None = None
-    p99_ratio: float | None = None
-    worst_p99: float | None = None
-    behind: int | None = None
-    over_oracle: float | None = None
-    cloud_percent: float | None = None
-    lost: int | None = None
+    family: str = column("family", default=REQUIRED)
+    policy: str = column("policy", default=REQUIRED)
+    bound: str = column("bound", default="")
+    recordings: int = column("recordings", 0, default=0)
+    mean_ratio: float | None = column("mean / constant", 3)
+    worst_mean: float | None = column("worst", 3)
+    p99_ratio: float | None = column("P99 / constant", 3)
+    worst_p99: float | None = column("worst P99", 2)
+    behind: int | None = column("behind", 0)
+    over_oracle: float | None = column("time / oracle", 3)
+    cloud_percent: float | None = column("used cloud %", 1)
+    lost: int | None = column("lost", 0)
     worst: str = ""
     note: str = ""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingLine:
     """A policy over one recording."""
 
     family: str
-    recording: str
-    policy: str
-    better: str
-    usable: str
-    mean_ms: float
-    mean_ratio: float
+    recording: str = column("recording", default=REQUIRED)
+    policy: str = column("policy", default=REQUIRED)
+    better: str = column("constant", default=REQUIRED)
+    usable: str = column("usable", default=REQUIRED)
+    mean_ms: float = column("mean ms", 1, default=REQUIRED)
+    mean_ratio: float = column("mean / it", 3, default=REQUIRED)
     p99_ms: float
-    p99_ratio: float
-    over_oracle: float | None
+    p99_ratio: float = column("P99 / it", 3, default=REQUIRED)
+    over_oracle: float | None = column("time / oracle", 3, default=REQUIRED)
     cloud_percent: float
     lost: int
     note: str = ""
 
 
-HEADINGS: dict[str, Heading] = {
-    "family": Heading("family", "family", None),
-    "policy": Heading("policy", "policy", None),
-    "bound": Heading("bound", "bound", None),
-    "recordings": Heading("recordings", "recordings", 0),
-    "mean_ratio": Heading("mean / constant", "mean / constant", 3),
-    "worst_mean": Heading("worst", "worst", 3),
-    "p99_ratio": Heading("P99 / constant", "P99 / constant", 3),
-    "worst_p99": Heading("worst P99", "worst P99", 2),
-    "behind": Heading("behind", "behind", 0),
-    "over_oracle": Heading("time / oracle", "time / oracle", 3),
-    "cloud_percent": Heading("used cloud %", r"used cloud \%", 1),
-    "lost": Heading("lost", "lost", 0),
-}
-OF_RECORDINGS: dict[str, Heading] = {
-    "recording": Heading("recording", "recording", None),
-    "policy": Heading("policy", "policy", None),
-    "better": Heading("constant", "constant", None),
-    "usable": Heading("usable", "usable", None),
-    "mean_ratio": Heading("mean / it", "mean / it", 3),
-    "p99_ratio": Heading("P99 / it", "P99 / it", 3),
-    "mean_ms": Heading("mean ms", "mean ms", 1),
-    "over_oracle": Heading("time / oracle", "time / oracle", 3),
-}
+HEADINGS = headings_of(FamilyLine)
+SHOWN = ("recording", "policy", "better", "usable", "mean_ratio", "p99_ratio", "mean_ms", "over_oracle")
+OF_RECORDINGS = {name: headings_of(RecordingLine)[name] for name in SHOWN}
 
 
 def tables(compared: Sequence[Comparison], config: CompareConfig) -> str:
@@ -106,8 +85,8 @@ def tables(compared: Sequence[Comparison], config: CompareConfig) -> str:
     by_family = [family_table(one, config) for one in compared]
     each = [recording_table(one, config) for one in compared]
     if config.format == CSV:  # the tables have different columns
-        return config.text(by_family, CSV) + "\n" + config.text(each, CSV)
-    text = config.text([*by_family, *(table for table in each if table.lines)], config.format)
+        return config.text(by_family) + "\n" + config.text(each)
+    text = config.text([*by_family, *(table for table in each if table.lines)])
     if config.format != MARKDOWN:
         return text
     return "\n".join([text, *(line for one in compared for line in sentences(one, config)), ""])
@@ -118,12 +97,11 @@ def family_table(compared: Comparison, config: CompareConfig) -> Table:
     families = by_family(compared.figures)
     policies = config.policies
     lines = [line for name, of in families.items() for one in policies for line in _lines(name, of, one)]
-    seeds = "1 seed" if config.seeds == 1 else f"{config.seeds} seeds"
     caption = (
         f"Scenario {compared.scenario} over recorded links ({config.where}): {compared.tasks} tasks,"
-        f" {compared.arrivals}, {seeds}. The constant is onboard or cloud, the one with the smaller mean on"
-        " that recording. Means over recordings are geometric, and a recording is the unit of the 95 %"
-        " intervals."
+        f" {compared.arrivals}, {config.count_of_seeds}. The constant is onboard or cloud, the one with the"
+        " smaller mean on that recording. Means over recordings are geometric, and a recording is the unit of"
+        " the 95 % intervals."
     )
     given = compared.taken_from_link.items()
     notes = [f"{name}: not recorded, and therefore taken from [link]: {text}." for name, text in given]

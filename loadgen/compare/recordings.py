@@ -1,33 +1,29 @@
-"""`loadgen compare --recordings FOLDER`: plays a scenario over each recording of a folder, with each policy.
+"""Recordings of links in a folder, a scenario over one of them, and what each policy took over it.
 
-`recording_table` computes the figures by family.
+`compare` plays the scenarios; `recording_table` computes the figures by family.
 """
 
-import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from random import Random
 from typing import Any
 
+import numpy as np
+
 from offboard.common.errors import ConfigError, DataError
-from offboard.loadgen.compare.compare_settings import CompareConfig, split_strategy
-from offboard.loadgen.compare.recording_figures import Figures, figures_of
-from offboard.loadgen.compare.recording_table import HEADINGS, Comparison, tables
-from offboard.loadgen.compare.resume import play_once
-from offboard.loadgen.progress import Progress, progress
+from offboard.loadgen.compare.compare_settings import CONSTANTS
 from offboard.loadgen.relay.link.link_settings import LinkFlags
 from offboard.loadgen.robot.workload import CONSTANT
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.scenario import Scenario
-from offboard.loadgen.scenario.scenario_file import check_calls, find_scenario, read_scenario
-from offboard.loadgen.simulation.simulated_testbed import check_simulated
-from offboard.loadgen.simulation.simulation_pool import SimulationPool
+from offboard.loadgen.table.table_two_figures import quantile
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 RECORDINGS_MAX = 10_000
-AT_ONCE = 64  # scenarios that are simulated before their outcomes are reduced to figures
-TASKS = 300  # unless --tasks says another number
 CSV, UP, DOWN = ".csv", ".up", ".down"
+USABLE = 2.0  # a link is usable if `cloud` takes at most this many times as long as `onboard`
+MEAN_BEHIND, P99_BEHIND = 1.03, 1.10
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,37 +33,6 @@ class RecordedLink:
     family: str
     name: str
     files: Mapping[str, Path]
-
-
-def run_recordings(names: Sequence[str], folder: Path, config: CompareConfig) -> int:
-    """Play all scenarios over all recordings, then print the tables to stdout."""
-    config.check_columns(HEADINGS, config.format)
-    links = find_recordings(folder)
-    scenarios = []
-    for path in map(find_scenario, names):
-        scenario = read_scenario(path).changed(
-            tasks=config.tasks or TASKS, reference=config.reference, heartbeats=config.heartbeats
-        )
-        check_calls(scenario, path)
-        scenario = at_rate(scenario, config.rate)
-        for link in links:
-            check_events(over(scenario, link, scenario.seed))
-        if config.simulate:
-            check_simulated(over(scenario, links[0], scenario.seed))
-        scenarios.append(scenario)
-    played = _simulated if config.simulate else _played
-    compared = [
-        Comparison(
-            scenario=scenario.name,
-            tasks=scenario.workload.tasks,
-            arrivals=_arrivals(scenario),
-            figures=played(scenario, links, config),
-            taken_from_link={link.family: from_link(over(scenario, link, scenario.seed)) for link in links},
-        )
-        for scenario in scenarios
-    ]
-    sys.stdout.write(tables(compared, config))
-    return 0
 
 
 def find_recordings(folder: Path) -> list[RecordedLink]:
@@ -137,63 +102,64 @@ def from_link(scenario: Scenario) -> str:
     return str(LinkFlags(**scenario.link).link.told()).partition("recorded: ")[2]
 
 
-def _arrivals(scenario: Scenario) -> str:
-    workload = scenario.workload
-    return "one at a time" if workload.rate is None else f"{workload.rate:g} a second"
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """The tasks of one policy over one recording, all seeds together."""
+
+    mean_s: float
+    p99_s: float
+    over_oracle: float | None
+    cloud_percent: float
+    tasks: int
+    lost: int
 
 
-def _units(
-    scenario: Scenario, links: Sequence[RecordedLink], config: CompareConfig
-) -> Iterator[tuple[RecordedLink, Scenario]]:
-    for link in links:
-        for n in range(config.seeds):
-            yield link, over(scenario, link, scenario.seed + n)
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """What each policy took over one recording."""
+
+    family: str
+    recording: str
+    taken: Mapping[str, Taken]
+
+    @property
+    def better(self) -> str:
+        """The constant policy with the smaller mean."""
+        return min(CONSTANTS, key=lambda name: self.taken[name].mean_s)
+
+    @property
+    def usable(self) -> bool:
+        return self.taken[CLOUD].mean_s <= USABLE * self.taken[ONBOARD].mean_s
+
+    def mean_ratio(self, policy: str) -> float:
+        return self.taken[policy].mean_s / self.taken[self.better].mean_s
+
+    def p99_ratio(self, policy: str) -> float:
+        """The P99 of a policy over that of the better constant, whose mean is smaller."""
+        return self.taken[policy].p99_s / self.taken[self.better].p99_s
+
+    def behind(self, policy: str) -> bool:
+        return self.mean_ratio(policy) > MEAN_BEHIND or self.p99_ratio(policy) > P99_BEHIND
 
 
-def _simulated(scenario: Scenario, links: Sequence[RecordedLink], config: CompareConfig) -> list[Figures]:
-    strategies = {name: _strategy(name) for name in config.policies}
-    figures: list[Figures] = []
-    step = max(1, AT_ONCE // config.seeds)
-    with SimulationPool(config.jobs) as pool:
-        for first in range(0, len(links), step):
-            links_now = links[first : first + step]
-            units = list(_units(scenario, links_now, config))
-            played = pool.play([one for _, one in units], strategies)
-            for link in links_now:
-                places = [n for n, (of, _) in enumerate(units) if of is link]
-                runs = {name: [outcomes[n] for n in places] for name, outcomes in played.items()}
-                figures.append(_reduced(link, scenario, runs, config))
-    return figures
+def figures_of(family: str, recording: str, runs: Mapping[str, Sequence[Outcome]]) -> Figures:
+    """DataError if a policy answered no task, so that nothing can be compared."""
+    for policy, outcomes in runs.items():
+        if not any(run.answered for run in outcomes):
+            raise DataError(f"{family}/{recording}: {policy} answered no task")
+    return Figures(family, recording, {policy: _taken(outcomes) for policy, outcomes in runs.items()})
 
 
-def _played(scenario: Scenario, links: Sequence[RecordedLink], config: CompareConfig) -> list[Figures]:
-    with progress("runs", len(links) * config.seeds * len(config.policies)) as shown:
-        return [_play(scenario, link, config, shown, turn=n) for n, link in enumerate(links)]
-
-
-def _play(
-    scenario: Scenario, link: RecordedLink, config: CompareConfig, shown: Progress, *, turn: int
-) -> Figures:
-    """Real runs over one recording; over all recordings each policy comes first equally often."""
-    runs: dict[str, list[Outcome]] = {policy: [] for policy in config.policies}
-    for n, (_, unit) in enumerate(_units(scenario, [link], config), turn):
-        first = n % len(config.policies)
-        for policy in (*config.policies[first:], *config.policies[:first]):
-            out = config.out / unit.name / f"{unit.seed}-{policy}"
-            print(f"{unit.name}, seed {unit.seed}, policy {policy}", file=sys.stderr, flush=True)
-            played = play_once(unit.changed(**_strategy(policy)), out, config.testbed, config.stolen_max)
-            runs[policy].append(played.outcome)
-            shown.step()
-    return _reduced(link, scenario, runs, config)
-
-
-def _reduced(
-    link: RecordedLink, scenario: Scenario, runs: Mapping[str, Sequence[Outcome]], config: CompareConfig
-) -> Figures:
-    compared = scenario.compared()
-    kept = {name: [run.of(compared).between(config.from_task) for run in of] for name, of in runs.items()}
-    return figures_of(link.family, link.name, kept)
-
-
-def _strategy(name: str) -> dict[str, Any]:
-    return dict(zip(("policy", "predictor"), split_strategy(name), strict=True))
+def _taken(runs: Sequence[Outcome]) -> Taken:
+    answered = [one for run in runs for one in run.answered]
+    seconds = np.array([one.response_s for one in answered])
+    references = [one for run in runs for one in run.references]
+    oracle_s = sum(one.oracle_s for one in references)
+    return Taken(
+        mean_s=float(seconds.mean()),
+        p99_s=float(quantile(seconds[None], 99)[0]),
+        over_oracle=sum(one.sent_s for one in references) / oracle_s if oracle_s else None,
+        cloud_percent=100 * float(np.mean([CLOUD in one.sites for one in answered])),
+        tasks=len(answered),
+        lost=sum(sum(run.asked.values()) for run in runs) - len(answered),
+    )

@@ -6,30 +6,26 @@
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import make_dataclass
-from typing import Any
 
+from offboard.common.config import REQUIRED
 from offboard.common.errors import ConfigError
-from offboard.common.text.wording import rounded
-from offboard.loadgen.compare.compare import rotated
-from offboard.loadgen.compare.compare_settings import SIMULATION, RunsConfig, split_strategy
-from offboard.loadgen.compare.resume import play_once
+from offboard.common.wording import rounded
+from offboard.loadgen.compare.compare_settings import RunsConfig
+from offboard.loadgen.compare.runs import outcomes, play_runs, read_scenarios
 from offboard.loadgen.progress import progress
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.outcome_figures import FIGURES
 from offboard.loadgen.scenario.pass_fail_check import DIGITS, Check, Verdict
 from offboard.loadgen.scenario.scenario import Scenario
-from offboard.loadgen.scenario.scenario_file import check_calls, find_scenario, read_scenario
 from offboard.loadgen.simulation.simulated_testbed import check_simulated
 from offboard.loadgen.simulation.simulation_pool import SimulationPool
-from offboard.loadgen.table.table_formats import UNDEFINED, Heading, Table, render
+from offboard.loadgen.table.table_formats import UNDEFINED, Table, column, headings_of, render
 
 
 def run_checks(names: Sequence[str], config: RunsConfig) -> int:
     """Play all scenarios, then print one table for each. A check that fails is a result, not an error."""
-    paths = [find_scenario(name) for name in names]
-    scenarios = [read_scenario(path) for path in paths]
-    for scenario, path in zip(scenarios, paths, strict=True):
-        check_calls(scenario, path)
+    scenarios = read_scenarios(names)
+    for scenario in scenarios:
         if not scenario.checks:
             raise ConfigError(f"{scenario.name} has no checks")
         if config.simulate:
@@ -46,19 +42,18 @@ def checks_table(scenario: Scenario, config: RunsConfig, runs: Mapping[str, Sequ
     """One line for each policy and check: its value in each run, and in how many runs it fails."""
     values = [f"run_{number}" for number in range(1, config.seeds + 1)]
     names = ("policy", "check", *values, "verdict")
-    line = make_dataclass("CheckLine", [*((name, str) for name in names), ("note", str, "")], frozen=True)
-    headings = {name: Heading(name.replace("_", " "), name.replace("_", " "), None) for name in names}
+    columns = [(name, str, column(name.replace("_", " "), default=REQUIRED)) for name in names]
+    line = make_dataclass("CheckLine", [*columns, ("note", str, "")], frozen=True)
     lines = []
-    for policy, outcomes in runs.items():
+    for policy, played in runs.items():
         for one in _judged(scenario, config):
-            verdicts = [one.judge(outcome) for outcome in outcomes]
+            verdicts = [one.judge(outcome) for outcome in played]
             cells = (policy, str(one), *map(_value, verdicts), _verdict(verdicts))
             lines.append(line(**dict(zip(names, cells, strict=True))))
-    where = f"in {SIMULATION}" if config.simulate else f"on the {config.testbed} testbed"
     seeds = "seed" if config.seeds == 1 else f"seeds {scenario.seed} to"
-    caption = f"Checks of {scenario.name} {where}, {seeds} {scenario.seed + config.seeds - 1}."
+    caption = f"Checks of {scenario.name} {config.place}, {seeds} {scenario.seed + config.seeds - 1}."
     about = {"scenario": scenario.name, "testbed": config.where}
-    return Table(caption, about, headings, lines)
+    return Table(caption, about, headings_of(line), lines)
 
 
 def _judged(scenario: Scenario, config: RunsConfig) -> list[Check]:
@@ -78,31 +73,11 @@ def _verdict(verdicts: Sequence[Verdict]) -> str:
 
 
 def _played(scenarios: Sequence[Scenario], config: RunsConfig) -> list[dict[str, list[Outcome]]]:
-    """The outcomes of real runs by policy, for each scenario. Each policy comes first equally often."""
-    found = []
+    """The outcomes of real runs by policy, for each scenario."""
     with progress("runs", len(scenarios) * config.seeds * len(config.policies)) as shown:
-        for scenario in scenarios:
-            runs: dict[str, list[Outcome]] = {policy: [] for policy in config.policies}
-            for n in range(config.seeds):
-                for policy in rotated(config.policies, n):
-                    seed, strategy = scenario.seed + n, _strategy(policy)
-                    print(f"{scenario.name}, seed {seed}, policy {policy}", file=sys.stderr, flush=True)
-                    out = config.out / scenario.name / f"{seed}-{policy}"
-                    played = play_once(scenario.changed(seed=seed, **strategy), out, config.testbed)
-                    runs[policy].append(played.outcome)
-                    shown.step()
-            found.append(runs)
-    return found
+        return [outcomes(play_runs(config.seeded(one), config, shown)) for one in scenarios]
 
 
 def _simulated(scenarios: Sequence[Scenario], config: RunsConfig) -> list[dict[str, list[Outcome]]]:
-    strategies = {policy: _strategy(policy) for policy in config.policies}
     with SimulationPool(config.jobs) as pool:
-        return [
-            pool.play([scenario.changed(seed=scenario.seed + n) for n in range(config.seeds)], strategies)
-            for scenario in scenarios
-        ]
-
-
-def _strategy(policy: str) -> dict[str, Any]:
-    return dict(zip(("policy", "predictor"), split_strategy(policy), strict=True))
+        return [pool.play(config.seeded(scenario), config.strategies()) for scenario in scenarios]

@@ -53,9 +53,8 @@ def _export_csv(source: Path, csv: Path, kind: str | None) -> int:
 def _export_mcap(path: Path, mcap: Path) -> int:
     if mcap.exists():
         raise ConfigError(f"--mcap: {mcap} exists; remove it, or give another file")
-    from offboard.loadgen.export.mcap_file import new_mcap  # first of all: it says if the extra is missing
+    from offboard.loadgen.export.mcap_file import new_mcap, write_recording  # says if the extra is missing
     from offboard.loadgen.export.recording import read_recording
-    from offboard.loadgen.export.ros_topics import write_recording
 
     recording = read_recording(find_source(path))
     with new_mcap(mcap) as file:

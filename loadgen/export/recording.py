@@ -1,7 +1,7 @@
 """What a robot on a map asked for and got, task by task, from its trace, its answers and its drive record.
 
 No file of a run holds scans, poses and goals: the robot is driven again, along the paths of the answers, and
-each task is checked against the trace. How tasks look in a file is left to `ros_topics`.
+each task is checked against the trace. How tasks look in a file is left to `mcap_file`.
 """
 
 from collections.abc import Iterator, Mapping
@@ -140,10 +140,8 @@ def _asked(
 
 
 def _decided(record: Mapping[str, Any]) -> Decided:
-    decision, predicted = (
-        record["decision"],
-        {site: one["predicted_s"] for site, one in record["sites"].items()},
-    )
+    decision = record["decision"]
+    predicted_s = ((site, one["predicted_s"]) for site, one in record["sites"].items())
     return Decided(
         size=float(record["size"]),
         site=str(decision["site"]),
@@ -151,9 +149,7 @@ def _decided(record: Mapping[str, Any]) -> Decided:
         policy=str(decision["policy"]),
         used=record["used"],
         waited_ms=1e3 * float(record["waited_s"]),
-        predicted_ms={
-            site: 1e3 * float(seconds) for site, seconds in predicted.items() if seconds is not None
-        },
+        predicted_ms={site: 1e3 * float(one) for site, one in predicted_s if one is not None},
         true_ms={one["site"]: 1e3 * float(one["seconds"]) for one in record["executions"] if one["ok"]},
     )
 
@@ -165,10 +161,8 @@ def _fits(task: Asked, plan: Plan | None) -> bool:
         return False
     if plan is None or not len(plan.cells):
         return True
-    return [tuple(plan.cells[0]), tuple(plan.cells[-1])] == [
-        grid.cell(pose.x, pose.y),
-        grid.cell(goal.x, goal.y),
-    ]
+    ends = [grid.cell(pose.x, pose.y), grid.cell(goal.x, goal.y)]
+    return [tuple(plan.cells[0]), tuple(plan.cells[-1])] == ends
 
 
 def _misfit(trace: Path, number: int, drive: DriveRecord) -> str:

@@ -14,8 +14,7 @@ from offboard.loadgen.fleet.fleet_figures import LAG_S, FleetLine, line_of
 from offboard.loadgen.fleet.fleet_run import Fleet, make_tasks, run_fleet
 from offboard.loadgen.fleet.fleet_settings import HEADINGS, FleetConfig
 from offboard.loadgen.progress import progress
-from offboard.loadgen.table.table_columns import MARKDOWN
-from offboard.loadgen.table.table_formats import Table
+from offboard.loadgen.table.table_formats import MARKDOWN, Table
 
 FIGURES, CHART = "fleet.json", "fleet.png"
 CAPTION = "Robots that share servers; times from when a task is due to its answer, in simulation:"
@@ -39,7 +38,7 @@ def run_fleets(config: FleetConfig) -> int:
         lines.append(line_of(fleet, config.start_s, time.monotonic() - began_s))
         shares.append(_shares(fleet))
     table = Table(CAPTION, {"command": "fleet"}, HEADINGS, lines, notes=NOTES)
-    print(config.text([table], config.format), end="")
+    print(config.text([table]), end="")
     _write(config.out, config, lines, shares)
     return 0
 

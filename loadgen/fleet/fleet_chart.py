@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from offboard.loadgen.fleet.fleet_figures import FleetLine
 from offboard.loadgen.replay.replay import ORACLE
 from offboard.loadgen.report.chart_parts import Drawing, Figure, key, legend, logarithmic, render
-from offboard.loadgen.report.chart_styles import FURTHER_LOOKS, LOOKS
+from offboard.loadgen.report.chart_styles import LOOKS, RUN_LOOKS
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 PANEL_IN = 1.9
@@ -19,7 +19,7 @@ def draw(lines: Sequence[FleetLine]) -> Drawing:
 def _paint(figure: Figure, lines: Sequence[FleetLine]) -> None:
     times, regret, shares = figure.subplots(3, sharex=True)
     robots = [line.robots for line in lines]
-    mean, p99, most, least = LOOKS[CLOUD], LOOKS[ONBOARD], FURTHER_LOOKS[2], FURTHER_LOOKS[3]
+    mean, p99, most, least = LOOKS[CLOUD], LOOKS[ONBOARD], RUN_LOOKS[2], RUN_LOOKS[3]
     for axes, look, values, gid in (
         (times, mean, [line.mean_ms for line in lines], "mean"),
         (times, p99, [line.p99_ms for line in lines], "p99"),

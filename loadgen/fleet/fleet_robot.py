@@ -1,6 +1,6 @@
 """One robot of a simulated fleet: its own `Offloader`, which waits for nothing but virtual time.
 
-Its sites are modelled in `fleet_site` and `simulation`.
+Its sites are modelled in `fleet_servers` and `simulation`.
 """
 
 from collections.abc import Callable, Sequence
@@ -8,25 +8,14 @@ from dataclasses import dataclass
 from functools import partial
 from random import Random
 
-from offboard.common.variants import IN_GROUP
-from offboard.loadgen import rivals
-from offboard.loadgen.fleet.fleet_messages import ASK, ToRobot, ToServer
+from offboard.loadgen.fleet.fleet_servers import ASK, FleetSite, ToRobot, ToServer, number_of
 from offboard.loadgen.fleet.fleet_settings import FleetConfig
-from offboard.loadgen.fleet.fleet_site import FleetSite, Place
 from offboard.loadgen.play.run_files import ROBOT_SEED_STEP
 from offboard.loadgen.simulation.model.simulated_cpu import SimulatedCpu
-from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks
-from offboard.loadgen.simulation.model.stepped_offloader import SteppedOffloader
-from offboard.loadgen.simulation.model.task_costs import (
-    DECIDING_CPU_S,
-    SITE_NOISE,
-    TASK_NOISE,
-    Noise,
-)
+from offboard.loadgen.simulation.model.stepped_offloader import SteppedOffloader, Walk, Walker
+from offboard.loadgen.simulation.model.task_costs import DECIDING_CPU_S, SITE_NOISE, TASK_NOISE, Noise
 from offboard.loadgen.simulation.model.true_costs import TrueCosts
-from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
-from offboard.loadgen.simulation.model.walker import Walk, Walker
-from offboard.loadgen.simulation.simulated_onboard import SimulatedOnboard
+from offboard.loadgen.simulation.virtual_site import SimulatedOnboard
 from offboard.robot_client.discovery.present_sites import PresentSites
 from offboard.robot_client.discovery.roster import Roster, Server
 from offboard.robot_client.policies import Probe
@@ -34,10 +23,10 @@ from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites import heartbeat
 from offboard.robot_client.sites.heartbeat import Heartbeat
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
+from offboard.testing.virtual_clock import VirtualClock
 
 NOISES = 65_537  # a prime, so that the noise has another period than the tasks
 FIRST_MAX = 1_000_000_000
-GROUP = "server"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,13 +59,12 @@ class FleetNoise(Noise):
 class Common:
     """What all robots of a fleet have in common.
 
-    - `noise`: on the costs of the tasks. `listed`: the servers of the fleet, of which each robot uses a few.
+    - `costs`: of the tasks that they repeat. `listed`: all servers, of which each robot uses a few.
     - `period_s`: the mean time from task to task.
     """
 
     config: FleetConfig
-    tasks: RobotTasks
-    noise: Noise
+    costs: TrueCosts
     listed: Sequence[Server]
     period_s: float
 
@@ -109,7 +97,7 @@ class FleetRobot:
         self._random = Random(seed)
         self._cpu = SimulatedCpu(clock, config.robot_cpus)
         self._first = self._random.randrange(FIRST_MAX)  # so that robots have other tasks and other noise
-        self._costs = TrueCosts(common.tasks, common.noise)
+        self._costs = common.costs
         self._listed, self._seed = common.listed, seed
         self._sites: dict[int, FleetSite] = {}  # every server that it has ever used, by number
         self._present: PresentSites
@@ -167,7 +155,7 @@ class FleetRobot:
     def _connect(self) -> SteppedOffloader:
         config = self._config
         settings = Settings(heartbeats=config.heartbeats, seed=self._seed)
-        policy = rivals.policy(config.policy)
+        policy = config.policy
         every_s = heartbeat.EVERY_S if settings.beats(policy) else 0.0
         self._present = PresentSites(
             [SimulatedOnboard(self._clock, self._cpu, self._costs)],
@@ -188,20 +176,13 @@ class FleetRobot:
         """Connect to a server, with a heartbeat after this time."""
         number = number_of(server.site)
         self._sites[number] = FleetSite(
-            Place(self._number, number, server.site, self._config.delay_ms / 1e3),
             self._clock,
             self._cpu,
             self._costs,
-            post=self._post,
+            site=server.site,
             heartbeat=Heartbeat(every_s, self._seed + number),
+            robot=self._number,
+            delay_s=self._config.delay_ms / 1e3,
+            post=self._post,
         )
         return self._sites[number]
-
-
-def server_of(number: int) -> Server:
-    """A server of the fleet, as robots know it: all are equal."""
-    return Server(f"{GROUP}{IN_GROUP}{number}", f"simulated://{number}")
-
-
-def number_of(site: str) -> int:
-    return int(site.rpartition(IN_GROUP)[2])

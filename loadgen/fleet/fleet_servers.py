@@ -1,97 +1,73 @@
-"""The servers of a simulated fleet: queues, heartbeats, what they were used for, and the oracle.
+"""The servers of a simulated fleet, what robots and they send each other, and the oracle.
 
-All servers are equal. They live in one process and are moved on in windows of time.
+All servers are equal. They live in one process, and are moved on in windows of time. Each robot has a runner
+for each server that it uses, which posts messages to it. Messages are plain tuples, which other processes may
+read. Every message takes the delay of the link, so nothing that is sent in one window of time arrives in it.
 """
 
-import heapq
-from collections import deque
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.loadgen.fleet.fleet_messages import (
-    ASK,
-    BEAT,
-    BEAT_REPLY,
-    CANCEL,
-    REPLY,
-    ToRobot,
-    ToServer,
-)
+from offboard.common.tasks import Task
+from offboard.common.variants import IN_GROUP
 from offboard.loadgen.fleet.fleet_settings import FleetSize
+from offboard.loadgen.simulation.model.simulated_cpu import Run, SimulatedCpu
+from offboard.loadgen.simulation.model.true_costs import TrueCosts
+from offboard.loadgen.simulation.virtual_site import VirtualSite
+from offboard.robot_client.discovery.roster import Server
+from offboard.robot_client.sites.conversation import PendingRequest
+from offboard.robot_client.sites.heartbeat import Heartbeat, ServerReport
+from offboard.robot_client.sites.runner import CLOUD
+from offboard.testing.virtual_clock import VirtualClock
+
+ASK, CANCEL, REQUEST, BEAT = range(4)  # what robots send; at the same instant, in this order
+REPLY, BEAT_REPLY = range(2)  # what servers send
 
 SAMPLE_S = 0.25  # between two samples of the load of every server
-ENDS = -1  # the sort of the events of a server itself, which come before messages of the same instant
-QUEUE_MAX = 100_000  # requests that wait at one server; a simulation with more has gone wrong
+ROBOT = "robot"  # owns every request
+GROUP = "server"
+
+Key = tuple[int, int, int]  # server, robot, and the number of the request
 
 
-@dataclass(eq=False, slots=True)
-class Run:
-    """A request at a server. `life` changes with its place in the queue: earlier events are then void."""
+class ToServer(NamedTuple):
+    """A message of a robot; messages are handled in the order of their fields.
 
+    `number` counts the tasks of the robot (ASK), its requests, or its heartbeats to this server.
+    `cpu_s`: what the task takes on a server. `limit_s`: for a REQUEST, when the robot gives up; for an ASK,
+    what the task would take onboard. ASK asks no server: it is how the oracle hears of a task, and of the
+    servers that the robot uses (`ways`).
+    """
+
+    arrives_s: float
+    sort: int
     robot: int
+    server: int
     number: int
-    cpu_s: float
-    added_s: float
-    begins_s: float = 0.0
-    life: int = 0
+    cpu_s: float = 0.0
+    limit_s: float = 0.0
+    ways: tuple[int, ...] = ()
 
 
-class Server:
-    """Runs requests in the order of their arrival, `workers` at a time, each on a CPU of its own."""
+class ToRobot(NamedTuple):
+    """A message of a server, with the number of what it answers, and the tasks that wait at the server."""
 
-    def __init__(self, workers: int) -> None:
-        self.busy_s = 0.0  # what its runs took so far
-        self.runs: dict[tuple[int, int], Run] = {}  # that wait or run, in order
-        self._free = [0.0] * workers  # when each worker will be free
-        self._waiting: deque[Run] = deque()
-
-    def begins_s(self, now_s: float) -> float:
-        """When a request that arrives now would begin."""
-        return max(now_s, self._free[0])
-
-    def queue(self, now_s: float) -> int:
-        """How many requests wait."""
-        while self._waiting and self._waiting[0].begins_s <= now_s:
-            self._waiting.popleft()
-        return len(self._waiting)
-
-    def add(self, run: Run, now_s: float) -> float:
-        """Put a request into the queue, and return when it will end."""
-        assert len(self._waiting) < QUEUE_MAX
-        self.runs[run.robot, run.number] = run
-        self._waiting.append(run)
-        return self._place(run, now_s)
-
-    def end(self, run: Run) -> None:
-        del self.runs[run.robot, run.number]
-        self.busy_s += run.cpu_s
-
-    def cancel(self, robot: int, number: int, now_s: float) -> list[tuple[float, Run]]:
-        """Drop a request that waits; returns the new ends of those behind it. A run goes on to its end."""
-        run = self.runs.get((robot, number))
-        if run is None or run.begins_s <= now_s:
-            return []
-        del self.runs[robot, number]
-        run.life += 1
-        begun = [one for one in self.runs.values() if one.begins_s <= now_s]
-        busy = [one.begins_s + one.cpu_s for one in begun]
-        self._free = sorted(busy + [now_s] * (len(self._free) - len(busy)))
-        self._waiting = deque(one for one in self.runs.values() if one.begins_s > now_s)
-        for one in self._waiting:
-            one.life += 1
-        return [(self._place(one, now_s), one) for one in self._waiting]
-
-    def _place(self, run: Run, now_s: float) -> float:
-        run.begins_s = self.begins_s(now_s)
-        heapq.heapreplace(self._free, run.begins_s + run.cpu_s)
-        return run.begins_s + run.cpu_s
+    arrives_s: float
+    robot: int
+    server: int
+    sort: int
+    number: int
+    queue: int
+    queue_s: float = 0.0
+    run_s: float = 0.0
 
 
 class Servers:
-    """All servers, and the oracle, which knows them as they are.
+    """All servers, and the oracle, which knows them as they are. Each worker has a CPU of its own.
 
     - `delay_s`: of the link, in each direction.
     - `oracle_s`: what each task of each robot would have taken on the best site that the robot uses.
@@ -100,62 +76,123 @@ class Servers:
     def __init__(self, size: FleetSize, tasks: int, delay_s: float) -> None:
         self.oracle_s: NDArray[np.float64] = np.full((size.robots, tasks), np.nan)
         self.samples: list[NDArray[np.int32]] = []  # requests at each server, every SAMPLE_S
-        self._servers = [Server(size.workers) for _ in range(size.servers)]
+        self._clock = VirtualClock()
+        self._servers = [SimulatedCpu(self._clock, size.workers, size.workers) for _ in range(size.servers)]
+        self._wanted: dict[Key, Run] = {}
         self._delay_s = delay_s
-        self._events: list[tuple[ToServer, int, Run | None]] = []  # with a life
+        self._sent: list[ToRobot] = []
+        self._sample()
 
     @property
     def busy_s(self) -> NDArray[np.float64]:
-        return np.array([server.busy_s for server in self._servers])
+        """What the runs of each server took so far."""
+        return np.array([server.own_s for server in self._servers])
 
     def step(self, messages: Iterable[ToServer], until_s: float) -> list[ToRobot]:
-        """Handle everything that happens before `until_s`; returns what the servers sent."""
-        for message in messages:
-            heapq.heappush(self._events, (message, 0, None))
-        sent: list[ToRobot] = []
-        while self._events and self._events[0][0].arrives_s < until_s:
-            message, life, run = heapq.heappop(self._events)
-            if run is None:
-                sent.extend(self._receive(message))
-            elif run.life == life:
-                sent.append(self._end(message, run))
-        while len(self.samples) * SAMPLE_S < until_s:
-            self.samples.append(np.array([len(server.runs) for server in self._servers], np.int32))
+        """Handle everything that happens up to `until_s`; returns what the servers sent."""
+        for message in sorted(messages):
+            self._clock.at(message.arrives_s, partial(self._receive, message))
+        while self._clock.step(until_s):
+            pass
+        sent, self._sent = self._sent, []
         return sent
 
-    def _receive(self, message: ToServer) -> list[ToRobot]:
+    def _sample(self) -> None:
+        self.samples.append(np.array([server.count for server in self._servers], np.int32))
+        self._clock.after(SAMPLE_S, self._sample)
+
+    def _receive(self, message: ToServer) -> None:
         now_s, sort, robot, index, number, cpu_s, limit_s, ways = message
         if sort == ASK:
-            begins_s = min(self._servers[one].begins_s(now_s) for one in ways)
+            begins_s = min(self._servers[one].begins_s(now_s, (), without="") for one in ways)
             self.oracle_s[robot, number] = min(limit_s, begins_s - now_s + cpu_s + 2 * self._delay_s)
-            return []
-        server = self._servers[index]
+            return
+        server, key = self._servers[index], (index, robot, number)
         if sort == BEAT:
-            queue = server.queue(now_s)
-            return [ToRobot(now_s + self._delay_s, robot, index, BEAT_REPLY, number=number, queue=queue)]
-        if sort == CANCEL:
-            for end_s, run in server.cancel(robot, number, now_s):
-                self._plan_end(end_s, index, run)
-        elif server.begins_s(now_s) < limit_s:
-            run = Run(robot, number, cpu_s, now_s)
-            self._plan_end(server.add(run, now_s), index, run)
-        return []
+            self._send(key, BEAT_REPLY)
+        elif sort == CANCEL:
+            run = self._wanted.pop(key, None)
+            if run is not None:  # one that runs goes on to its end
+                server.drop(run)
+        else:
+            ended = partial(self._ended, key)
+            self._wanted[key] = server.add(cpu_s, ended, owner=ROBOT, until_s=limit_s)
 
-    def _plan_end(self, end_s: float, index: int, run: Run) -> None:
-        heapq.heappush(
-            self._events, (ToServer(end_s, ENDS, run.robot, index, number=run.number), run.life, run)
-        )
+    def _ended(self, key: Key, run: Run) -> None:
+        if self._wanted.pop(key, None) is not None:
+            self._send(key, REPLY, queue_s=run.begun_s - run.added_s, run_s=self._clock.now_s() - run.begun_s)
 
-    def _end(self, message: ToServer, run: Run) -> ToRobot:
-        now_s, server = message.arrives_s, self._servers[message.server]
-        server.end(run)
-        return ToRobot(
-            now_s + self._delay_s,
-            run.robot,
-            message.server,
-            REPLY,
-            number=run.number,
-            queue=server.queue(now_s),
-            queue_s=run.begins_s - run.added_s,
-            run_s=run.cpu_s,
+    def _send(self, key: Key, sort: int, *, queue_s: float = 0.0, run_s: float = 0.0) -> None:
+        index, robot, number = key
+        reply = ToRobot(
+            self._clock.now_s() + self._delay_s,
+            robot=robot,
+            server=index,
+            sort=sort,
+            number=number,
+            queue=self._servers[index].waiting,
+            queue_s=queue_s,
+            run_s=run_s,
         )
+        self._sent.append(reply)
+
+
+class FleetSite(VirtualSite):
+    """A server, as one robot of the fleet uses it. `post` sends a message, which takes `delay_s`."""
+
+    def __init__(
+        self,
+        clock: VirtualClock,
+        cpu: SimulatedCpu,
+        costs: TrueCosts,
+        *,
+        site: str,
+        heartbeat: Heartbeat,
+        robot: int,
+        delay_s: float,
+        post: Callable[[ToServer], object],
+    ) -> None:
+        self._robot, self._server = robot, number_of(site)
+        self._delay_s = delay_s
+        self._post = post
+        super().__init__(clock, cpu, costs, site=site, heartbeat=heartbeat)
+
+    def receive(self, message: ToRobot) -> None:
+        """A message of the server has arrived."""
+        report = ServerReport(message.queue)
+        if message.sort == BEAT_REPLY:
+            self._pong(message.number, report)
+            return
+        self.conversation.heard(self._clock.now_s(), report)
+        self._clock.after(self.sending_s, partial(self._take, message))
+
+    def _take(self, message: ToRobot) -> None:
+        """The robot has unpacked the answer."""
+        request = self.conversation.asked(message.number)
+        if request is not None:
+            queue_s, run_s, bytes_in = message.queue_s, message.run_s, self._costs.task(0).bytes_in
+            self._unpacked(request, queue_s=queue_s, run_s=run_s, cpu_s=run_s, bytes_in=bytes_in)
+
+    def _send_packed(self, request: PendingRequest) -> None:
+        request.bytes_out = self._costs.task(0).bytes_out  # all requests are small
+        cpu_s = self._costs.cpu_s(CLOUD, request.task)
+        self._message(REQUEST, request.task.id, cpu_s=cpu_s, limit_s=request.deadline_s)
+
+    def _cancel(self, task: Task) -> None:
+        self._message(CANCEL, task.id)
+
+    def _beat(self, number: int) -> None:
+        self._message(BEAT, number)
+
+    def _message(self, sort: int, number: int, cpu_s: float = 0.0, limit_s: float = 0.0) -> None:
+        arrives_s, to = self._clock.now_s() + self._delay_s, self._server
+        self._post(ToServer(arrives_s, sort, self._robot, to, number=number, cpu_s=cpu_s, limit_s=limit_s))
+
+
+def server_of(number: int) -> Server:
+    """A server of the fleet, as robots know it: all are equal."""
+    return Server(f"{GROUP}{IN_GROUP}{number}", f"simulated://{number}")
+
+
+def number_of(site: str) -> int:
+    return int(site.rpartition(IN_GROUP)[2])

@@ -6,8 +6,7 @@ from pathlib import Path
 
 from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError
-from offboard.loadgen import rivals
-from offboard.loadgen.table.table_columns import MARKDOWN, ColumnSettings
+from offboard.loadgen.table.table_columns import ColumnSettings
 from offboard.loadgen.table.table_formats import Heading
 from offboard.robot_client import policies
 from offboard.robot_client.sites.runner import CLOUD
@@ -70,19 +69,18 @@ class FleetConfig(ColumnSettings):
     timeout_s: float = setting(
         2.0, "longest wait for a server", group=TASKS, rare=True, name="timeout", minimum=0.001
     )
-    policy: str = setting(policies.ALIAS, f"policy of the robots: {rivals.POLICY_HELP}", metavar="NAME")
+    policy: str = setting(policies.ALIAS, f"policy of the robots: {policies.HELP}", metavar="NAME")
     heartbeats: bool | None = setting(None, "whether robots send heartbeats, if not as the policy needs it")
     seed: int = setting(1, "random seed", minimum=0)
     jobs: int | None = setting(None, "number of processes (default: one for each CPU)", minimum=1, maximum=64)
     out: Path = setting(Path("out/fleet"), "folder for fleet.json and fleet.png", metavar="DIR")
-    format: str = setting(MARKDOWN, "format of the table", choices=(MARKDOWN, "csv", "json", "latex"))
 
     def __post_init__(self) -> None:
         check(self)
-        rivals.policy(self.policy, "--policy")
+        policies.check_name(self.policy, "--policy")
         if self.policy.rpartition(":")[2] == CLOUD:
             raise ConfigError(f"--policy: {self.policy!r} needs a server named {CLOUD}; a fleet has none")
-        self.check_columns(HEADINGS, self.format)
+        self.check_columns(HEADINGS)
         if self.servers and len(self.servers) not in (1, len(self.robots)):
             raise ConfigError(
                 f"--servers: {len(self.servers)} numbers for {len(self.robots)} of --robots; "
@@ -90,7 +88,6 @@ class FleetConfig(ColumnSettings):
             )
 
     def fleets(self) -> list["FleetSize"]:
-        """The size of each fleet."""
         servers = self.servers or tuple(max(4, math.ceil(robots / 100)) for robots in self.robots)
         if len(servers) == 1:
             servers *= len(self.robots)

@@ -37,9 +37,10 @@ RETURNS_NOTHING = "same(a, b) returned None, and must return whether they are eq
 def verified(answered: Sequence[Answered], workload: Workload, seed: int) -> list[Answered]:
     """The same tasks with `wrong` and `unverified` filled in; unchanged if the tasks cannot be made again.
 
-    That is so if the next task depends on the previous answer (a map without `jump`).
+    That is so if the next task depends on the previous answer (a map without `jump`), and for the steps of a
+    stream.
     """
-    if not workload.known()["jump"]:
+    if workload.streams or not workload.known()["jump"]:
         return list(answered)
     tasks = _repeated(workload, seed)
     ordered = sorted(answered, key=lambda one: one.i)
@@ -92,9 +93,7 @@ class _Repeated:
             raise OffloadError(f"task {i} fails without Offboard: {describe(error)}") from error
 
 
-@functools.lru_cache(maxsize=1)  # a comparison plays the same tasks with each policy
-def _repeated(workload: Workload, seed: int) -> _Repeated:
-    return _Repeated(workload, seed)
+_repeated = functools.lru_cache(maxsize=1)(_Repeated)  # a comparison plays the same tasks with each policy
 
 
 def _compared(one: Answered, work: Calls, expected: dict[str, Any]) -> Answered:
@@ -115,10 +114,7 @@ def _compared(one: Answered, work: Calls, expected: dict[str, Any]) -> Answered:
 
 
 def wrong_plan(answer: Mapping[str, Any], expected: Plan, request: Sequence[Any]) -> str | None:
-    """What is wrong with an answered path.
-
-    None if it is free of obstacles and as short as the expected one.
-    """
+    """What is wrong with an answered path; None if it is free of obstacles and as short as expected."""
     if answer["status"] != expected.status:
         return f"status {answer['status']}, but {expected.status} was expected"
     if expected.status != "NONE":
@@ -157,13 +153,7 @@ def _blocked(request: Sequence[Any], cells: NDArray[np.int32]) -> str | None:
     return None
 
 
-_room: dict[tuple[int, float], tuple[GridMap, NDArray[np.bool_]]] = {}
-
-
+@functools.lru_cache(maxsize=1)  # for one map and robot
 def _passable(grid: GridMap, radius_m: float) -> NDArray[np.bool_]:
-    """Where a robot of this radius fits; cached for one map."""
-    key = (id(grid), radius_m)
-    if key not in _room:
-        _room.clear()
-        _room[key] = (grid, passable(grid, radius_m))
-    return _room[key][1]
+    """Where a robot of this radius fits."""
+    return passable(grid, radius_m)

@@ -4,27 +4,34 @@ NAME.csv holds the rows; NAME.json holds machine, Table I, settings, commit, dis
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from offboard.common import VERSION
 from offboard.common.config import check, setting
-from offboard.loadgen.play.code_commit import commit_here
-from offboard.loadgen.play.machine import docker_version, machine
+from offboard.loadgen.play.machine import commit_here, docker_version, machine, output_of
+from offboard.loadgen.play.part_setups import setups
 from offboard.loadgen.play.play_scenario import TESTBEDS, play
 from offboard.loadgen.play.run_files import TRACE
-from offboard.loadgen.play.table_one import specifications, table_one
 from offboard.loadgen.replay.dataset_file import measured_tasks, read_recorded, write_dataset
 from offboard.loadgen.scenario.scenario import Scenario, Workload
 from offboard.loadgen.scenario.scenario_file import check_calls, find_scenario, read_scenario
 from offboard.loadgen.table.measured_rows import write_whole
 from offboard.loadgen.table.measurement_notes import disturbance, read_noted
-from offboard.loadgen.table.table_formats import render
+from offboard.loadgen.table.table_formats import Heading, Table, render
+from offboard.loadgen.testbed.container_part import IMAGES, service_of
+from offboard.loadgen.testbed.testbed import CLOUD, ROBOT
 from offboard.robot_client import policies
 
+SYSTEM = "import platform as p; print(p.freedesktop_os_release()['PRETTY_NAME'], p.python_version(), sep='|')"
+TABLE_ONE = {
+    "what": Heading("", "", None),
+    "robot": Heading("robot", "robot", None),
+    "cloud": Heading("cloud", "cloud", None),
+}
 POLICY = policies.ALIAS  # its traces hold features and work; where a row runs is not up to the policy
 
 
@@ -57,7 +64,7 @@ def run_dataset(name: str, config: DatasetConfig, command: Sequence[str]) -> int
     )
     check_calls(scenario, path)
     run = config.run / scenario.name
-    started_at, commit = datetime.now(UTC), commit_here()
+    started_at, commit = datetime.now(timezone.utc), commit_here()
     play(scenario, run, config.testbed).check_robots()
     rows, disturbed = read_noted(run / TRACE), disturbance(run / TRACE)
     this = machine() | ({"docker": docker_version()} if config.testbed == "docker" else {})
@@ -84,6 +91,53 @@ def run_dataset(name: str, config: DatasetConfig, command: Sequence[str]) -> int
     print(f"\n{render([table_one(scenario.name, specified)], 'md')}")
     print(f"written: {path} ({len(rows)} rows, {rows.left_out} left out) and {path.with_suffix('.json')}")
     return 0
+
+
+@dataclass(frozen=True, slots=True)
+class Specification:
+    """One line of Table I: the same thing of both parts."""
+
+    what: str
+    robot: str
+    cloud: str
+    note: ClassVar[str] = ""
+
+
+def table_one(name: str, lines: Sequence[Specification]) -> Table:
+    """What robot and cloud of the dataset ran on, as in Table I of the paper."""
+    return Table(f"Table I of {name}: robot and cloud.", {"dataset": name}, TABLE_ONE, lines)
+
+
+def specifications(this: Mapping[str, Any], scenario: Scenario, run: Path) -> list[Specification]:
+    """Both parts are on `this` machine, in containers if it names a version of Docker."""
+    cloud = next(server for server in scenario.servers if server.name == CLOUD)
+    docker = this.get("docker")
+    inside = [this, this]
+    if docker is not None:
+        parts = setups(scenario, run)
+        inside = [_system_in(service_of(part, parts[part])) for part in (ROBOT, CLOUD)]
+    runs_in = "a process" if docker is None else f"a container of Docker {docker}"
+    cores, memory = f"{this['cores']}, shared", f"{this['memory_gib']:g} GiB, shared"
+    quotas = f"{scenario.robot.cpus:g} CPU", f"{cloud.cpus:g} CPU"
+    systems, pythons = ([str(one[key] or "unknown") for one in inside] for key in ("system", "python"))
+    return [
+        Specification("processor", this["cpu"], this["cpu"]),
+        Specification("cores", cores, cores),
+        Specification("CPU quota", *quotas),
+        Specification("RAM", memory, memory),
+        Specification("GPU", this["gpu"], this["gpu"]),
+        Specification("runs in", runs_in, runs_in),
+        Specification("system", *systems),
+        Specification("kernel", this["kernel"], this["kernel"]),
+        Specification("Python", *pythons),
+    ]
+
+
+def _system_in(service: str) -> dict[str, str | None]:
+    """System and Python inside the image of a Compose service; None: unknown."""
+    run = ("docker", "run", "--rm", "--network", "none", "--entrypoint", "python3")
+    system, _, python = (output_of((*run, IMAGES[service], "-c", SYSTEM)) or "").partition("|")
+    return {"system": system or None, "python": python or None}
 
 
 def _conditions(scenario: Scenario, testbed: str) -> str:

@@ -7,15 +7,17 @@ import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from dataclasses import asdict, dataclass, replace
+from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from offboard.common import VERSION
 from offboard.common.errors import OffloadError
-from offboard.common.text.wording import duration, rounded
+from offboard.common.wording import duration, rounded
 from offboard.loadgen.play.answer_verification import verified
+from offboard.loadgen.play.machine import NOTED_PERCENT, StolenCpuTime
 from offboard.loadgen.play.part_setups import setups
 from offboard.loadgen.play.player import Player, started_at_first
 from offboard.loadgen.play.run_digest import digests
@@ -30,18 +32,16 @@ from offboard.loadgen.play.run_files import (
     clear_folder,
 )
 from offboard.loadgen.play.run_table import run_table
-from offboard.loadgen.play.stolen_cpu_time import NOTED_PERCENT, StolenCpuTime
 from offboard.loadgen.play.watch import Page, watching
 from offboard.loadgen.progress import progress
 from offboard.loadgen.robot_files import alone_path, reference_path
-from offboard.loadgen.scenario.outage_recovery import read_outage
 from offboard.loadgen.scenario.outcome import Answered, Outcome
 from offboard.loadgen.scenario.outcome_figures import FIGURES
 from offboard.loadgen.scenario.outcome_files import read_answered, read_readings, read_references
 from offboard.loadgen.scenario.pass_fail_check import Verdict
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
-from offboard.loadgen.scenario.site_shares import share_lines, site_shares
+from offboard.loadgen.scenario.site_shares import read_outage, share_lines, site_shares
 from offboard.loadgen.table.measured_rows import write_whole
 from offboard.loadgen.table.table_formats import render
 from offboard.loadgen.table.table_settings import TableConfig
@@ -52,17 +52,16 @@ from offboard.loadgen.testbed.testbed import Setup, Testbed
 DEMO_WINDOWS = ("5", "10", "20", "30", "40", "50")
 
 
-def _local(out: Path, setups: Mapping[str, Setup]) -> Testbed:
-    return LocalTestbed(out, setups)
-
-
 def _docker(out: Path, setups: Mapping[str, Setup]) -> Testbed:
     from offboard.loadgen.testbed.docker_testbed import DockerTestbed
 
     return DockerTestbed(out, setups)
 
 
-TESTBEDS: dict[str, Callable[[Path, Mapping[str, Setup]], Testbed]] = {"local": _local, "docker": _docker}
+TESTBEDS: dict[str, Callable[[Path, Mapping[str, Setup]], Testbed]] = {
+    "local": LocalTestbed,
+    "docker": _docker,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,8 +102,8 @@ def play(
     Unless `quiet`, progress lines and the output of the first robot go to stdout. `page`: the page that shows
     the run while it goes on.
     """
-    say = _say_nothing if quiet else _say
-    started_at, workload = datetime.now(UTC), scenario.workload
+    say: Callable[[str], object] = (lambda _: None) if quiet else partial(print, flush=True)
+    started_at, workload = datetime.now(timezone.utc), scenario.workload
     played_from = digests(scenario)  # taken now, because the parts load the software now
     with ExitStack() as opened:
         bed = opened.enter_context(TESTBEDS[testbed](out, setups(scenario, out, shown=not quiet)))
@@ -115,7 +114,8 @@ def play(
         with progress("compiling the planner" if workload.map else "starting", to=sys.stdout):
             bed.start(*started_at_first(scenario))
         many = "the robot" if workload.robots == 1 else f"{workload.robots} robots"
-        tasks = f"{workload.tasks} {'plans' if workload.map else 'tasks'}"
+        noun = "plans" if workload.map else "steps" if workload.streams else "tasks"
+        tasks = f"{workload.tasks} {noun}"
         say(f"starting {many} with a quota of {scenario.robot.cpus:g} CPU: {tasks}")
         stolen = StolenCpuTime()
         with progress("starting the robots", to=sys.stdout) as shown:
@@ -135,7 +135,7 @@ def play_demo(out: Path) -> int:
     config = TableConfig(windows=DEMO_WINDOWS, feedback="both")
     tables = read_tables(out / TRACE, config)
     (out / TABLE).write_text(render(tables, config.format))
-    print(f"\n{config.text(tables, config.format)}\nwritten: {out / TABLE}; charts: loadgen report {out}")
+    print(f"\n{config.text(tables)}\nwritten: {out / TABLE}; charts: loadgen report {out}")
     if (out / PICTURE).exists():
         print(f"picture of the last plan: {out / PICTURE}")
     print(f"the run on a page: loadgen watch {out}")
@@ -182,7 +182,7 @@ def judge(scenario: Scenario, out: Path, exit_codes: Mapping[str, int]) -> Playe
         readings=read_readings(out / READINGS),
         deadline_s=workload.deadline_s,
         outage=read_outage(out / EVENTS),
-        costing=scenario.costing(),
+        costing=scenario.costing,
     )
     verdicts = [check.judge(outcome) for check in scenario.checks]
     return Played(scenario, outcome, verdicts, exit_codes)
@@ -197,7 +197,7 @@ def write_summary(out: Path, played: Played, about: Mapping[str, Any]) -> None:
         "policy": scenario.robot.policy,
         "predictor": scenario.robot.predictor,
         "window": scenario.robot.window,
-        "decided_by": scenario.decided_by(),
+        "decided_by": asdict(scenario.decided_by),
         "tasks": scenario.workload.tasks * scenario.workload.robots,
         "recordings": scenario.recorded(),
         "software": VERSION,
@@ -242,11 +242,3 @@ def _by_quality(outcome: Outcome) -> Iterator[str]:
         quality, mean_ms = FIGURES["quality"].compute(part), FIGURES["mean_ms"].compute(part)
         mean = duration((mean_ms or 0.0) / 1e3)
         yield f"{site}: {len(part.answered)} answers of quality {quality:g} after {mean} (mean)"
-
-
-def _say(text: str) -> None:
-    print(text, flush=True)
-
-
-def _say_nothing(_text: str) -> None:
-    pass

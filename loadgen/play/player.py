@@ -11,6 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from offboard.common.command_line import USAGE_EXIT
 from offboard.common.errors import ConfigError, OffloadError
 from offboard.loadgen.play.run_files import (
     ANSWERS,
@@ -27,8 +28,7 @@ from offboard.loadgen.robot_files import alone_path
 from offboard.loadgen.scenario.event_timeline import ON_A_PART, Event, Timeline, absent_at_first
 from offboard.loadgen.scenario.outcome import Reading
 from offboard.loadgen.scenario.scenario import Scenario
-from offboard.loadgen.table.site_disturbance import WAYS
-from offboard.loadgen.testbed.part_process import USAGE_EXIT
+from offboard.loadgen.table.measurement_notes import WAYS
 from offboard.loadgen.testbed.testbed import ROBOT, WAN, Testbed, kind_of, relay_of
 
 POLL_S = 0.02
@@ -52,13 +52,14 @@ class Player:
     """
 
     def __init__(
-        self, scenario: Scenario, testbed: Testbed, say: Callable[[str], None], shown: Progress
+        self, scenario: Scenario, testbed: Testbed, say: Callable[[str], object], shown: Progress
     ) -> None:
         self._scenario = scenario
         self._say = say
         self._shown = shown
         self._testbed = testbed
-        self._robots = scenario.robots()
+        # The robots, and the file that each one creates when it begins its first task.
+        self._robots = {files.robot: files.answers for files in RobotFiles.of(scenario, testbed.out)}
         self._parts = set(started_at_first(scenario))  # the parts that were started
         self._paused: set[str] = set()  # a paused part cannot be sampled
         self._timeline = Timeline(scenario.timeline())
@@ -72,7 +73,7 @@ class Player:
 
     def play(self) -> dict[str, int]:
         """Start the robots, apply the events until all robots have ended, and return their exit codes."""
-        limit_s = self._limit_s()
+        limit_s = max(ROBOT_S_AT_LEAST, ROBOT_S_A_TASK * self._runs())
         until = time.monotonic() + limit_s
         self._start_all(until)
         out = self._testbed.out
@@ -87,7 +88,7 @@ class Player:
                 self._poll(events.write, readings.write)
             for event in self._timeline.left():
                 events.write(json.dumps({**event.shown(), "happened_s": None}) + "\n")
-        codes = {robot: self._code(robot) or 0 for robot in self._ended()}
+        codes = {robot: self._testbed.exit_code(robot) or 0 for robot in self._ended()}
         for robot, code in codes.items():
             if code == USAGE_EXIT:
                 raise ConfigError(f"{robot} refuses its settings: see its message above or in {out / 'logs'}")
@@ -133,10 +134,10 @@ class Player:
         """Why the event cannot happen to its part now; None if it can."""
         for part in event.parts():
             if event.action == "start":
-                if part in self._parts and self._code(part) is None:
+                if part in self._parts and self._testbed.exit_code(part) is None:
                     return f"{part} was running"
             elif event.action != "restart":
-                if part not in self._parts or self._code(part) is not None:
+                if part not in self._parts or self._testbed.exit_code(part) is not None:
                     return f"{part} was not running"
                 if (event.action, part in self._paused) in (("pause", True), ("resume", False)):
                     return f"{part} was {'' if part in self._paused else 'not '}paused"
@@ -184,23 +185,20 @@ class Player:
             self._say(f"{robot} has begun its tasks; quota: {self._testbed.held(robot)}")
 
     def _ended(self) -> list[str]:
-        return [robot for robot in self._robots if robot in self._parts and self._code(robot) is not None]
+        return [
+            robot
+            for robot in self._robots
+            if robot in self._parts and self._testbed.exit_code(robot) is not None
+        ]
 
     def _start(self, robot: str) -> None:
         """Start a robot. Until it begins its first task it may use a whole CPU, so that it is ready soon."""
         self._testbed.start(robot)
         self._parts.add(robot)
-        begun = next(
-            files.answers
-            for files in RobotFiles.of(self._scenario, self._testbed.out)
-            if files.robot == robot
-        )
+        begun = self._robots[robot]
         if not begun.exists() and self._scenario.robot.cpus < BOOT_CPUS:
             self._testbed.set_cpus(robot, BOOT_CPUS)
             self._booting[robot] = begun
-
-    def _code(self, part: str) -> int | None:
-        return self._testbed.exit_code(part)
 
     def _over(self) -> bool:
         """Whether all robots have ended and no event will start one again."""
@@ -210,9 +208,6 @@ class Player:
             event.action in ("start", "restart") and event.value in self._robots and event.at_s is not None
             for event in self._timeline.left()
         )
-
-    def _limit_s(self) -> float:
-        return max(ROBOT_S_AT_LEAST, ROBOT_S_A_TASK * self._runs())
 
     def _runs(self) -> int:
         """The tasks that the first robot runs, those of `alone` included."""

@@ -1,6 +1,6 @@
 """Digests of everything that a run depends on: if both are unchanged, the run need not be played again.
 
-`compare/resume` compares them with those in the summary of an earlier run.
+`compare/runs` compares them with those in the summary of an earlier run.
 """
 
 import contextlib
@@ -65,10 +65,7 @@ def _sources(scenario: Scenario) -> Iterator[Path]:
 
 
 def _of_file(path: Any) -> str:
-    """The digest of a file that a scenario names.
-
-    For a map it covers the cells, which are in another file.
-    """
+    """The digest of a file of the scenario; that of a map covers its cells, which are in another file."""
     assert isinstance(path, Path), path
     if path.suffix not in (".yaml", ".yml", ".map"):
         return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -6,7 +6,6 @@ What is in them is described in docs/formats.md.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 from offboard.common.errors import ConfigError, DataError
 from offboard.loadgen import robot_files
@@ -34,7 +33,7 @@ class RobotFiles:
     seed: int
 
     @classmethod
-    def of(cls, scenario: Scenario, out: Path) -> Iterator[Self]:
+    def of(cls, scenario: Scenario, out: Path) -> "Iterator[RobotFiles]":
         """One for each robot. Only the first robot's files have names without a number."""
         for n, robot in enumerate(scenario.robots()):
             suffix = robot.removeprefix(ROBOT)

@@ -4,11 +4,12 @@ All figures of the run are in its summary; `outcome_figures` computes them.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.outcome_figures import FIGURES
-from offboard.loadgen.table.table_columns import MARKDOWN, ColumnSettings
+from offboard.loadgen.table.table_columns import ColumnSettings
 from offboard.loadgen.table.table_formats import Heading, Table
 
 
@@ -20,12 +21,15 @@ class RobotLine:
     tasks: int
     lost: float | None
     failed: float | None
-    mean_ms: float | None
-    p95_ms: float | None
-    p99_ms: float | None
-    late_percent: float | None
-    cloud_percent: float | None
-    twice_percent: float | None
+    mean_ms: float | None = None
+    p95_ms: float | None = None
+    p99_ms: float | None = None
+    cloud_percent: float | None = None
+    twice_percent: float | None = None
+    late_percent: float | None = None
+    empty_percent: float | None = None
+    age_ms: float | None = None
+    seam: float | None = None
     note: str = ""
 
 
@@ -41,33 +45,27 @@ HEADINGS: Mapping[str, Heading] = {
     "cloud_percent": Heading("to cloud %", r"to cloud \%", 1),
     "twice_percent": Heading("on both %", r"on both \%", 1),
 }
+OF_STREAMS: Mapping[str, Heading] = {
+    **{name: HEADINGS[name] for name in ("robot", "tasks", "lost", "failed")},
+    "empty_percent": Heading("empty %", r"empty \%", 2),
+    "age_ms": Heading("age ms", "age ms", 0),
+    "seam": Heading("seam", "seam", 3),
+}
 
 
 def run_table(name: str, outcome: Outcome) -> str:
     """One line for each robot of the run; `late` is undefined without a deadline."""
-    lines = [_line(robot, _of(robot, outcome)) for robot in outcome.asked]
-    table = Table(f"{name}, from when each task was due to its answer:", {"scenario": name}, HEADINGS, lines)
-    return ColumnSettings().text([table], MARKDOWN)
+    streams = any(one.step is not None for one in outcome.answered)
+    headings = OF_STREAMS if streams else HEADINGS
+    lines = [_line(robot, outcome.of([robot]), headings) for robot in outcome.asked]
+    about = "steps of a stream" if streams else "from when each task was due to its answer"
+    table = Table(f"{name}, {about}:", {"scenario": name}, headings, lines)
+    return ColumnSettings().text([table])
 
 
-def _of(robot: str, outcome: Outcome) -> Outcome:
-    answered = [one for one in outcome.answered if one.robot == robot]
-    return replace(outcome, asked={robot: outcome.asked[robot]}, answered=answered)
-
-
-def _line(robot: str, outcome: Outcome) -> RobotLine:
-    def figure(name: str) -> float | None:
-        return FIGURES[name].compute(outcome)
-
-    return RobotLine(
-        robot,
-        tasks=outcome.asked[robot],
-        lost=figure("lost"),
-        failed=figure("failed"),
-        mean_ms=figure("mean_ms"),
-        p95_ms=figure("p95_ms"),
-        p99_ms=figure("p99_ms"),
-        late_percent=None if outcome.deadline_s is None else figure("late_percent"),
-        cloud_percent=figure("cloud_percent"),
-        twice_percent=figure("twice_percent"),
-    )
+def _line(robot: str, outcome: Outcome, headings: Mapping[str, Heading]) -> RobotLine:
+    shown = headings.keys() & FIGURES.keys()
+    if outcome.deadline_s is None:
+        shown -= {"late_percent"}
+    figures: dict[str, Any] = {name: FIGURES[name].compute(outcome) for name in shown}
+    return RobotLine(robot, outcome.asked[robot], **figures)

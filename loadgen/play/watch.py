@@ -89,30 +89,45 @@ def _has_screen() -> bool:
     return sys.platform == "darwin" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
 
 
-class RunLive:
-    """The source of the page of a run: follows the files in its folder."""
+def recorded_look(path: Path, kind: str | None) -> Look:
+    """All tasks of a kind and all events that are in a trace, or in the folder of a run, as one look."""
+    tasks: list[Any] = []
+    events: list[Any] = []
+    for look in RunLive(path).looks():
+        if not look.tasks and not look.events:
+            break
+        tasks += [task for task in look.tasks if kind in (None, task["kind"])]
+        events += look.events
+    return Look("report", 0.0, tasks, events, over=True)
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+
+class RunLive:
+    """The source of the page of a run: follows the files in its folder. A single trace has only tasks."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
 
     def looks(self) -> Generator[Look]:
         files: dict[Path, GrowingFile] = {}
-        events, began_s = GrowingFile(self._folder / EVENTS), None
+        events, began_s = GrowingFile(self._path / EVENTS), None
         while True:
-            over = (self._folder / SUMMARY).exists()  # before the files are read: it is written last
-            for path in sorted(self._folder.glob("trace*.jsonl")):
-                if path not in files and _TRACE.fullmatch(path.name):
-                    files[path] = GrowingFile(path)
+            over = (self._path / SUMMARY).exists()  # before the files are read: it is written last
+            for path in self._traces():
+                files.setdefault(path, GrowingFile(path))
             tasks = [
-                {**line, "robot": f"{ROBOT}{suffix}"} if len(files) > 1 else line
+                {**line, "robot": f"{ROBOT}{path.stem.removeprefix('trace')}"} if len(files) > 1 else line
                 for path, file in files.items()
-                for suffix in _TRACE.findall(path.name)
                 for line in file.new_lines()
             ]
             if began_s is None and tasks:
                 began_s = min(datetime.fromisoformat(line["started_at"]).timestamp() for line in tasks)
             happened = [] if began_s is None else [_at(line, began_s) for line in events.new_lines()]
             yield Look("run", time.time(), tasks, [one for one in happened if one], over=over and not tasks)
+
+    def _traces(self) -> list[Path]:
+        if self._path.is_file():
+            return [self._path]
+        return [path for path in sorted(self._path.glob("trace*.jsonl")) if _TRACE.fullmatch(path.name)]
 
 
 def _at(event: dict[str, Any], began_s: float) -> dict[str, Any] | None:

@@ -5,14 +5,14 @@ What a change does to bytes is left to the relay. Toxiproxy's API is in `toxipro
 
 import contextlib
 from collections.abc import Iterator
-from typing import Any, Protocol
+from typing import Any
 
 from offboard.common.errors import ConfigError, MissingExtra
-from offboard.common.live.live_files import DOCS_PATHS
-from offboard.common.live.live_pages import LivePages
+from offboard.common.live.live_files import DOCS_PATHS, LivePages
 from offboard.common.security.http_guard import HttpGuard
 from offboard.loadgen.relay.link.link import NAMES
-from offboard.loadgen.relay.link_schedule import Linked, Schedule, parse_schedule
+from offboard.loadgen.relay.link_schedule import Schedule, parse_schedule
+from offboard.loadgen.relay.tcp.relay import Relay
 
 try:
     import uvicorn
@@ -29,16 +29,6 @@ except ImportError as error:
 
 BODY_BYTES_MAX = 4 << 20  # 20,000 measured delays for each direction take a fifth of this
 STOP_S = 1  # time for replies in progress when the relay stops
-
-
-class Relayed(Linked, Protocol):
-    """The relay, as far as the control API uses it."""
-
-    def status(self) -> dict[str, Any]:
-        """Counts of connections and bytes."""
-
-    def begin_recording(self) -> None:
-        """Play the recording of the link from its beginning; ConfigError if there is none."""
 
 
 class Change(BaseModel):
@@ -117,7 +107,7 @@ class ControlServer(uvicorn.Server):
 
 
 def control_app(
-    relay: Relayed,
+    relay: Relay,
     schedule: Schedule,
     *,
     token: str | None = None,
@@ -141,7 +131,7 @@ def control_app(
     return app
 
 
-def _add_link(app: FastAPI, relay: Relayed, *, insecure: bool) -> None:
+def _add_link(app: FastAPI, relay: Relay, *, insecure: bool) -> None:
     @app.get("/health")
     async def health() -> dict[str, Any]:
         """The event loop of the relay is running."""
@@ -170,7 +160,7 @@ def _add_link(app: FastAPI, relay: Relayed, *, insecure: bool) -> None:
         return {"reset": relay.reset()}
 
 
-def _add_schedule(app: FastAPI, relay: Relayed, schedule: Schedule) -> None:
+def _add_schedule(app: FastAPI, relay: Relay, schedule: Schedule) -> None:
     @app.get("/schedule")
     async def read_schedule() -> dict[str, Any]:
         """Seconds since the start, number of events played, and all events in order."""
@@ -198,7 +188,7 @@ async def _bad_request(_request: Request, error: Exception) -> JSONResponse:
     return JSONResponse({"detail": "; ".join(map(_sentence, error.errors()))}, 422)
 
 
-def _shown(relay: Relayed) -> dict[str, Any]:
+def _shown(relay: Relay) -> dict[str, Any]:
     link = relay.link
     outage = link.up.outage and link.down.outage
     return {"up": link.up.shown(), "down": link.down.shown(), "outage": outage, **relay.status()}

@@ -8,28 +8,18 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from offboard.common.errors import ConfigError, DataError
 from offboard.common.toml_file import line_of, read_toml, unknown
 from offboard.loadgen.relay.link.link import CONDITIONS, Link
+from offboard.loadgen.relay.tcp.relay import Relay
 
 EVENTS_MAX = 10_000
 AT_S_MAX = 1e6
 KEYS = ("at_s", "up", "down", "reset", *CONDITIONS)
 
 log = logging.getLogger(__name__)
-
-
-class Linked(Protocol):
-    """A relay: it has a link that can be changed, and connections that can be reset."""
-
-    @property
-    def link(self) -> Link: ...
-
-    def set_link(self, link: Link, by: str) -> None: ...
-
-    def reset(self) -> int: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +39,10 @@ class Event:
 
 
 class Schedule:
-    """Plays events on a link in order of time; an event that is already due is played at once."""
+    """Plays events on the link of a relay, in order of time; an event that is due is played at once."""
 
-    def __init__(self, linked: Linked) -> None:
-        self._linked = linked
+    def __init__(self, relay: Relay) -> None:
+        self._relay = relay
         self._events: Sequence[Event] = ()
         self._done = 0
         self._start_s = 0.0
@@ -89,11 +79,11 @@ class Schedule:
     def _apply(self, event: Event) -> None:
         try:
             if event.changes:
-                self._linked.set_link(self._linked.link.changed(event.changes), by="schedule")
+                self._relay.set_link(self._relay.link.changed(event.changes), by="schedule")
         except ConfigError as error:  # the link has changed since the schedule was checked
             log.warning("schedule: the event at %g s was skipped: %s; remedy: correct it", event.at_s, error)
         if event.reset:
-            self._linked.reset()
+            self._relay.reset()
 
 
 def read_schedule(path: Path, link: Link) -> tuple[Event, ...]:

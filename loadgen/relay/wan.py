@@ -5,26 +5,27 @@ The relay is in `tcp.relay`, its HTTP control API in `control_api`.
 
 import asyncio
 import contextlib
+import select
+import selectors
 import signal
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
 from offboard.common.config import setting
 from offboard.common.errors import ConfigError
-from offboard.common.security.address import address
-from offboard.common.security.exposure import LOOPBACK, OPEN_REMEDY, on_loopback, warn_each_minute
-from offboard.common.security.private_files import read_token
+from offboard.common.security.address import LOOPBACK, OPEN_REMEDY, address, on_loopback, warn_each_minute
+from offboard.common.security.plain_files import read_token
 from offboard.loadgen.relay.control_api import ControlServer, control_app
-from offboard.loadgen.relay.link.bandwidth import CHUNK_BYTES
 from offboard.loadgen.relay.link.link_settings import RECORDED, LinkFlags
+from offboard.loadgen.relay.link.pipe import CHUNK_BYTES
 from offboard.loadgen.relay.link_schedule import Schedule, read_schedule
 from offboard.loadgen.relay.tcp.link_record import LinkRecord
-from offboard.loadgen.relay.tcp.precise_selector import PreciseSelector
-from offboard.loadgen.relay.tcp.relay import Relay
-from offboard.loadgen.relay.tcp.tcp_address import BACKLOG, bind, name_of
-from offboard.loadgen.relay.toxiproxy.proxies import Proxies, RelaySettings
+from offboard.loadgen.relay.tcp.relay import BACKLOG, Relay, RelaySettings, bind, name_of
+from offboard.loadgen.relay.toxiproxy.proxies import Proxies
 from offboard.loadgen.relay.toxiproxy.toxiproxy_api import toxiproxy_app
 
+SPIN_S = 0.0003
 END_S = 1.0  # time for the connections to end when the relay stops
 ADDRESSES, ACCESS, RUN, LIMITS = "addresses", "access", "run", "limits"
 
@@ -80,11 +81,7 @@ class WanConfig(LinkFlags, AddressFlags):
     )
     seed: int = setting(0, "seed of jitter and loss", group=RUN)
     connections_max: int = setting(
-        256,
-        "connections at the same time; further ones are closed",
-        group=LIMITS,
-        rare=True,
-        minimum=1,
+        256, "connections at the same time; further ones are closed", group=LIMITS, rare=True, minimum=1
     )
     buffer_bytes: int = setting(
         8 << 20,
@@ -120,8 +117,12 @@ class WanConfig(LinkFlags, AddressFlags):
 
 def run_wan(config: WanConfig) -> int:
     """Relay until SIGTERM or Ctrl-C."""
-    with asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(PreciseSelector())) as runner:
-        runner.run(_serve(config))
+    loop = asyncio.SelectorEventLoop(PreciseSelector())
+    try:
+        loop.run_until_complete(_serve(config))
+    finally:
+        loop.run_until_complete(_end_rest(loop))
+        loop.close()
     return 0
 
 
@@ -133,25 +134,15 @@ async def _serve(config: WanConfig) -> None:
         loop = asyncio.get_running_loop()
         events = () if config.schedule is None else read_schedule(config.schedule, config.link)
         record = None if config.truth is None else LinkRecord(config.truth, loop.time())
-        relay = Relay(
-            address("--to", config.to),
-            config.link,
-            seed=config.seed,
-            connections_max=config.connections_max,
-            buffer_bytes=config.buffer_bytes,
-            record=record,
-        )
+        settings = RelaySettings(config.seed, config.connections_max, config.buffer_bytes)
+        relay = Relay(address("--to", config.to), config.link, settings, record=record)
         schedule = Schedule(relay)
         app = control_app(
-            relay,
-            schedule,
-            token=token,
-            loopback=config.http_on_loopback,
-            insecure=bool(config.open_ways),
+            relay, schedule, token=token, loopback=config.http_on_loopback, insecure=bool(config.open_ways)
         )
         servers = [(ControlServer(app), http)]
         where = f"relay {name_of(listening)} -> {config.to}, control http://{name_of(http)}/link"
-        proxies = Proxies(RelaySettings(config.seed, config.connections_max, config.buffer_bytes))
+        proxies = Proxies(settings)
         if config.toxiproxy is not None:
             toxiproxy = sockets.enter_context(bind("--toxiproxy", config.toxiproxy))
             servers.append((ControlServer(toxiproxy_app(proxies)), toxiproxy))
@@ -178,3 +169,30 @@ async def _serve(config: WanConfig) -> None:
         if record is not None:
             await relay.ended(END_S)
             record.close(loop.time())
+
+
+async def _end_rest(loop: asyncio.AbstractEventLoop) -> None:
+    """End what `_serve` has left, as `asyncio.run` does."""
+    rest = asyncio.all_tasks() - {asyncio.current_task()}
+    for task in rest:
+        task.cancel()
+    await asyncio.gather(*rest, return_exceptions=True)
+    await loop.shutdown_asyncgens()
+    await loop.shutdown_default_executor()
+
+
+class PreciseSelector(selectors.EpollSelector):
+    """Ends a wait on time, where epoll alone rounds every timer up to a whole millisecond.
+
+    A core that sleeps wakes up about 0.2 ms late, so the last SPIN_S of a wait are polled.
+    """
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        if timeout is None or timeout <= 0:
+            return super().select(timeout)
+        end = time.monotonic() + timeout
+        if timeout > SPIN_S:
+            select.select([self.fileno()], [], [], timeout - SPIN_S)
+        while not (ready := super().select(0)) and time.monotonic() < end:
+            pass
+        return ready

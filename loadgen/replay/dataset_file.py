@@ -136,7 +136,7 @@ def _task(values: Mapping[str, Any]) -> RecordedTask:
 
 
 def _execution(site: str, values: Mapping[str, Any]) -> Execution:
-    part_s = {part: values.get(f"{site}_{part}") for part in PARTS}
+    part_s: dict[str, Any] = {part: values.get(f"{site}_{part}") for part in PARTS}
     bytes_out, bytes_in = values.get(f"{site}_bytes_out"), values.get(f"{site}_bytes_in")
     if bytes_out is None or bytes_in is None:
         bytes_out = bytes_in = 0  # unknown: their sum is learned, and half of it would be wrong
@@ -144,10 +144,7 @@ def _execution(site: str, values: Mapping[str, Any]) -> Execution:
         site,
         values[f"{site}_s"],
         values.get("work"),
-        queue_s=part_s["queue_s"],
-        run_s=part_s["run_s"],
-        network_s=part_s["network_s"],
-        cpu_s=part_s["cpu_s"],
+        **part_s,
         bytes_out=bytes_out,
         bytes_in=bytes_in,
         packed=values.get(f"{site}_packed") or (),

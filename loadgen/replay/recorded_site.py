@@ -11,8 +11,8 @@ from functools import partial
 from offboard.common.errors import CloudBroken, Overtaken
 from offboard.common.tasks import Kind, Task
 from offboard.loadgen.replay.recorded_tasks import RecordedTask
-from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
 from offboard.robot_client.sites.runner import NOTHING, ONBOARD, UNMEASURED, Condition, Execution, Sending
+from offboard.testing.virtual_clock import VirtualClock
 
 GIVEN_UP = 2.0  # times as long as the task took: when a run ends whose own end the trace does not hold
 

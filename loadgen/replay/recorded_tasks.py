@@ -156,17 +156,15 @@ def _decision(fields: Mapping[str, Any], sites: Collection[str]) -> Decision:
 
 def _execution(fields: Mapping[str, Any], work: float | None) -> Execution:
     ok = fields["ok"] and not fields["censored"]
-    part_s = {name: None if fields.get(name) is None else _number(fields[name]) for name in PARTS}
+    known = [name for name in PARTS if fields.get(name) is not None]
+    part_s: dict[str, Any] = {name: _number(fields[name]) for name in known}
     return Execution(
         fields["site"],
         _number(fields["seconds"]),
         work if ok else None,
         None if ok else _failure(fields.get("error")),
         censored=fields["censored"],
-        queue_s=part_s["queue_s"],
-        run_s=part_s["run_s"],
-        network_s=part_s["network_s"],
-        cpu_s=part_s["cpu_s"],
+        **part_s,
         bytes_out=int(_number(fields.get("bytes_out", 0))),
         bytes_in=int(_number(fields.get("bytes_in", 0))),
         started=fields.get("started", True),

@@ -11,89 +11,31 @@ from typing import Any
 
 import numpy as np
 
-from offboard.common.config import check, setting
-from offboard.common.errors import ConfigError, DataError
+from offboard.common.config import REQUIRED
+from offboard.common.errors import DataError
 from offboard.loadgen import rivals
+from offboard.loadgen.policy_name import split_objective
 from offboard.loadgen.progress import progress
-from offboard.loadgen.replay import same_decisions
 from offboard.loadgen.replay.dataset_file import measured_tasks, read_recorded
 from offboard.loadgen.replay.recorded_tasks import RecordedTask
-from offboard.loadgen.replay.settings_of_run import DecidedBy, settings_of_run
-from offboard.loadgen.replay.virtual_robot import VirtualRobot
+from offboard.loadgen.replay.replay_settings import ReplayConfig
+from offboard.loadgen.replay.virtual_robot import VirtualRobot, compare, same_percent
 from offboard.loadgen.table import confidence_intervals, table_two_figures
 from offboard.loadgen.table.confidence_intervals import Picks
 from offboard.loadgen.table.measured_rows import Column, Rows, read_lived
 from offboard.loadgen.table.measurement_notes import read_noted
-from offboard.loadgen.table.table_formats import Heading, Table
-from offboard.loadgen.table.table_settings import FULL, MeasuredTimesConfig
+from offboard.loadgen.table.table_formats import Table, column, headings_of
+from offboard.loadgen.table.table_settings import FULL
 from offboard.loadgen.table.table_two_figures import Scored, Sides
 from offboard.robot_client import policies
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.policies import Policy
 from offboard.robot_client.policies.objectives import MEAN, Mean
-from offboard.robot_client.predictors.window import WINDOW, WINDOW_MAX
 from offboard.robot_client.settings import Settings
 
 ORACLE = "oracle"
 RECORDED = "as recorded"
 OWN = "each policy's own"
-
-
-@dataclass(frozen=True)
-class ReplayConfig(MeasuredTimesConfig):
-    """Which policies to replay, and with which predictor."""
-
-    policies: tuple[str, ...] = setting(
-        (*rivals.RULES, policies.DEFAULT),
-        f"policies to replay: {rivals.POLICY_HELP}; POLICY+OBJECTIVE, such as default+p95, decides by another"
-        " objective than the run",
-        metavar="NAME,NAME,..",
-    )
-    predictor: str | None = setting(
-        None,
-        "predictor for all policies (default: that of the run, if its summary.json names one, or else the "
-        f"one that each policy brings): {rivals.PREDICTOR_HELP}",
-        metavar="NAME",
-    )
-    window: int | None = setting(
-        None,
-        "window length N; the first N rows are warm-up and are not scored (default: that of the run, if its "
-        f"summary.json is next to the trace, or else {WINDOW})",
-        minimum=2,
-        maximum=WINDOW_MAX,
-    )
-    decided_by: DecidedBy = DecidedBy()
-
-    def __post_init__(self) -> None:
-        check(self)
-        for policy in self.policies:
-            rivals.policy(rivals.split_objective(policy, "--policies")[0], "--policies")
-        if self.predictor is not None:
-            rivals.predictor(self.predictor, "--predictor")
-
-    @property
-    def length(self) -> int:
-        """The window length N."""
-        return WINDOW if self.window is None else self.window
-
-    def as_in_the_run(self, path: Path) -> "ReplayConfig":
-        """With the objective of the run of this trace, and with its window and predictor if none are given.
-
-        ConfigError if a policy has an objective that needs what the run does not say.
-        """
-        run = settings_of_run(path)
-        for policy in self.policies:
-            objective = rivals.split_objective(policy, "--policies")[1]
-            try:
-                run.decided_by.make(objective)
-            except ConfigError as error:
-                raise ConfigError(f"--policies: {policy!r}: {error} in the summary of the run") from None
-        return replace(
-            self,
-            window=self.window or run.window,
-            predictor=self.predictor or run.predictor,
-            decided_by=run.decided_by,
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,37 +46,23 @@ class PolicyScore:
     all decisions of the run that the policy makes too, if it has learnt what the run had learnt.
     """
 
-    policy: str
-    bound: str = ""
-    scored: int = 0
-    mean_s: float | None = None
-    p95_s: float | None = None
-    p99_s: float | None = None
-    time_over_oracle: float | None = None
-    regret_s: float | None = None
-    regret_mean_s: float | None = None
-    accuracy_percent: float | None = None
-    cloud_percent: float | None = None
-    both_percent: float | None = None
-    same_percent: float | None = None
+    policy: str = column("policy", default=REQUIRED)
+    bound: str = column("bound", default="")
+    scored: int = column("tasks", 0, default=0)
+    mean_s: float | None = column("mean s", 5, latex="mean")
+    p95_s: float | None = column("P95 s", 5, latex="P95")
+    p99_s: float | None = column("P99 s", 5, latex="P99")
+    time_over_oracle: float | None = column("time/oracle", 5)
+    regret_s: float | None = column("regret s", 5, latex="regret")
+    regret_mean_s: float | None = column("regret s/task", 5, latex="regret/task")
+    accuracy_percent: float | None = column("accuracy %", 2, latex=r"acc. \%")
+    cloud_percent: float | None = column("cloud %", 2)
+    both_percent: float | None = column("on both sites %", 2)
+    same_percent: float | None = column("as the run %", 2)
     note: str = ""
 
 
-HEADINGS: dict[str, Heading] = {
-    "policy": Heading("policy", "policy", None),
-    "bound": Heading("bound", "bound", None),
-    "scored": Heading("tasks", "tasks", 0),
-    "mean_s": Heading("mean s", "mean", 5),
-    "p95_s": Heading("P95 s", "P95", 5),
-    "p99_s": Heading("P99 s", "P99", 5),
-    "time_over_oracle": Heading("time/oracle", "time/oracle", 5),
-    "regret_s": Heading("regret s", "regret", 5),
-    "regret_mean_s": Heading("regret s/task", "regret/task", 5),
-    "accuracy_percent": Heading("accuracy %", r"acc. \%", 2),
-    "cloud_percent": Heading("cloud %", r"cloud \%", 2),
-    "both_percent": Heading("on both sites %", r"on both sites \%", 2),
-    "same_percent": Heading("as the run %", r"as the run \%", 2),
-}
+HEADINGS = headings_of(PolicyScore)
 FIRST = ("same_percent", "scored", "mean_s", "p95_s", "time_over_oracle", "accuracy_percent", "cloud_percent")
 
 
@@ -153,8 +81,8 @@ class Replayed:
 
 def run_replay(path: Path, config: ReplayConfig) -> int:
     """Print the tables of `path` to stdout."""
-    config.check_columns(HEADINGS, config.format)
-    sys.stdout.write(config.text(tables(path, config), config.format))
+    config.check_columns(HEADINGS)
+    sys.stdout.write(config.text(tables(path, config)))
     return 0
 
 
@@ -209,12 +137,10 @@ def best(rows: Rows) -> Replayed:
 
 
 def _same_percent(run: Sequence[RecordedTask], policy: str, config: ReplayConfig) -> float | None:
-    """The share of the run's decisions that this policy makes too."""
-
     def robot(sites: Sequence[str]) -> VirtualRobot:
         return VirtualRobot(*_made(policy, config), tells_work=_tell_work(run), sites=sites)
 
-    return same_decisions.same_percent(same_decisions.compare(run, robot))
+    return same_percent(compare(run, robot))
 
 
 def _made(policy: str, config: ReplayConfig) -> tuple[Policy, Memories]:
@@ -222,13 +148,12 @@ def _made(policy: str, config: ReplayConfig) -> tuple[Policy, Memories]:
 
     Without a predictor in the settings, it has its own.
     """
-    policy, objective = rivals.split_objective(policy, "policy")
-    name = rivals.policy(policy)
+    name, objective = split_objective(policy, "policy")
     settings = Settings(
         predictor=None if config.predictor is None else rivals.predictor(config.predictor),
         window=config.length,
         objective=config.decided_by.make(objective) if policies.weighs_cost(name) else Mean(),
-        energy=config.decided_by.energy,
+        energy=config.decided_by,
         seed=config.seed,
     )
     return policies.make(name, config.seed), settings.make_memories(name)
@@ -240,12 +165,8 @@ def _tell_work(tasks: Sequence[RecordedTask]) -> bool:
 
 def _about(config: ReplayConfig, asked: ReplayConfig) -> str:
     """With which predictor and window, and whether they are those of the run, because none were asked for."""
-    of_run = {
-        name: " of the run"
-        for name in ("predictor", "window")
-        if getattr(config, name) != getattr(asked, name)
-    }
-    predictor, window = of_run.get("predictor", ""), of_run.get("window", "")
+    predictor = " of the run" if config.predictor != asked.predictor else ""
+    window = " of the run" if config.window != asked.window else ""
     objective = config.decided_by.objective
     weighed = "" if objective == MEAN else f", objective {objective} of the run"
     return f"predictor {config.predictor or OWN}{predictor}, window {config.length}{window}{weighed}"
@@ -254,20 +175,13 @@ def _about(config: ReplayConfig, asked: ReplayConfig) -> str:
 def _table(
     path: Path, rows: Rows, config: ReplayConfig, lines: list[PolicyScore], *, about: str, feedback: str
 ) -> Table:
-    left_out = f" ({rows.left_out} tasks without both times left out)" if rows.left_out else ""
     absent = set() if config.bootstrap else {"bound"}
     if all(line.same_percent is None for line in lines):  # no policy of a run decided them
         absent.add("same_percent")
     return Table(
-        caption=f"{path}: {len(rows)} rows{left_out}, {about}.",
-        about={
-            "source": str(path),
-            "rows": len(rows),
-            "left_out": rows.left_out,
-            "feedback": feedback,
-            "predictor": config.predictor or OWN,
-            "window": config.length,
-        },
+        caption=f"{path}: {rows.counted()}, {about}.",
+        about=rows.about(path)
+        | {"feedback": feedback, "predictor": config.predictor or OWN, "window": config.length},
         headings={name: of for name, of in HEADINGS.items() if name not in absent},
         lines=lines,
         notes=rows.notes,

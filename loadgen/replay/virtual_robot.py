@@ -1,6 +1,7 @@
 """A robot in virtual time: the `Offloader` of the robot runs recorded tasks on recorded sites.
 
-Either the policy decides (`play`), or the run is followed and the policy is only asked (`follow`).
+Either the policy decides (`play`), or the run is followed and the policy is only asked (`follow`). Its
+decisions can then be compared with those of the run.
 """
 
 import contextlib
@@ -8,16 +9,14 @@ import itertools
 import math
 import operator
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from offboard.common.errors import OffloadError
 from offboard.common.tasks import Size, task
 from offboard.loadgen.replay.recorded_site import RecordedSite
 from offboard.loadgen.replay.recorded_tasks import RecordedTask
-from offboard.loadgen.simulation.model.stepped_offloader import SteppedOffloader
-from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
-from offboard.loadgen.simulation.model.walker import Walk, Walker
+from offboard.loadgen.simulation.model.stepped_offloader import SteppedOffloader, Walk, Walker
 from offboard.robot_client.execution import batch
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.policies import ALONE, PINNED, Decision, Forecast, Hedge, Policy, observe
@@ -25,8 +24,10 @@ from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.policies.decision import pairs
 from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
+from offboard.testing.virtual_clock import VirtualClock
 
 NOT_BY_A_RULE = (PINNED, ALONE, batch.NAME, observe.NAME)  # who else decides where a task runs
+DELAY_TOLERANCE = 0.05  # of the delay of a hedge: with less between two delays, they are the same decision
 ON_BOTH = Decision(ONBOARD, "all sites learn", PINNED, both=True, waits=True)
 
 
@@ -170,9 +171,40 @@ class _Chooser:
         return decision
 
 
-def by_process(tasks: Sequence[RecordedTask]) -> list[list[RecordedTask]]:
-    """The tasks of each start of the robot, which then knew nothing."""
-    return [list(group) for _, group in itertools.groupby(tasks, operator.attrgetter("process"))]
+def compare(
+    tasks: Sequence[RecordedTask], make: Callable[[Sequence[str]], VirtualRobot]
+) -> list[tuple[RecordedTask, Decision]]:
+    """Each task that a rule decided in the run, with the decision of the robot that `make` makes for sites.
+
+    The robot follows the run, so that before each task it has learnt what the run had learnt.
+    """
+    found = []
+    # A robot that is started again knows nothing.
+    for _, group in itertools.groupby(tasks, operator.attrgetter("process")):
+        process = list(group)
+        sites = tuple(dict.fromkeys(site for one in process for site in one.sites))
+        for recorded, decision in zip(process, make(sites).follow(process), strict=True):
+            if decision is not None:
+                found.append((recorded, decision))
+    return found
+
+
+def same_percent(compared: Sequence[tuple[RecordedTask, Decision]]) -> float | None:
+    """The share of decisions that are those of the run; None if there are none."""
+    if not compared:
+        return None
+    return 100 * sum(same(one.decision, decision) for one, decision in compared) / len(compared)
+
+
+def same(run: Decision | None, replayed: Decision) -> bool:
+    """Whether both decisions start the same sites, at the same time but for DELAY_TOLERANCE."""
+    if run is None or (run.site, run.both, run.spared) != (replayed.site, replayed.both, replayed.spared):
+        return False
+    one, other = run.second, replayed.second
+    if isinstance(one, Hedge) and isinstance(other, Hedge):
+        close = math.isclose(one.after_s, other.after_s, rel_tol=DELAY_TOLERANCE)
+        return close and one.site == other.site
+    return one == other
 
 
 @task("replayed", size=lambda size, number: size)  # noqa: ARG005 - the size is known

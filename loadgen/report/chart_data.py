@@ -5,22 +5,18 @@ How they are drawn is left to `charts.py`.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
-from offboard.loadgen.table.confidence_intervals import Blocks
+from offboard.loadgen.table.confidence_intervals import Blocks, Picks
 from offboard.loadgen.table.measured_rows import Column, Rows
-from offboard.loadgen.table.predictor_evaluation import Evaluation
-from offboard.loadgen.table.table_two_figures import Score, Scored, Sides
+from offboard.loadgen.table.table_two import Evaluation
+from offboard.loadgen.table.table_two_figures import Score, Sides
 
 POINTS_MAX = 1000  # points of one series that are drawn; more make the page large and show nothing new
-SHARE_TASKS = 20  # the share of the cloud is taken over this number of tasks,
-SHARE_PARTS = 50  # or over one part in 50 of a long run; over half of a short run
 
 S = TypeVar("S", float, Column)
-Picks = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,27 +50,7 @@ class Times:
         return self.crossing is not None and self.low <= self.crossing <= self.high
 
 
-@dataclass(frozen=True, slots=True)
-class Decisions:
-    """What `policy` decided: number, seconds and site of the tasks to draw, in order.
-
-    - `of`: the number of all tasks.
-    - `share_percent`: the share of the cloud among the latest `over` tasks.
-    - `best_percent`: the same share for the oracle; None where only the time of one site is known.
-    """
-
-    policy: str
-    number: Picks
-    seconds: Column
-    to_cloud: Sides
-    share_percent: Column
-    best_percent: Column | None
-    over: int
-    of: int
-
-
-@dataclass(frozen=True, slots=True)
-class Interval:
+class Interval(NamedTuple):
     """The 95 % interval of the accuracy with one window, in percent."""
 
     low: float
@@ -125,37 +101,6 @@ def crossing(onboard: Line, cloud: Line) -> float | None:
     return found if np.isfinite(found) else None
 
 
-def decisions(
-    policy: str, seconds: Column, to_cloud: Sides, *, first: int, seed: int, best: Sides | None = None
-) -> Decisions:
-    """The chart of decisions.
-
-    Tasks are numbered from `first`. `best` says which tasks were really faster in the cloud.
-    """
-    count = len(seconds)
-    over = min(max(SHARE_TASKS, count // SHARE_PARTS), max(1, count // 2))
-    picks = thin(count, seed)
-    return Decisions(
-        policy=policy,
-        number=picks + first,
-        seconds=seconds[picks],
-        to_cloud=to_cloud[picks],
-        share_percent=share_percent(to_cloud, over)[picks],
-        best_percent=None if best is None else share_percent(best, over)[picks],
-        over=over,
-        of=count,
-    )
-
-
-def share_percent(sides: Sides, over: int) -> Column:
-    """For each task, the share of the cloud among the latest `over` tasks; NaN before there are that many."""
-    total = np.cumsum(sides, dtype=np.float64)
-    total[over:] -= total[:-over].copy()
-    total[: over - 1] = np.nan
-    found: Column = 100 * total / over
-    return found
-
-
 def ecdf(seconds: Column) -> tuple[Column, Column]:
     """Sorted times, and the percentage of tasks that took at most this time; the first step starts at 0 %."""
     values = np.sort(seconds)
@@ -170,10 +115,14 @@ def accuracy_intervals(
     found: dict[str, Interval] = {}
     for line in scores:
         scored = evaluation.predictions(line.predictor, line.window, feedback)
-        interval = None if scored is None else _accuracy_interval(scored, seed)
-        if interval is not None:
-            found[line.window] = interval
+        low, high = (None, None) if scored is None else _accuracy_interval(scored.right, seed)
+        if low is not None and high is not None:
+            found[line.window] = Interval(low, high)
     return found
+
+
+def _accuracy_interval(right: Sides, seed: int) -> tuple[float | None, float | None]:
+    return Blocks(len(right), seed=seed).interval(lambda picks: 100 * right[picks].mean(-1))
 
 
 def thin(count: int, seed: int) -> Picks:
@@ -182,15 +131,3 @@ def thin(count: int, seed: int) -> Picks:
         return np.arange(count)
     edges = np.linspace(0, count, POINTS_MAX + 1).astype(np.intp)
     return np.random.default_rng(seed).integers(edges[:-1], edges[1:])
-
-
-def _accuracy_interval(scored: Scored, seed: int) -> Interval | None:
-    """The interval of the accuracy; None if there are too few rows."""
-
-    def accuracy(picks: Picks) -> dict[str, Column]:
-        return {"accuracy_percent": 100 * right[picks].mean(-1)}
-
-    spent_s = np.where(scored.to_cloud, scored.cloud_s, scored.onboard_s)
-    right = spent_s == np.minimum(scored.onboard_s, scored.cloud_s)
-    low, high = Blocks(len(right), seed=seed).intervals(accuracy)
-    return Interval(low["accuracy_percent"], high["accuracy_percent"]) if low else None

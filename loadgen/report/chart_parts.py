@@ -48,7 +48,7 @@ def render(paint: Callable[[Figure], None]) -> Drawing:
         figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), layout="constrained")
         paint(figure)
         svg, png = io.BytesIO(), io.BytesIO()
-        figure.savefig(svg, format="svg")
+        figure.savefig(svg, format="svg", metadata={"Date": None})  # the same bytes on each day
         figure.savefig(png, format="png", dpi=PNG_DPI)
         return Drawing(svg.getvalue(), png.getvalue())
 
@@ -83,7 +83,6 @@ def logarithmic(set_scale: Callable[[str], None], axis: Axis, low: float, high: 
 
 
 def key(look: Look, label: str, *, hollow: bool = False) -> Line2D:
-    """One entry of the legend."""
     face = "white" if hollow else look.colour
     return Line2D(
         [], [], color=look.colour, linestyle=look.line, marker=look.marker, markerfacecolor=face, label=label

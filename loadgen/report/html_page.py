@@ -1,15 +1,21 @@
-"""The HTML page of a report: one file without scripts, which opens offline and makes no requests.
+"""The HTML page of a report: one file, which opens offline and makes no requests.
 
-Its charts are made fit for the page in `inline_svg.py`.
+It has the look of the page `/live`. If there are tasks to show, its top is that page: the sections, and the
+scripts with the tasks inside. What they show is said by `common/live`.
 """
 
 import base64
+import gzip
+import hashlib
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
+from pathlib import Path
 
-from offboard.loadgen.report.inline_svg import inline
+from offboard.common.live.live_files import charts_file, page_file
+from offboard.common.live.look import Look, as_json
+from offboard.loadgen.play.watch import recorded_look
 from offboard.loadgen.table.table_formats import Table, cells
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
@@ -27,21 +33,31 @@ TERMS = {
     "Regret is the time that another policy takes beyond it.",
     "paper": "The published policy: the cloud if its predicted time is lower, else onboard.",
 }
+MODULES = ("memory", "answers", "charts", "stream", "live")  # each imports only from those before it
+LOOK_MAX = 3_000_000  # characters of the packed tasks; the whole file stays below 6 MB
 RAISED = re.compile(r"\^(\w)")  # as in the heading t^c
 
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One chart, as the content of an SVG file; None if there is no chart, for the reason in the caption.
+    """One chart or map, as the content of an SVG or PNG file; None: the caption says why there is none.
 
-    `png` is a picture instead of a chart.
+    Its id on the page is `picture-NAME`: the live page has charts of its own.
     """
 
     name: str
     title: str
     caption: str
-    svg: bytes | None
-    png: bytes | None = None
+    picture: bytes | None
+
+
+@dataclass(frozen=True, slots=True)
+class LivePart:
+    """What goes into `<main>`, what goes to the end of `<body>`, and which scripts may run."""
+
+    main: str
+    scripts: str
+    policy: str
 
 
 def page(
@@ -51,34 +67,37 @@ def page(
     facts: Mapping[str, str],
     panels: Sequence[Panel],
     tables: Sequence[Table],
+    live: LivePart | None = None,
 ) -> str:
-    """The whole document. All texts are escaped here, except those inside the charts.
+    """The whole document. All texts are escaped here, except those of `live`.
 
-    `about` is shown once, at the top; it includes the notes of all tables.
+    `about` is shown once, at the top; it includes the notes of all tables. The terms explain the tables.
     """
+    live = live or LivePart("", "", "")
     said = "".join(f"<p>{escape(line)}</p>" for line in about)
+    terms = f'<section id="terms"><h2>Terms</h2><dl>{_pairs(TERMS)}</dl></section>' if tables else ""
     parts = [
         "<!doctype html>",
         '<html lang="en">',
         "<head>",
         '<meta charset="utf-8">',
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">',
+        f'<meta http-equiv="Content-Security-Policy" content="{live.policy}{POLICY}">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         '<meta name="color-scheme" content="light dark">',
         '<link rel="icon" href="data:,">',
         f"<title>{escape(title)}</title>",
-        f"<style>{CSS}</style>",
+        f"<style>{page_file('/live/live.css').path.read_text()}</style>",
         "</head>",
         "<body>",
-        f"<header><h1>{escape(title)}</h1>{said}</header>",
+        f'<header><h1>{escape(title)}</h1><p id="state" role="status"></p></header>',
         "<main>",
-        f'<dl class="facts">{_pairs(facts)}</dl>',
-        '<div class="charts">',
-        *map(_panel, panels),
-        f"<aside><h2>Terms</h2><dl>{_pairs(TERMS)}</dl></aside>",
-        "</div>",
+        f'<section id="about">{said}<dl class="facts">{_pairs(facts)}</dl></section>',
+        live.main,
+        f'<div class="charts" id="pictures">{"".join(map(_panel, panels))}</div>',
         *(_table(table, f"table-{number}") for number, table in enumerate(tables, 1)),
+        terms,
         "</main>",
+        live.scripts,
         "</body>",
         "</html>",
         "",
@@ -92,13 +111,13 @@ def _pairs(texts: Mapping[str, str]) -> str:
 
 
 def _panel(panel: Panel) -> str:
-    heading = f"<h2>{escape(panel.title)}</h2>"
-    chart = f'<div class="chart">{inline(panel.svg, panel.name, panel.title)}</div>' if panel.svg else ""
-    if panel.png:
-        data = base64.b64encode(panel.png).decode()
-        chart = f'<img src="data:image/png;base64,{data}" alt="{escape(panel.title)}">'
+    picture = ""
+    if panel.picture:
+        kind = "png" if panel.picture.startswith(b"\x89PNG") else "svg+xml"
+        data = base64.b64encode(panel.picture).decode()
+        picture = f'<img src="data:image/{kind};base64,{data}" alt="{escape(panel.title)}">'
     caption = f"<figcaption>{escape(panel.caption)}</figcaption>"
-    return f'<figure id="{panel.name}">{heading}{chart}{caption}</figure>'
+    return f'<figure id="picture-{panel.name}"><h2>{escape(panel.title)}</h2>{picture}{caption}</figure>'
 
 
 def _table(table: Table, name: str) -> str:
@@ -120,48 +139,38 @@ def _line(cells: Sequence[str]) -> str:
     return f'<tr><th scope="row">{first}</th>{"".join(f"<td>{cell}</td>" for cell in rest)}</tr>'
 
 
-CSS = """
-:root { color-scheme: light dark; --page: #f6f7f9; --card: #ffffff; --text: #1c2330; --quiet: #566072;
-  --line: #dfe3ea; --stripe: #f4f6f9; --font: system-ui, "Segoe UI", Roboto, Helvetica, Arial, sans-serif; }
-@media (prefers-color-scheme: dark) {
-  :root { --page: #12161d; --card: #1b212b; --text: #e8ecf2; --quiet: #a8b3c4; --line: #323b49;
-    --stripe: #202734; }
-}
-* { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 78rem; padding: 1.5rem clamp(0.75rem, 3vw, 2rem) 3rem;
-  background: var(--page); color: var(--text); font: 1rem/1.5 var(--font); overflow-wrap: anywhere; }
-h1 { margin: 0; font-size: 1.5rem; line-height: 1.25; }
-h2 { margin: 0 0 0.75rem; font-size: 1.05rem; }
-header p { margin: 0.2rem 0 0; color: var(--quiet); font-size: 0.9rem; }
-.facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(9.5rem, 1fr)); gap: 0.75rem;
-  margin: 1.25rem 0; }
-.facts div, figure, aside, section { background: var(--card); border: 1px solid var(--line);
-  border-radius: 0.6rem; }
-.facts div { padding: 0.6rem 0.9rem; }
-.facts dt { color: var(--quiet); font-size: 0.85rem; }
-.facts dd { font-size: 1.3rem; font-weight: 600; font-variant-numeric: tabular-nums; }
-dl, dd { margin: 0; }
-aside div { margin-top: 0.5rem; font-size: 0.9rem; }
-aside dt { font-weight: 600; }
-aside dd { color: var(--quiet); }
-.charts { display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 1rem; }
-figure, aside { margin: 0; padding: clamp(0.6rem, 2vw, 1rem); break-inside: avoid; }
-figcaption { margin-top: 0.6rem; color: var(--quiet); font-size: 0.9rem; }
-.chart { background: #ffffff; border-radius: 0.4rem; }
-.chart svg { display: block; width: 100%; height: auto; }
-figure img { display: block; width: 100%; height: auto; }
-.chart svg * { stroke-linejoin: round; stroke-linecap: butt; }
-.chart text { font-family: var(--font) !important; }
-@media (max-width: 60rem) { .charts { grid-template-columns: minmax(0, 1fr); } }
-section { margin-top: 1rem; padding: clamp(0.6rem, 2vw, 1rem); break-inside: avoid; }
-section h2 { margin: 0 0 0.5rem; font-size: 0.95rem; }
-.scroll { overflow-x: auto; }
-.scroll:focus-visible { outline: 2px solid #4c8dd6; outline-offset: 2px; }
-table { border-collapse: collapse; font-size: 0.85rem; font-variant-numeric: tabular-nums;
-  white-space: nowrap; }
-th, td { padding: 0.3rem 0.6rem; text-align: right; border-bottom: 1px solid var(--line); }
-thead th { color: var(--quiet); font-weight: 600; vertical-align: bottom; }
-th:first-child { position: sticky; left: 0; background: var(--card); text-align: left; }
-tbody tr:nth-child(even) > * { background: var(--stripe); }
-sup { line-height: 0; }
-"""
+def live_part(source: Path, kind: str | None) -> LivePart:
+    """The page of the tasks of this kind in a trace or in the folder of a run. It needs plotly."""
+    script = "".join(map(_module, MODULES))
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    return LivePart(
+        main=page_file("/live").path.read_text().partition("<main>")[2].partition("</main>")[0],
+        scripts=_data("packed-plotly", _packed(charts_file().read_bytes()))
+        + _data("packed-look", _fitting(recorded_look(source, kind)))
+        + f'<script type="module">{script}</script>',
+        policy=f"script-src 'sha256-{digest}' blob:; ",
+    )
+
+
+def _module(name: str) -> str:
+    """A module without its imports and exports: in one file all have the same scope."""
+    text = page_file(f"/live/{name}.js").path.read_text()
+    return re.sub(r"^export |^import .*\n", "", text, flags=re.MULTILINE)
+
+
+def _fitting(look: Look) -> str:
+    """The look, packed; without its first tasks if they do not fit."""
+    packed = _packed(as_json(look))
+    while len(packed) > LOOK_MAX and look.tasks:
+        out = len(look.tasks) - int(0.9 * len(look.tasks) * LOOK_MAX / len(packed))
+        look = replace(look, tasks=look.tasks[out:], left_out=look.left_out + out)
+        packed = _packed(as_json(look))
+    return packed
+
+
+def _packed(data: bytes) -> str:
+    return base64.b64encode(gzip.compress(data, mtime=0)).decode()
+
+
+def _data(name: str, packed: str) -> str:
+    return f'<script type="text/plain" id="{name}">{packed}</script>\n'

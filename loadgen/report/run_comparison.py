@@ -11,19 +11,21 @@ from typing import Any
 
 import numpy as np
 
+from offboard.common.config import REQUIRED
 from offboard.common.errors import ConfigError, DataError
 from offboard.loadgen.play.run_files import PICTURE, SUMMARY, find_source
 from offboard.loadgen.progress import progress
-from offboard.loadgen.report.chart_styles import FURTHER_LOOKS
+from offboard.loadgen.report.chart_styles import RUN_LOOKS
 from offboard.loadgen.report.html_page import Panel, page
 from offboard.loadgen.report.report import PAGE, PLAN, ReportConfig
 from offboard.loadgen.table.measured_rows import Column, is_csv, read_lived, write_whole
-from offboard.loadgen.table.table_formats import Heading, Table
+from offboard.loadgen.table.table_formats import Table, column, headings_of
 from offboard.loadgen.table.table_two_figures import Sides, quantile
 
 FOLDER = Path("out/comparison")
-RUNS_MAX = len(FURTHER_LOOKS)  # each has a line of its own in the chart
+RUNS_MAX = len(RUN_LOOKS)  # each has a line of its own in the chart
 CHART = "runs"
+CAPTION = "Tasks that the policy placed; lost, late and time / oracle are those of the whole run."
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,33 +43,21 @@ class Run:
 class RunLine:
     """One line of the table; None: undefined, or not known without a summary."""
 
-    run: str
-    policy: str
-    tasks: int
-    mean_ms: float
-    over_first: float
-    p95_ms: float
-    p99_ms: float
-    cloud_percent: float
-    lost: float | None
-    late_percent: float | None
-    time_over_oracle: float | None
+    run: str = column("run", default=REQUIRED)
+    policy: str = column("policy", default=REQUIRED)
+    tasks: int = column("tasks", 0, default=REQUIRED)
+    mean_ms: float = column("mean ms", 1, default=REQUIRED)
+    over_first: float = column("mean / first run", 3, default=REQUIRED)
+    p95_ms: float = column("P95 ms", 1, default=REQUIRED)
+    p99_ms: float = column("P99 ms", 1, default=REQUIRED)
+    cloud_percent: float = column("to cloud %", 1, default=REQUIRED)
+    lost: float | None = column("lost", 0)
+    late_percent: float | None = column("late %", 1)
+    time_over_oracle: float | None = column("time / oracle", 3)
     note: str = ""
 
 
-HEADINGS = {
-    "run": Heading("run", "run", None),
-    "policy": Heading("policy", "policy", None),
-    "tasks": Heading("tasks", "tasks", 0),
-    "mean_ms": Heading("mean ms", "mean ms", 1),
-    "over_first": Heading("mean / first run", "mean / first run", 3),
-    "p95_ms": Heading("P95 ms", "P95 ms", 1),
-    "p99_ms": Heading("P99 ms", "P99 ms", 1),
-    "cloud_percent": Heading("to cloud %", r"to cloud \%", 1),
-    "lost": Heading("lost", "lost", 0),
-    "late_percent": Heading("late %", r"late \%", 1),
-    "time_over_oracle": Heading("time / oracle", "time / oracle", 3),
-}
+HEADINGS = headings_of(RunLine)
 
 
 def run_comparison(paths: Sequence[Path], config: ReportConfig) -> int:
@@ -84,12 +74,14 @@ def run_comparison(paths: Sequence[Path], config: ReportConfig) -> int:
 
     drawing = charts.draw(CHART, {run.name: run.waited_s for run in runs})
     panels = [Panel(CHART, "Distribution of the waiting time", _caption(runs), drawing.svg), *_plans(runs)]
+    first_s = float(runs[0].waited_s.mean())
+    lines = [_line(run, first_s) for run in runs]
     text = page(
         f"{len(runs)} runs compared",
         about=[f"{run.name}: {run.path}{_settings(run)}." for run in runs],
-        facts={f"Mean time, {line.run}": f"{line.mean_ms:.1f} ms" for line in _lines(runs)},
+        facts={f"Mean time, {line.run}": f"{line.mean_ms:.1f} ms" for line in lines},
         panels=panels,
-        tables=[_table(runs)],
+        tables=[Table(CAPTION, {}, HEADINGS, lines)],
     )
     out = (config.out or FOLDER) / PAGE
     write_whole(out, text)
@@ -121,16 +113,6 @@ def _renamed(run: Run, runs: Sequence[Run]) -> Run:
     return run if alone else replace(run, name=str(run.path))
 
 
-def _table(runs: Sequence[Run]) -> Table:
-    caption = "Tasks that the policy placed; lost, late and time / oracle are those of the whole run."
-    return Table(caption, {}, HEADINGS, _lines(runs))
-
-
-def _lines(runs: Sequence[Run]) -> list[RunLine]:
-    first_s = float(runs[0].waited_s.mean())
-    return [_line(run, first_s) for run in runs]
-
-
 def _line(run: Run, first_s: float) -> RunLine:
     figures, mean_s = run.summary.get("figures", {}), float(run.waited_s.mean())
     return RunLine(
@@ -159,9 +141,8 @@ def _caption(runs: Sequence[Run]) -> str:
 
 
 def _plans(runs: Sequence[Run]) -> list[Panel]:
-    """The last plan of each run on a map."""
     pictures = [(run, run.path / PICTURE) for run in runs if (run.path / PICTURE).is_file()]
     return [
-        Panel(f"plan-{number}", f"A plan on the map, {run.name}", PLAN, svg=None, png=picture.read_bytes())
+        Panel(f"plan-{number}", f"A plan on the map, {run.name}", PLAN, picture.read_bytes())
         for number, (run, picture) in enumerate(pictures, 1)
     ]

@@ -15,7 +15,6 @@ try:
 except ImportError as error:
     raise MissingExtra("predictor k-means", "learned") from error
 
-REFIT_SHARE = 10  # as of the random forest
 FITTING = threading.Lock()  # a fit changes the number of threads of the whole process, and restores it
 # With several threads, a fit took 20 times as long: they wait for each other.
 THREADS = ThreadpoolController()
@@ -29,9 +28,7 @@ class KMeansOfSizes(Refitted):
     The spread is the standard deviation of the residuals over the window.
     """
 
-    def __init__(self, window: int, seed: int = 0) -> None:
-        super().__init__(window, REFIT_SHARE)
-        self.seed = seed
+    refit_share = 10
 
     def _fit(self, sizes: Column, seconds: Column) -> None:
         self._low = float(sizes.min())
@@ -67,4 +64,4 @@ def clusters(count: int) -> int:
     With more clusters a step is smaller, but its mean has fewer observations; both errors are equal if k
     grows with the cube root.
     """
-    return math.ceil(2 * math.cbrt(count))
+    return math.ceil(2 * math.pow(count, 1 / 3))

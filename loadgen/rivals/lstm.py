@@ -32,7 +32,6 @@ PATIENCE = 150  # the fit ends after this many updates without a better check
 BETTER = 0.999  # a check is better if its loss is below this share of the best one
 HELD_OUT_SHARE = 10  # the newest tenth decides when to stop ...
 HELD_OUT_MIN = 2  # ... unless that is fewer than this; then all observations train and decide
-REFIT_SHARE = 2  # training continues after half as many observations as the last fit had
 PREVIOUS = 5  # observations before the task in a sequence; two or ten were no better on measured datasets
 FLAT = 1e-9  # times that differ by less than this share are equal
 SCORE_MAX = 1e30  # larger scores would overflow 32 bits; all cells are saturated long before
@@ -54,11 +53,12 @@ class Lstm(Refitted):
     The spread is the standard deviation of the residuals over the window, which are mostly training errors.
     """
 
+    refit_share = 2
     previous = 0  # observations before the task that are part of its sequence
     numbers = 1  # in each step
 
     def __init__(self, window: int, seed: int = 0) -> None:
-        super().__init__(window, REFIT_SHARE)
+        super().__init__(window, seed)
         self._random = torch.Generator("cpu").manual_seed(seed)
         self._network = _Network(self.numbers, self._random)
 

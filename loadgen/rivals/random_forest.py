@@ -14,21 +14,19 @@ except ImportError as error:
     raise MissingExtra("predictor random-forest", "learned") from error
 
 TREES = 100  # scikit-learn's default
-REFIT_SHARE = 10  # a fit takes a tenth of a second, so a tenth as many observations must come before the next
 
 
 class RandomForest(Refitted):
     """scikit-learn's RandomForestRegressor on the size, stored as the step function that it is.
 
-    It is fitted again after a tenth as many observations as the last fit had.
+    It is fitted again after a tenth as many observations as the last fit had, because a fit takes a tenth of
+    a second.
     A forest does not extrapolate: sizes beyond the smallest and largest one are predicted as those two.
     The spread is the standard deviation of the out-of-bag residuals: each observation is compared with the
     trees that were not trained on it.
     """
 
-    def __init__(self, window: int, seed: int = 0) -> None:
-        super().__init__(window, REFIT_SHARE)
-        self.seed = seed
+    refit_share = 10
 
     def _fit(self, sizes: Column, seconds: Column) -> None:
         self._low = float(sizes.min())

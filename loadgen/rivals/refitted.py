@@ -17,15 +17,15 @@ Column = npt.NDArray[np.float64]
 class Refitted:
     """Keeps a window of observations, and fits the model when a prediction is asked for.
 
-    A subclass defines `_fit` and `_estimate`, and `_follow` if the model changes between two fits.
-
-    refit_share: with k, the model is fitted again after 1/k as many observations as the last fit had; with
-        None, after each observation.
+    A subclass defines `refit_share`, `_fit` and `_estimate`, and `_follow` if the model changes between two
+    fits. `seed` is for models that draw random numbers.
     """
 
-    def __init__(self, window: int, refit_share: int | None = None) -> None:
+    refit_share: int  # with k, the model is fitted again after 1/k as many observations as the last fit had
+
+    def __init__(self, window: int, seed: int = 0) -> None:
         self.window = checked_length(window)
-        self.refit_share = refit_share
+        self.seed = seed
         self._observations: deque[tuple[float, float]] = deque(maxlen=window)
         self._unfitted = 0  # observations since the last fit
         self._refit_at = 0  # that many of them start a fit; 0 before the first fit
@@ -51,7 +51,7 @@ class Refitted:
             sizes, seconds = np.array(self._observations, dtype=np.float64).T.copy()
             self._fit(sizes, seconds)
             self._unfitted = 0
-            self._refit_at = max(1, len(sizes) // self.refit_share) if self.refit_share else 1
+            self._refit_at = max(1, len(sizes) // self.refit_share)
         return self._estimate(size, ahead)
 
     def _fit(self, sizes: Column, seconds: Column) -> None:
@@ -62,5 +62,4 @@ class Refitted:
         """Take in one observation between two fits."""
 
     def _estimate(self, size: float, ahead: int) -> Prediction:
-        """The prediction of the fitted model."""
         raise NotImplementedError

@@ -9,10 +9,12 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from offboard.common.errors import BadValue, ConfigError, MissingExtra, OffloadError, describe, of_task
-from offboard.common.tasks import Kind, kind_of, load_modules
+from offboard.common.source.task_modules import load_modules
+from offboard.common.tasks import Kind, kind_of
 from offboard.loadgen.robot import answers
 from offboard.loadgen.robot.config import CallConfig
 from offboard.loadgen.robot.workload import parse_sizes, sizes
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 NAMED = "MODULE:FUNCTION"
 SAME = "same"  # function of a task's module: whether two answers are equal within its tolerance
@@ -69,6 +71,8 @@ class Calls:
 
 def make_calls(config: CallConfig) -> Calls:
     """The calls that the settings ask for; a ConfigError or DataError if they cannot be made."""
+    if config.own_stream:
+        return _follow(config)
     what = f"{NAMED} with a @task function"
     if config.inputs is None:
         function = _find_task(config.task, f"{what} of one number")
@@ -89,8 +93,17 @@ def make_calls(config: CallConfig) -> Calls:
     return calls
 
 
+def _follow(config: CallConfig) -> Calls:
+    """The policy of `stream_policy`, with its observations."""
+    from offboard.loadgen.robot.stream_policy import follow, observations
+
+    assert config.stream_hz is not None
+    run_s = {ONBOARD: 1e-3 * config.stream_onboard_ms, CLOUD: 1e-3 * config.stream_cloud_ms}
+    seen = observations(config.stream_hz, config.stream_horizon, run_s, config.seed)
+    return Calls(follow, ((one,) for one in seen))
+
+
 def _find_task(name: str, allowed: str) -> Callable[..., Any]:
-    """The function of `--task`."""
     try:
         function = _find(name)
         kind = kind_of(function)

@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 from offboard.common.config import as_dict, flag_of, settings_of
 from offboard.common.errors import ConfigError, OffloadError
-from offboard.common.host.logs import start_log
+from offboard.common.logs import start_log
 from offboard.common.task_states import TaskStates
 from offboard.loadgen.progress import progress
 from offboard.loadgen.robot.answers import Answers
-from offboard.loadgen.robot.config import DriveConfig, MapSettings, RobotConfig
+from offboard.loadgen.robot.config import CallConfig, DriveConfig, Planning, RobotConfig
 from offboard.loadgen.robot.references import References, measure_alone
 from offboard.loadgen.robot.run import OwnRecord, Run
+from offboard.loadgen.robot.stream_run import run_stream
 from offboard.loadgen.robot.work import Plans, Work, make_work
 from offboard.loadgen.robot_files import alone_path, reference_path
 from offboard.robot_client.offloader import Offloader
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
     from offboard.robot_client.records.metrics import Metrics
 
 log = logging.getLogger(__name__)
-
-Observer = Callable[[Record], None]
 
 
 def run_robot(config: RobotConfig) -> int:
@@ -79,7 +78,7 @@ def write_drive_record(config: DriveConfig, work: Plans) -> None:
 
     if config.trace is None or config.answers is None:
         return
-    names = {flag_of(field) for field in settings_of(MapSettings)} | {"seed"}
+    names = {flag_of(field) for field in settings_of(Planning)} | {"seed"}
     settings = {name: value for name, value in as_dict(config).items() if name in names and value is not None}
     DriveRecord(config.answers, settings, work.robot.prior).write(config.trace)
 
@@ -132,14 +131,21 @@ def _run_tasks(
         _warn_of_absent("starting", absent)
         gc.collect()
         gc.freeze()  # so that collections during the run do not look at what exists now
-        run.run()
+        if isinstance(config, CallConfig) and config.stream_hz is not None:
+            run_stream(config, work, offload, say=print, answers=answers)
+        else:
+            run.run()
 
 
 def _observed(config: RobotConfig, states: TaskStates, own: OwnRecord, trace: Trace | None) -> Offloader:
     """The offloader whose tasks go into the trace, the metrics and the live page."""
     metrics = _metrics(config, trace)
-    observers: list[Observer] = [own, *([trace.write] if trace else []), *([metrics] if metrics else [])]
-    settings = config.settings(config.seed)
+    observers: list[Callable[[Record], None]] = [
+        own,
+        *([trace.write] if trace else []),
+        *([metrics] if metrics else []),
+    ]
+    settings = config.settings()
     offload = _connect(
         config,
         states,
@@ -156,7 +162,7 @@ def _observed(config: RobotConfig, states: TaskStates, own: OwnRecord, trace: Tr
 def _connect(
     config: RobotConfig, states: TaskStates, settings: Settings | None = None, **options: Any
 ) -> Offloader:
-    own = replace(settings or Settings(), states=states, insecure=config.insecure)
+    own = replace(settings or Settings(insecure=config.insecure), states=states)
     return Offloader.connect(
         config.cloud, timeout_s=config.timeout_s, keys=config.keys, settings=own, **options
     )

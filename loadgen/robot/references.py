@@ -5,7 +5,7 @@ Both have their own offloader, so that they and the run learn nothing from each 
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from random import Random
@@ -18,7 +18,6 @@ from offboard.loadgen.progress import progress
 from offboard.loadgen.robot.config import RobotConfig
 from offboard.loadgen.robot.summary import PROGRESS_EVERY, describe
 from offboard.loadgen.robot.work import Work
-from offboard.loadgen.robot_files import read_fields
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import BOTH
 from offboard.robot_client.records.lines import VERSION, Lines
@@ -26,8 +25,6 @@ from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 WAYS = (ONBOARD, CLOUD, BOTH)
-
-_FIELDS = ("i", "waited_s", "used", "chosen", "both", "sites")
 
 
 class References(Lines):
@@ -54,7 +51,6 @@ class References(Lines):
         self._orders = orders(tasks // every, seed, sites)
 
     def due(self, number: int) -> bool:
-        """Whether task `number` is to be measured."""
         return number % self._every == self._every - 1
 
     def measure(
@@ -116,11 +112,6 @@ def measure_alone(config: RobotConfig, work: Work, offload: Offloader, say: Call
             whole += ran == len(WAYS)
     missing = f"; the {CLOUD} did not answer for the others" if whole < config.alone else ""
     say(f"run on each site alone and on both at once: {whole} of {config.alone} {work.noun}{missing}")
-
-
-def read(path: Path) -> Iterator[dict[str, Any]]:
-    """The fields of each line, as `read_trace` returns them."""
-    return read_fields(path, _FIELDS)
 
 
 def orders(count: int, seed: int, ways: Sequence[str]) -> list[tuple[str, ...]]:

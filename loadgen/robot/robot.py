@@ -1,20 +1,23 @@
-"""A simulated robot: it asks for paths on its map, and drives them in a world with more obstacles.
+"""A simulated robot with a LiDAR: asks for paths on its map, and drives them in a world with more obstacles.
 
-Where the paths are planned is decided by the offloader.
+Where the paths are planned is decided by the offloader. What a scan means for a plan is decided in `planner`.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from offboard.common.errors import ConfigError
-from offboard.common.planning.grid_kernels import covered
-from offboard.common.planning.maps import OCCUPIED, GridMap, largest_component, passable, path_size
+from offboard.common.planning import DIJKSTRA
+from offboard.common.planning.compiled import kernel
+from offboard.common.planning.grid_kernels import covered, largest_component
+from offboard.common.planning.maps import OCCUPIED, GridMap, passable, path_size
 from offboard.common.planning.planner import RADIUS_CELLS_MAX, RADIUS_M, Plan, Point, Pose, Scan, scan_hits
-from offboard.common.planning.planner_names import DIJKSTRA
-from offboard.loadgen.robot.lidar import BEAMS, RANGE_MAX_M, cast_scan
 
+BEAMS = 360
+RANGE_MAX_M = 10.0
 OBSTACLE_SIDE_M = (0.3, 1.0)
 LOOK_EVERY_M = 0.5
 TRIES_MAX = 5  # plans for one goal before another is picked
@@ -38,7 +41,6 @@ class SimulatedRobot:
         seed: int,
         obstacles: int = 40,
         radius_m: float = RADIUS_M,
-        beams: int = BEAMS,
         range_max: float = RANGE_MAX_M,
         size: float | None = None,
         planner: str = DIJKSTRA,
@@ -47,7 +49,7 @@ class SimulatedRobot:
             allowed = f"{RADIUS_CELLS_MAX} cells of {prior.resolution:g} m"
             raise ConfigError(f"--radius: {radius_m:g} m is too large, the maximum is {allowed}")
         self.prior, self.radius_m, self._planner = prior, radius_m, planner
-        self._beams, self._range_max = beams, range_max
+        self._range_max = range_max
         self._random = np.random.default_rng(seed)
         self.truth = _with_boxes(prior, self._free(prior), obstacles, self._random)
         self._standable = self._free(self.truth)
@@ -121,7 +123,7 @@ class SimulatedRobot:
         self.pose = Pose(float(x), float(y), yaw)
 
     def _scan(self) -> Scan:
-        return cast_scan(self.truth, self.pose, beams=self._beams, range_max=self._range_max)
+        return cast_scan(self.truth, self.pose, range_max=self._range_max)
 
     def _free(self, grid: GridMap) -> NDArray[np.int32]:
         # C order, since drawing a few cells from another order first copies all of them.
@@ -145,13 +147,11 @@ class SimulatedRobot:
         if size is None:
             away = np.abs(distances - self._random.uniform(0, distances.max()))
         else:
-            away = np.abs([self._size(distance) - size for distance in distances])
+            of_map = self.prior.resolution, self.prior.cells.size
+            away = np.abs([path_size(distance, *of_map) - size for distance in distances])
         x, y = points[away.argmin()]
         self.goal = Point(float(x), float(y))
         self._tries = 0
-
-    def _size(self, distance_m: float) -> float:
-        return path_size(distance_m, self.prior.resolution, self.prior.cells.size)
 
 
 def _with_boxes(prior: GridMap, free: NDArray[np.int32], count: int, random: np.random.Generator) -> GridMap:
@@ -162,3 +162,52 @@ def _with_boxes(prior: GridMap, free: NDArray[np.int32], count: int, random: np.
         top, left = max(row - high // 2, 0), max(col - wide // 2, 0)
         cells[top : top + high, left : left + wide] = OCCUPIED
     return GridMap(cells, prior.resolution, prior.origin)
+
+
+def cast_scan(truth: GridMap, pose: Pose, *, beams: int = BEAMS, range_max: float = RANGE_MAX_M) -> Scan:
+    """One turn of beams from `pose`, the first one straight ahead, each up to the first occupied cell.
+
+    Beams pass through unknown cells; a beam that meets nothing on the map returns infinity.
+    """
+    row, col = truth.position(pose.x, pose.y)
+    increment = 2 * math.pi / beams
+    angles = pose.yaw - truth.origin[2] + increment * np.arange(beams)
+    lengths = cast(truth.cells, row, col, np.sin(angles), np.cos(angles), range_max / truth.resolution)
+    return Scan((lengths * truth.resolution).astype(np.float32), 0.0, increment, range_max)
+
+
+@kernel
+def cast(
+    cells: NDArray[np.int8],
+    row: float,
+    col: float,
+    to_row: NDArray[np.float64],
+    to_col: NDArray[np.float64],
+    reach: float,
+) -> NDArray[np.float64]:
+    """The length of each beam in cells, up to the first occupied cell; visits every cell on the way."""
+    lengths = np.full(to_row.size, np.inf)
+    height, width = cells.shape
+    for k in range(to_row.size):
+        r, c = math.floor(row), math.floor(col)
+        step_r, next_r, wide_r = _axis(row, to_row[k])
+        step_c, next_c, wide_c = _axis(col, to_col[k])
+        length = 0.0
+        while 0 <= r < height and 0 <= c < width and length < reach:
+            if cells[r, c] >= OCCUPIED:
+                lengths[k] = length
+                break
+            if next_r < next_c:
+                length, r, next_r = next_r, r + step_r, next_r + wide_r
+            else:
+                length, c, next_c = next_c, c + step_c, next_c + wide_c
+    return lengths
+
+
+@kernel
+def _axis(start: float, direction: float) -> Any:
+    """Along one axis: step from cell to cell, length to the first cell border, length between borders."""
+    if direction == 0.0:
+        return 0, np.inf, np.inf
+    border = math.floor(start) + (1 if direction > 0 else 0)
+    return (1 if direction > 0 else -1), (border - start) / direction, abs(1.0 / direction)

@@ -14,9 +14,8 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import partial
 from typing import Any, TypeVar
 
-from offboard.common import errors
+from offboard.common import cpu_time, errors
 from offboard.common.errors import ConfigError, TaskError
-from offboard.common.host import cpu_time
 from offboard.common.tasks import kind_of
 from offboard.loadgen.progress import Progress, progress
 from offboard.loadgen.robot.answers import Answered, Answers

@@ -8,7 +8,7 @@ from array import array
 from collections.abc import Sequence
 
 from offboard.common.tasks import show_size
-from offboard.common.text.wording import duration
+from offboard.common.wording import duration
 from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.runner import ONBOARD
 
@@ -29,9 +29,8 @@ class Summary:
         self._got = 0
         self._failed = 0
         self._late = array("d")  # seconds after the due instant
-        self._both: list[
-            tuple[float | None, float | None]
-        ] = []  # seconds onboard and on the fastest other site
+        # Seconds onboard and on the fastest other site.
+        self._both: list[tuple[float | None, float | None]] = []
         self._waited: dict[str, array[float]] = {}  # seconds by the chosen site
         self._fallbacks = 0
         self._seconds = 0  # tasks that also ran on a second site
@@ -52,7 +51,6 @@ class Summary:
             self._fallbacks += len(ran) > 1 and not twice
 
     def add_failure(self, *, late_s: float = 0.0) -> None:
-        """Count a task without an answer."""
         self._failed += 1
         self._late.append(late_s)
 

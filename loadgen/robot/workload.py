@@ -66,9 +66,9 @@ def parse_sizes(specs: Sequence[str]) -> tuple[Phase, ...]:
     firsts = [phase.first for phase in phases]
     twice = [first for first, other in itertools.pairwise(firsts) if first == other]
     if twice:
-        raise ConfigError(f"--sizes: {_joined(specs)}: more than one spec holds from task {twice[0]} on")
+        raise ConfigError(f"--sizes: {','.join(specs)}: more than one spec holds from task {twice[0]} on")
     if firsts and firsts[0] != 0:
-        raise ConfigError(f"--sizes: {_joined(specs)}: no spec holds from task 0 on")
+        raise ConfigError(f"--sizes: {','.join(specs)}: no spec holds from task 0 on")
     return tuple(phases)
 
 
@@ -155,7 +155,3 @@ def _size(where: str, text: str | None) -> float:
     if not 0 <= size <= SIZE_MAX:
         raise DataError(f"{where}: {COLUMN}: {text!r} is not a number from 0 to {SIZE_MAX:g}")
     return size
-
-
-def _joined(specs: Sequence[str]) -> str:
-    return ",".join(specs)

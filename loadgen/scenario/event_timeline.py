@@ -42,13 +42,11 @@ class Event:
     on: str | None = None
 
     def shown(self) -> dict[str, Any]:
-        """The event as a scenario file writes it."""
         when = {"at_s": self.at_s} if self.at_s is not None else {"at_task": self.at_task}
         where = {} if self.on is None else {ON: self.on}
         return {**when, **where, self.action: self.value}
 
     def apply(self, testbed: Testbed) -> None:
-        """Make the event happen on a testbed."""
         match self.action:
             case "link":
                 testbed.set_link(self.on, **self.value)
@@ -105,13 +103,8 @@ def parse_events(
     `parts` are the names that events may use, `links` are the links that they change, by server.
     """
     lines = path.read_text().splitlines()
-    given = table.get("event", [])
-    if not isinstance(given, list) or not all(isinstance(event, dict) for event in given):
-        raise DataError(f"{path}: event is not a list of tables, each under [[event]]")
-    if len(given) > EVENTS_MAX:
-        raise DataError(f"{path}: {len(given)} events, at most {EVENTS_MAX} are allowed")
     events = []
-    for number, event in enumerate(given, 1):
+    for number, event in enumerate(list_of_tables(table, "event", path, most=EVENTS_MAX), 1):
         try:
             events.append(_parse(event, parts, links))
         except ConfigError as error:
@@ -119,6 +112,16 @@ def parse_events(
             place = f"{path}:{line_of(lines, 'event', number, key)}"
             raise DataError(f"{place}: {key}: {said}" if key in KEYS else f"{place}: {said}") from None
     return tuple(events)
+
+
+def list_of_tables(table: Mapping[str, Any], name: str, path: Path, *, most: int) -> list[dict[str, Any]]:
+    """The tables under each [[name]] of a scenario file."""
+    given = table.get(name, [])
+    if not isinstance(given, list) or not all(isinstance(one, dict) for one in given):
+        raise DataError(f"{path}: {name} is not a list of tables, each under [[{name}]]")
+    if len(given) > most:
+        raise DataError(f"{path}: {len(given)} {name}s, at most {most} are allowed")
+    return given
 
 
 def _parse(given: Mapping[str, Any], parts: Sequence[str], links: Mapping[str, Link]) -> Event:

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.common.task_call import check_wanted
 from offboard.common.tasks import task
-from offboard.common.wanted import check_wanted
 from offboard.loadgen.testbed.testbed import PART, ROBOT, kind_of
 
 ROUNDS_MAX = 10_000_000
@@ -44,10 +44,7 @@ def hash_pairs(count: int) -> bytes:
 
 @task("hash_rarely_long", size=float)
 def hash_rarely_long(rounds: int) -> bytes:
-    """Like `hash_rounds`, but 1 in RARE sizes takes MUCH times as long.
-
-    Each computer has its own slow sizes.
-    """
+    """Like `hash_rounds`, but 1 in RARE sizes takes MUCH times as long: other ones on each computer."""
     return _hashed_in_steps(rounds, rounds_on(os.environ.get(PART, ""), rounds))
 
 

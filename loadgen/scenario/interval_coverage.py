@@ -30,10 +30,7 @@ class Interval:
 
 
 def intervals_of(record: Mapping[str, Any], late: Late) -> tuple[Interval, ...]:
-    """The intervals of one record's executions.
-
-    Leaves out executions without an interval or a usable time.
-    """
+    """The intervals of one record's executions, without those that have no interval or no usable time."""
     found = []
     for one in record.get("executions", ()):
         outlook = record["sites"].get(one["site"], {})
@@ -59,10 +56,7 @@ def intervals_of(record: Mapping[str, Any], late: Late) -> tuple[Interval, ...]:
 
 
 def interval_columns(tasks: Sequence[Sequence[Interval]]) -> dict[str, Column]:
-    """One row for each task and one column for each of its intervals; NaN fills the rest.
-
-    Sites are numbered.
-    """
+    """One row for each task, one column for each of its intervals, filled up with NaN. Sites are numbered."""
     shape = len(tasks), max(map(len, tasks), default=0)
     numbers = {site: n for n, site in enumerate(sorted({one.site for task in tasks for one in task}))}
     columns = {

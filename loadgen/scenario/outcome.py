@@ -1,4 +1,4 @@
-"""The outcome of a played scenario: its answered tasks, its reference runs and what the parts used.
+"""The outcome of a played scenario: its answered tasks, their cost, its reference runs and use of the parts.
 
 `outcome_files` reads it from the folder of the run, `outcome_figures` computes figures from it.
 """
@@ -8,7 +8,59 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from offboard.loadgen.scenario.interval_coverage import Interval
-from offboard.loadgen.scenario.task_cost import Costing, Spent
+from offboard.loadgen.table.measured_rows import Column
+from offboard.loadgen.table.table_two_figures import known_mean, known_quantile
+from offboard.robot_client.policies.objectives import S_PER_QUALITY
+from offboard.robot_client.settings import ObjectiveOptions
+
+P95 = 95  # percent, as the objective `p95`
+
+
+@dataclass(frozen=True, slots=True)
+class Spent:
+    """What all runs of a task took: CPU seconds onboard, and bytes sent and received.
+
+    `remote_s`: how long the task waited for servers.
+    """
+
+    compute_s: float = 0.0
+    remote_s: float = 0.0
+    bytes: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One step of a stream: whether its action was a stand-in, its age, and the change at a new chunk."""
+
+    held: bool
+    age_s: float | None
+    seam: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Costing(ObjectiveOptions):
+    """The price of tasks by the objective of a scenario, from what each task took.
+
+    What a robot expects before a task is in `robot_client/policies/objectives`.
+    """
+
+    s_per_quality: float = S_PER_QUALITY
+
+    def of_task(
+        self, response_s: float, quality: float | None, spent: Spent, *, failed: bool = False
+    ) -> float:
+        """What one task counts: seconds, or for `deadline` the quality that was lost."""
+        lost = 0.0 if quality is None else 1.0 - quality
+        if self.objective == "deadline":
+            assert self.deadline_s is not None, "checked when the scenario was read"
+            return 1.0 if failed or response_s > self.deadline_s else lost
+        joules = self.onboard_j(spent.compute_s) + self.remote_j(spent.remote_s, spent.bytes)
+        worth_s = (self.s_per_joule or 0.0) * joules + (self.s_per_megabyte or 0.0) * 1e-6 * spent.bytes
+        return response_s + self.s_per_quality * lost + worth_s
+
+    def over(self, costs: Column) -> Column:
+        """The cost of the tasks in the last axis together: their mean, or their P95. NaN are left out."""
+        return known_quantile(costs, P95) if self.objective == "p95" else known_mean(costs)
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +75,7 @@ class Answered:
     `server_s` is the run time that the cloud server reported, without link and queue.
     `probed` says whether a second site ran it too, so that its time is learnt.
     `overhead_s` is what Offboard itself added to the time of the task; None: unknown.
-    `spent` is what all its runs took.
+    `spent` is what all its runs took. `step` is set if the task was a step of a stream.
     """
 
     i: int
@@ -44,6 +96,7 @@ class Answered:
     quality: float | None = None
     probed: bool = False
     spent: Spent = Spent()
+    step: Step | None = None
 
     @property
     def response_s(self) -> float:
@@ -51,7 +104,6 @@ class Answered:
         return self.ended_s - self.due_s
 
     def cost(self, costing: Costing) -> float:
-        """What the task cost at these prices."""
         return costing.of_task(self.response_s, self.quality, self.spent, failed=self.error is not None)
 
 
@@ -114,7 +166,6 @@ class Outcome:
     costing: Costing = Costing()
 
     def costs(self) -> Sequence[float]:
-        """What each answered task cost."""
         return [one.cost(self.costing) for one in self.answered]
 
     def between(self, first: int, last: int | None = None) -> "Outcome":

@@ -3,13 +3,14 @@
 Which limits they must keep is up to `pass_fail_check`.
 """
 
+import itertools
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from offboard.loadgen.scenario.outcome import Outcome, Reading
+from offboard.loadgen.scenario.outcome import Outcome, Reading, Step
 from offboard.loadgen.table.table_two_figures import quantile
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client.sites.runner import ONBOARD
@@ -38,16 +39,9 @@ def _lost(run: Outcome) -> float:
     return sum(run.asked.values()) - len({(one.robot, one.i) for one in run.answered})
 
 
-def _wrong(run: Outcome) -> float:
-    return sum(one.wrong is not None for one in run.answered)
-
-
-def _unverified(run: Outcome) -> float:
-    return sum(one.unverified is not None for one in run.answered)
-
-
-def _failed(run: Outcome) -> float:
-    return sum(one.error is not None for one in run.answered)
+def _count(field: str) -> Callable[[Outcome], float]:
+    """How many answers have something in this field."""
+    return lambda run: sum(getattr(one, field) is not None for one in run.answered)
 
 
 def _mean_ms(run: Outcome) -> float | None:
@@ -80,7 +74,6 @@ def _in_the_cloud(run: Outcome) -> list[bool]:
 
 
 def site_percent(run: Outcome, site: str) -> float | None:
-    """The share of one site in the tasks that were sent to one site."""
     return _percent(lambda run: [one.chosen == site for one in run.answered if one.chosen and not one.both])(
         run
     )
@@ -125,6 +118,26 @@ def _cost(run: Outcome) -> float | None:
     return float(run.costing.over(np.array(run.costs()))) if run.answered else None
 
 
+def _steps(run: Outcome) -> list[Step]:
+    """The steps from the first fresh action on."""
+    steps = [one.step for one in sorted(run.answered, key=lambda one: one.i) if one.step is not None]
+    return list(itertools.dropwhile(lambda step: step.held, steps))
+
+
+def _held(run: Outcome) -> list[bool]:
+    return [step.held for step in _steps(run)]
+
+
+def _age_ms(run: Outcome) -> float | None:
+    ages = [step.age_s for step in _steps(run) if step.age_s is not None and not step.held]
+    return 1e3 * sum(ages) / len(ages) if ages else None
+
+
+def _seam(run: Outcome) -> float | None:
+    seams = [step.seam for step in _steps(run) if step.seam is not None]
+    return sum(seams) / len(seams) if seams else None
+
+
 def _overhead_ms(run: Outcome) -> float | None:
     known = [one.overhead_s for one in run.answered if one.overhead_s is not None]
     return 1e3 * statistics.median(known) if known else None
@@ -158,15 +171,15 @@ def _growth(of: Callable[[Reading], float]) -> Callable[[Outcome], float | None]
 
 FIGURES: dict[str, Figure] = {
     "lost": Figure("tasks", "tasks that were never answered", _lost),
-    "wrong": Figure("tasks", "tasks with a wrong answer", _wrong, "jump", real=True),
+    "wrong": Figure("tasks", "tasks with a wrong answer", _count("wrong"), "jump", real=True),
     "unverified": Figure(
         "tasks",
         "answers with unexpected bytes that are too large to be compared",
-        _unverified,
+        _count("unverified"),
         "jump",
         real=True,
     ),
-    "failed": Figure("tasks", "tasks that ended with an error", _failed),
+    "failed": Figure("tasks", "tasks that ended with an error", _count("error")),
     "mean_ms": Figure("ms", "mean time from when a task is due to its answer", _mean_ms),
     "p95_ms": Figure("ms", "95 % of the tasks are answered within this time", _quantile_ms(95)),
     "p99_ms": Figure("ms", "99 % of the tasks are answered within this time", _quantile_ms(99)),
@@ -203,6 +216,14 @@ FIGURES: dict[str, Figure] = {
         "reference",
     ),
     "regret_ms": Figure("ms", "mean time that the faster site would have saved", _regret_ms, "reference"),
+    "empty_percent": Figure("%", "steps of a stream without a fresh action", _percent(_held), "stream"),
+    "age_ms": Figure("ms", "mean time since the observation of a fresh action", _age_ms, "stream"),
+    "seam": Figure(
+        "",
+        "mean over chunks of the largest change of one dimension from the last action to their first one",
+        _seam,
+        "stream",
+    ),
     "overhead_ms": Figure(
         "ms", "median time that Offboard itself added to a task that ran on one site", _overhead_ms, real=True
     ),

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from offboard.common.errors import DataError
-from offboard.loadgen.robot_files import late_executions, read_trace
+from offboard.loadgen.robot_files import Late, late_executions, read_trace
 from offboard.loadgen.scenario.interval_coverage import intervals_of
-from offboard.loadgen.scenario.outcome import Answered, Reading, Reference
-from offboard.loadgen.scenario.task_cost import Spent, spent_of
+from offboard.loadgen.scenario.outcome import Answered, Reading, Reference, Spent, Step
 from offboard.robot_client.sites.runner import ONBOARD
 
 
@@ -24,7 +23,10 @@ def read_answered(answers: Path, records: Path, robot: str) -> list[Answered]:
     for line in read_lines(answers):
         record = by_id.get(line["id"], {})
         decision, executions = record.get("decision", {}), record.get("executions", ())
-        used = record.get("used")
+        used, step = record.get("used"), step_of(line["answer"])
+        quality = record["sites"][used].get("quality") if used else None
+        if step is not None:
+            used, quality = line["answer"]["site"], line["answer"]["quality"]
         found.append(
             Answered(
                 i=line["i"],
@@ -43,11 +45,41 @@ def read_answered(answers: Path, records: Path, robot: str) -> list[Answered]:
                 overhead_s=overhead_s(record) if record else None,
                 used=used,
                 probed=is_probed(record) if record else False,
-                quality=record["sites"][used].get("quality") if used else None,
+                quality=quality,
                 spent=spent_of(record, late) if record else Spent(),
+                step=step,
             )
         )
     return found
+
+
+def step_of(answer: Mapping[str, Any] | None) -> Step | None:
+    """The step of a stream that a line of the answers holds; None: it holds the answer of a call."""
+    if answer is None or "held" not in answer:
+        return None
+    return Step(answer["held"], answer["age_s"], answer["seam"])
+
+
+def spent_of(record: Mapping[str, Any], late: Late) -> Spent:
+    """What the executions of a record took; a run that was still going on counts with its end."""
+    compute_s, remote_s, moved = 0.0, 0.0, 0.0
+    for one in record["executions"]:
+        ended = late.get((record["id"], one["site"]), one)
+        if one["site"] == ONBOARD:
+            compute_s += _onboard_s(ended, record["features"].get(f"{ONBOARD}.capacity", 1.0))
+        else:
+            remote_s += one["seconds"]
+            moved += ended["bytes_out"] + ended["bytes_in"]
+    return Spent(compute_s, min(remote_s, record["waited_s"]), moved)
+
+
+def _onboard_s(execution: Mapping[str, Any], capacity: float) -> float:
+    """CPU seconds; those of a cancelled run are not known, and it counts with all that it may have had."""
+    if not execution["started"]:
+        return 0.0
+    cpu_s = execution["cpu_s"]
+    ran_s = execution["seconds"] - (execution["queue_s"] or 0.0)
+    return float(capacity * ran_s if cpu_s is None else cpu_s)
 
 
 def is_probed(record: Mapping[str, Any]) -> bool:

@@ -10,8 +10,9 @@ from typing import Any
 
 from offboard.common.config import check, from_table, setting
 from offboard.common.errors import ConfigError, DataError
-from offboard.common.text.wording import rounded
 from offboard.common.toml_file import line_of, unknown
+from offboard.common.wording import rounded
+from offboard.loadgen.scenario.event_timeline import list_of_tables
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.outcome_figures import FIGURES, SHARE, site_percent
 
@@ -91,26 +92,16 @@ class Verdict:
 
 
 def parse_checks(
-    table: Mapping[str, Any],
-    path: Path,
-    *,
-    tasks: int,
-    known: Mapping[str, bool],
-    sites: Sequence[str],
+    table: Mapping[str, Any], path: Path, *, tasks: int, known: Mapping[str, bool], sites: Sequence[str]
 ) -> tuple[Check, ...]:
     """The checks in a scenario file; DataError names file and line.
 
     `tasks` and `known` describe the workload, `sites` are those of the scenario. A check that no run of it
     can compute is an error too.
     """
-    given = table.get("check", [])
-    if not isinstance(given, list) or not all(isinstance(one, dict) for one in given):
-        raise DataError(f"{path}: check is not a list of tables, each under [[check]]")
-    if len(given) > CHECKS_MAX:
-        raise DataError(f"{path}: {len(given)} checks, at most {CHECKS_MAX} are allowed")
     lines = path.read_text().splitlines()
     checks = []
-    for number, one in enumerate(given, 1):
+    for number, one in enumerate(list_of_tables(table, "check", path, most=CHECKS_MAX), 1):
         place = f"{path}:{line_of(lines, 'check', number, 'figure')}"
         for key in one:
             if key not in Check.__dataclass_fields__:

@@ -35,10 +35,7 @@ class Chaos:
                 raise ConfigError(f"chaos.faults: {name!r} is not one of {', '.join(FAULTS)}")
 
     def events(self, seed: int, duration_s: float, link: Link) -> tuple[Event, ...]:
-        """The events of a run that takes `duration_s` seconds on `link`.
-
-        Every fault ends before the run does.
-        """
+        """The events of a run of `duration_s` seconds on `link`. Every fault ends before the run does."""
         random, count = Random(seed), int(duration_s // self.every_s)
         if 2 * count > EVENTS_MAX:
             raise ConfigError(f"chaos.every_s: {2 * count} events, at most {EVENTS_MAX} are allowed")

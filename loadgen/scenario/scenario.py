@@ -4,73 +4,55 @@
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from offboard.common.config import check, setting
+from offboard.common.config import check, part_of, setting
 from offboard.common.errors import ConfigError
-from offboard.common.planning.planner_names import DIJKSTRA, PLANNERS
 from offboard.common.variants import IN_GROUP
 from offboard.loadgen import rivals
+from offboard.loadgen.policy_name import split_objective
 from offboard.loadgen.relay.link.link_settings import LinkFlags
-from offboard.loadgen.robot.config import CallConfig, DriveConfig, RobotConfig
-from offboard.loadgen.robot.decision_settings import USED_BY
-from offboard.loadgen.robot.workload import ARRIVALS
+from offboard.loadgen.rivals.stream_rules import RULES, STREAM
+from offboard.loadgen.robot.config import (
+    TASKS_DEFAULT,
+    CallConfig,
+    Calling,
+    DriveConfig,
+    Load,
+    Planning,
+    RobotConfig,
+    Streaming,
+)
 from offboard.loadgen.scenario.event_timeline import AT_TASK_MAX, Event
+from offboard.loadgen.scenario.outcome import Costing
 from offboard.loadgen.scenario.outcome_figures import FIGURES
 from offboard.loadgen.scenario.pass_fail_check import Check, check_computable
 from offboard.loadgen.scenario.random_faults import Chaos
-from offboard.loadgen.scenario.task_cost import Costing
 from offboard.loadgen.testbed.cpu_quota import CPUS_MAX, CPUS_MIN
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, relay_of
 from offboard.robot_client import policies
-from offboard.robot_client.policies import BOTH, objectives
-from offboard.robot_client.policies.objectives import MEAN, OBJECTIVES, Energy, Objective
+from offboard.robot_client.flags import Waits
+from offboard.robot_client.policies import BOTH
+from offboard.robot_client.policies.objectives import MEAN, Energy
+from offboard.robot_client.settings import DecisionOptions, ObjectiveOptions, Settings
 from offboard.robot_client.sites.runner import ONBOARD
 
 ROBOTS_MAX = 64
 SERVERS_MAX = 16
 
 
-@dataclass(frozen=True)
-class Workload:
+@dataclass(frozen=True, kw_only=True)
+class Workload(Load, Planning, Calling, Streaming):
     """`[workload]`: the tasks of the robots, and when they are due.
 
     In a scenario file, the paths of `map` and of a file of sizes are relative to that file.
     """
 
-    map: Path | None = setting(None, "map.yaml or MovingAI .map to plan on")
-    task: str | None = setting(
-        None, "MODULE:FUNCTION to call instead, with one number of sizes or with the arguments of inputs"
-    )
-    inputs: str | None = setting(
-        None, "MODULE:FUNCTION that takes the seed and returns the arguments of each call of the task"
-    )
-    resolution: float | None = setting(
-        None, "cell size of the planning grid, in metres; default: that of the map", minimum=0.001
-    )
-    planner: str = setting(DIJKSTRA, "search algorithm", choices=PLANNERS)
-    tasks: int = setting(200, "number of tasks of each robot", minimum=1, maximum=AT_TASK_MAX)
-    sizes: tuple[str, ...] = setting((), "input sizes, written as for `loadgen call --sizes`")
-    arrivals: str = setting("closed", "when the next task is due", choices=ARRIVALS)
-    rate: float | None = setting(None, "tasks per second of each robot; not for closed arrivals")
-    burst: int = setting(10, "tasks in each burst, if arrivals are bursts", minimum=1)
-    in_flight: int = setting(16, "most unanswered tasks of one robot", minimum=1)
+    tasks: int = setting(TASKS_DEFAULT, "number of tasks of each robot", minimum=1, maximum=AT_TASK_MAX)
     robots: int = setting(1, "number of robots; each has its own CPU quota", minimum=1, maximum=ROBOTS_MAX)
-    jump: bool = setting(
-        False, "each task starts at the previous goal, so that tasks do not depend on the answers"
-    )
-    measure: int = setting(0, "run the first K tasks on both sites", minimum=0)
-    alone: int = setting(
-        0, "run K more plans after the tasks, each onboard alone, in the cloud alone, and on both", minimum=0
-    )
-    reference: int = setting(
-        0, "run every K-th task of the first robot again on each site alone; 0: none", minimum=0
-    )
     deadline_ms: float | None = setting(None, "a task that takes longer than this is late", minimum=0.0)
-    obstacles: int = setting(40, "number of boxes that are not on the map", minimum=0)
-    radius_m: float = setting(0.15, "radius of the robot, in metres", name="radius", minimum=0.0)
 
     def __post_init__(self) -> None:
         check(self)
@@ -84,6 +66,10 @@ class Workload:
             raise ConfigError(f"workload.alone: {self.alone} is above workload.tasks {self.tasks}")
 
     @property
+    def streams(self) -> bool:
+        return self.stream_hz is not None
+
+    @property
     def deadline_s(self) -> float | None:
         return None if self.deadline_ms is None else self.deadline_ms / 1e3
 
@@ -93,13 +79,7 @@ class Workload:
     def robot(self, seed: int) -> RobotConfig:
         """The settings of a robot with this workload; ConfigError if they contradict each other."""
         config = CallConfig if self.map is None else DriveConfig
-        shared = {f.name for f in fields(config)} & {f.name for f in fields(self)}
-        return config(
-            **{name: getattr(self, name) for name in shared},
-            seed=seed,
-            cloud="tcp://relay:1",
-            trace=Path("trace.jsonl"),
-        )
+        return part_of(config, self, seed=seed, cloud="tcp://relay:1", trace=Path("trace.jsonl"))
 
     def known(self) -> dict[str, bool]:
         """The keys of `[workload]` that some figures need, and whether this workload has them."""
@@ -107,71 +87,38 @@ class Workload:
             "jump": self.jump or self.map is None,
             "reference": self.reference > 0,
             "deadline_ms": self.deadline_ms is not None,
+            "stream": self.streams,
         }
 
 
-@dataclass(frozen=True)
-class RobotPart:
+@dataclass(frozen=True, kw_only=True)
+class RobotPart(DecisionOptions, ObjectiveOptions, Waits):
     """`[robot]`: how each robot decides, and its CPU quota."""
 
     cpus: float = setting(0.2, "CPU quota, in CPUs", minimum=CPUS_MIN, maximum=CPUS_MAX)
     policy: str = setting(
         policies.ALIAS,
-        f"policy that chooses the site: {rivals.POLICY_HELP}; POLICY+OBJECTIVE decides by another objective"
+        f"policy that chooses the site: {policies.HELP}; POLICY+OBJECTIVE decides by another objective"
         " than that of the scenario",
     )
-    predictor: str | None = setting(
-        None, f"predictor, if not the one that the policy brings: {rivals.PREDICTOR_HELP}"
-    )
-    heartbeats: bool | None = setting(
-        None, "whether each robot sends heartbeats, if not as its policy is meant to be used"
-    )
-    window: int = setting(50, "number of executions remembered for each site", minimum=2)
-    timeout_s: float = setting(
-        2.0, "longest wait for an answer of a server, in seconds", name="timeout", minimum=0.001
-    )
-    objective: str = setting(
-        MEAN,
-        "what the policy makes small, and what `cost` measures; deadline is that of workload.deadline_ms",
-        choices=OBJECTIVES,
-    )
-    s_per_joule: float | None = setting(None, "seconds that one joule is worth", minimum=0.0)
-    s_per_megabyte: float | None = setting(
-        None, "seconds that a million bytes, sent or received, are worth", minimum=0.0
-    )
-    compute_watts: float = setting(
-        Energy().compute_w, "power that one busy core draws above idle, in watts", minimum=0.0
-    )
-    idle_watts: float = setting(
-        Energy().idle_w, "power drawn while waiting for an answer, in watts", minimum=0.0
-    )
-    radio_joules_byte: float = setting(
-        Energy().radio_j_byte, "energy to send or receive one byte, in joules", minimum=0.0
-    )
+    deadline_s: float | None = None  # workload.deadline_ms says it
+    memory: Path | str | None = None  # a run begins without knowledge
 
     def __post_init__(self) -> None:
         check(self)
         self.names()
-        for weight in ("s_per_joule", "s_per_megabyte"):
-            given, names = getattr(self, weight) is not None, USED_BY[weight]
-            if given and self.objective not in names:
-                raise ConfigError(f"robot.{weight}: needs robot.objective = {' or '.join(names)}")
-            if self.objective == names[0] and not given:
-                raise ConfigError(f"robot.objective: {self.objective!r} needs robot.{weight}")
 
     @property
     def decides_by(self) -> str:
         """The objective of the policy; mean for a policy that weighs no costs."""
-        policy, objective = rivals.split_objective(self.policy, "robot.policy")
-        own = self.objective if policies.weighs_cost(rivals.policy(policy)) else MEAN
+        policy, objective = split_objective(self.policy, "robot.policy")
+        own = self.objective if policy in RULES or policies.weighs_cost(policy) else MEAN
         return own if objective is None else objective
-
-    def energy(self) -> Energy:
-        return Energy(self.compute_watts, self.idle_watts, self.radio_joules_byte)
 
     def names(self) -> tuple[str, str | None]:
         """Policy and predictor, by the names that a robot knows."""
-        policy = rivals.policy(rivals.split_objective(self.policy, "robot.policy")[0], "robot.policy")
+        policy, _ = split_objective(self.policy, "robot.policy")
+        policy = policies.ALIAS if policy in RULES else policy
         if self.predictor is None:
             return policy, None
         return policy, rivals.predictor(self.predictor, "robot.predictor")
@@ -230,44 +177,53 @@ class Scenario:
     chaos: Chaos | None = None
 
     def __post_init__(self) -> None:
-        check_servers(self.servers)
-        self.objective()
+        names = [server.name for server in self.servers]
+        if len(names) > SERVERS_MAX:
+            raise ConfigError(f"cloud: {len(names)} servers, at most {SERVERS_MAX} are allowed")
+        if len(set(names)) < len(names) or CLOUD not in names:
+            raise ConfigError(f"cloud.name: {', '.join(names)}: each name once, and {CLOUD} among them")
+        if self.robot.decides_by == "deadline" and self.workload.deadline_s is None:
+            raise ConfigError("robot.objective: 'deadline' needs workload.deadline_ms")
+        judged = self.costing
+        if judged.objective != "deadline":
+            judged = replace(judged, deadline_s=None)
+        judged.check_objective(
+            lambda name: "workload.deadline_ms" if name == "deadline_s" else f"robot.{name}"
+        )
+        self.decided_by.make()
+        if self.workload.streams and self.robot.policy not in (policies.ALIAS, *RULES):
+            raise ConfigError(f"robot.policy: {self.robot.policy!r} is not one of {', '.join(RULES)}")
+        if self.robot.policy in RULES and not self.workload.streams:
+            raise ConfigError(f"robot.policy: {self.robot.policy!r} needs workload.stream")
         if self.chaos is not None and len(self.servers) > 1:
             raise ConfigError("chaos: random faults need a scenario with one server")
 
-    def objective(self) -> Objective:
-        """What the policy makes small; ConfigError if the scenario does not say what it needs."""
-        robot, deadline_s = self.robot, self.workload.deadline_s
-        name = robot.decides_by
-        if "deadline" in (name, robot.objective) and deadline_s is None:
-            raise ConfigError("robot.objective: 'deadline' needs workload.deadline_ms")
-        return objectives.make(
-            name,
-            deadline_s=deadline_s,
-            s_per_joule=robot.s_per_joule,
-            s_per_megabyte=robot.s_per_megabyte,
-        )
+    @property
+    def stream_rule(self) -> str:
+        """When a stream asks whom."""
+        return STREAM if self.robot.policy == policies.ALIAS else self.robot.policy
 
-    def decided_by(self) -> dict[str, Any]:
-        """The objective of the policy, with all that it may need; `summary.json` has it for a replay."""
-        robot = self.robot
-        return {
-            "objective": robot.decides_by,
-            "deadline_s": self.workload.deadline_s,
-            "s_per_joule": robot.s_per_joule,
-            "s_per_megabyte": robot.s_per_megabyte,
-            **asdict(robot.energy()),
-        }
-
+    @property
     def costing(self) -> Costing:
-        """The price of a task by the objective of the scenario, whatever the policy makes small."""
-        robot = self.robot
-        return Costing(
-            robot.objective,
-            self.workload.deadline_s,
-            s_per_joule=robot.s_per_joule or 0.0,
-            s_per_megabyte=robot.s_per_megabyte or 0.0,
-            energy=robot.energy(),
+        """What its tasks cost by the objective of the scenario, whatever the policy makes small."""
+        return part_of(Costing, self.robot, deadline_s=self.workload.deadline_s)
+
+    @property
+    def decided_by(self) -> ObjectiveOptions:
+        """What the policy makes small; `summary.json` has it for a replay."""
+        return part_of(ObjectiveOptions, self.costing, objective=self.robot.decides_by)
+
+    def settings(self, seed: int) -> Settings:
+        """The rare options of the offloader of a robot."""
+        _, predictor = self.robot.names()
+        found = self.decided_by
+        return part_of(
+            Settings,
+            self.robot,
+            predictor=predictor,
+            objective=found.make(),
+            energy=part_of(Energy, found),
+            seed=seed,
         )
 
     def parts(self) -> tuple[str, ...]:
@@ -275,7 +231,6 @@ class Scenario:
         return parts_of([server.name for server in self.servers], self.workload)
 
     def sites(self) -> tuple[str, ...]:
-        """The sites of each robot."""
         return (ONBOARD, *(server.site for server in self.servers))
 
     def links(self) -> dict[str, Mapping[str, Any]]:
@@ -308,7 +263,6 @@ class Scenario:
         return self.events + self.chaos.events(self.seed, seconds, LinkFlags(**self.link).link)
 
     def robots(self) -> tuple[str, ...]:
-        """The names of the robots."""
         return self.workload.robot_names()
 
     def compared(self) -> tuple[str, ...]:
@@ -356,21 +310,8 @@ class Scenario:
         for one in checks:
             check_computable(one, tasks=count, known=workload.known())
         return replace(
-            self,
-            seed=self.seed if seed is None else seed,
-            workload=workload,
-            robot=robot,
-            checks=checks,
+            self, seed=self.seed if seed is None else seed, workload=workload, robot=robot, checks=checks
         )
-
-
-def check_servers(servers: Sequence[CloudPart]) -> None:
-    """ConfigError unless each server has a name of its own, and one is named cloud."""
-    names = [server.name for server in servers]
-    if len(names) > SERVERS_MAX:
-        raise ConfigError(f"cloud: {len(names)} servers, at most {SERVERS_MAX} are allowed")
-    if len(set(names)) < len(names) or CLOUD not in names:
-        raise ConfigError(f"cloud.name: {', '.join(names)}: each name once, and {CLOUD} among them")
 
 
 def parts_of(servers: Sequence[str], workload: Workload) -> tuple[str, ...]:

@@ -11,26 +11,22 @@ from typing import Any
 
 from offboard.common.config import from_table
 from offboard.common.errors import ConfigError, DataError, MissingExtra, OffloadError
-from offboard.common.toml_file import line_of, read_toml, unknown_key
+from offboard.common.toml_file import line_of, read_toml, unknown, unknown_key
 from offboard.loadgen.relay.link.link_settings import LinkFlags
+from offboard.loadgen.robot.config import STREAM_TASK, Streaming
 from offboard.loadgen.scenario.event_timeline import ON, parse_events
 from offboard.loadgen.scenario.pass_fail_check import parse_checks
 from offboard.loadgen.scenario.random_faults import Chaos
-from offboard.loadgen.scenario.scenario import (
-    CloudPart,
-    RobotPart,
-    Scenario,
-    Workload,
-    check_servers,
-    parts_of,
-)
+from offboard.loadgen.scenario.scenario import CloudPart, RobotPart, Scenario, Workload, parts_of
 from offboard.robot_client.sites.runner import ONBOARD
 
-SHIPPED = Path(__file__).parents[1] / "scenarios"
-LINKS = Path(__file__).parents[1] / "links"  # recordings, and the scenarios that are played over them
+_HERE = Path(__file__).resolve().parents[1]  # in a checkout, not by the link in offboard/
+SHIPPED = _HERE / "scenarios"
+LINKS = _HERE / "links"  # recordings, and the scenarios that are played over them
 NAME = r"[A-Za-z0-9][A-Za-z0-9_-]*"
 WORKLOAD_FLAG = re.compile(rf"--({'|'.join(f.name.replace('_', '-') for f in fields(Workload))})\b")
 LINK_KEYS = tuple(f.name for f in fields(LinkFlags))
+STREAM, STREAM_PREFIX = "stream", "stream_"
 FILES = ("samples", "recording")  # ends of the names of link conditions that are files
 
 
@@ -69,7 +65,7 @@ def read_scenario(path: Path) -> Scenario:
             known=workload.known(),
             sites=(ONBOARD, *(one.site for one in servers)),
         ),
-        "chaos": _chaos(table, workload, path, servers=len(servers)),
+        "chaos": _chaos(table, workload, path),
     }
     try:
         return Scenario(**found)
@@ -96,11 +92,12 @@ def find_scenario(name: str) -> Path:
     for path in (Path(name), SHIPPED / f"{name}.toml", LINKS / f"{name}.toml"):
         if path.is_file():
             return path
-    raise DataError(f"scenario {name!r} is neither a file nor one of {', '.join(known_names())}")
+    if name.endswith(".toml"):
+        raise DataError(f"{name}: no such file")
+    raise DataError(unknown("scenario", name, known_names()))
 
 
 def known_names() -> tuple[str, ...]:
-    """The names that `find_scenario` knows."""
     return (*shipped(), *shipped(LINKS))
 
 
@@ -117,7 +114,10 @@ def _table(table: Mapping[str, Any], section: str, path: Path) -> Mapping[str, A
 
 
 def _workload(table: Mapping[str, Any], path: Path) -> Workload:
-    workload = from_table(Workload, table, path, "workload")
+    try:
+        workload = from_table(Workload, _streaming(table, path), path, "workload")
+    except DataError as error:
+        raise DataError(str(error).replace(f".{STREAM_PREFIX}", f".{STREAM}.")) from error
     try:
         workload.robot(seed=0)
     except ConfigError as error:
@@ -131,14 +131,37 @@ def _workload(table: Mapping[str, Any], path: Path) -> Workload:
     return replace(workload, map=place)
 
 
+def _streaming(table: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
+    """The keys of `[workload.stream]` under the names of their settings, and its policy if none is named."""
+    if STREAM not in table:
+        return table
+    stream = _table(table, STREAM, path)
+    known = [f.name.removeprefix(STREAM_PREFIX) for f in fields(Streaming)]
+    for key in stream:
+        if key not in known:
+            raise unknown_key(path, key, known)
+    if "hz" not in stream:
+        raise DataError(f"{path}: workload.stream.hz is missing")
+    named = {f"{STREAM_PREFIX}{key}": value for key, value in stream.items()}
+    return {"task": STREAM_TASK, **{key: one for key, one in table.items() if key != STREAM}, **named}
+
+
 def _workload_error(error: OffloadError, path: Path) -> DataError:
     """An error about flags of the robot, as one about the keys of the scenario that they come from."""
     keys = [flag.replace("-", "_") for flag in WORKLOAD_FLAG.findall(str(error))]
     if not keys:
         return DataError(f"{path}: workload: {error}")
-    text = WORKLOAD_FLAG.sub(lambda flag: "workload." + flag[1].replace("-", "_"), str(error))
-    line = line_of(path.read_text().splitlines(), "workload", 1, keys[0])
+    text = WORKLOAD_FLAG.sub(lambda flag: _key_of(flag[1].replace("-", "_")), str(error))
+    table, _, key = _key_of(keys[0]).rpartition(".")
+    line = line_of(path.read_text().splitlines(), table, 1, key)
     return DataError(f"{path}:{line}: {text}")
+
+
+def _key_of(name: str) -> str:
+    """The key of a setting of the workload, with its table."""
+    if name.startswith(STREAM_PREFIX):
+        return f"workload.{STREAM}.{name.removeprefix(STREAM_PREFIX)}"
+    return f"workload.{name}"
 
 
 def _sizes(texts: tuple[str, ...], path: Path) -> tuple[str, ...]:
@@ -167,18 +190,12 @@ def _servers(table: Mapping[str, Any], path: Path) -> tuple[CloudPart, ...]:
         own = {key: value for key, value in one.items() if key != "link"}
         part = from_table(CloudPart, own, path, f"cloud {number}")
         found.append(replace(part, link=_link(_table(one, "link", path), path)))
-    try:
-        check_servers(found)
-    except ConfigError as error:
-        raise DataError(f"{path}: {error}") from None
     return tuple(found)
 
 
-def _chaos(table: Mapping[str, Any], workload: Workload, path: Path, *, servers: int) -> Chaos | None:
+def _chaos(table: Mapping[str, Any], workload: Workload, path: Path) -> Chaos | None:
     if "chaos" not in table:
         return None
-    if servers > 1:
-        raise DataError(f"{path}: chaos: random faults need one server, not {servers}")
     if workload.rate is None:
         raise DataError(
             f"{path}: chaos: random faults come by the clock; workload.arrivals must not be closed"

@@ -1,75 +1,50 @@
 """The other robots of a simulated scenario: they load the servers, and always choose the fastest site."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 
 from offboard.loadgen.relay.link.link import Link
-from offboard.loadgen.simulation.model.simulated_connection import SimulatedConnection
+from offboard.loadgen.simulation.model.simulated_connection import TASK, Message, SimulatedConnection
 from offboard.loadgen.simulation.model.simulated_cpu import SimulatedCpu
-from offboard.loadgen.simulation.model.simulated_direction import Message
 from offboard.loadgen.simulation.model.simulated_server import OK, Reply, SimulatedServer
 from offboard.loadgen.simulation.model.task_costs import DECIDING_CPU_S
-from offboard.loadgen.simulation.model.true_costs import TrueCosts
-from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
-from offboard.loadgen.simulation.oracle import Coming, Oracle
-from offboard.loadgen.simulation.simulated_cloud import TASK
+from offboard.loadgen.simulation.model.true_costs import Coming, Oracle, TrueCosts
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
-
-
-@dataclass(frozen=True, slots=True)
-class RobotSettings:
-    """A robot: its name, its CPU quota, the seed of its link, and the timeout of a cloud run."""
-
-    name: str
-    cpus: float
-    seed: int
-    timeout_s: float
+from offboard.testing.virtual_clock import VirtualClock
 
 
 class OtherRobot:
-    """Runs its tasks one after the other, each on the site that is really fastest, between `begin` and `end`.
+    """Runs tasks one after the other, each on the site that is really fastest, between `start` and `kill`.
 
     It neither learns nor repeats: a task that the server refuses or loses runs onboard.
     """
 
     def __init__(
         self,
-        settings: RobotSettings,
         clock: VirtualClock,
         servers: Mapping[str, SimulatedServer],
         costs: TrueCosts,
         links: Mapping[str, Link],
+        *,
+        name: str,
+        cpus: float,
+        seed: int,
+        timeout_s: float,
     ) -> None:
-        self.cpu = SimulatedCpu(clock, settings.cpus)
+        self.cpu = SimulatedCpu(clock, cpus)
         self.connections = {
-            name: SimulatedConnection(
-                clock,
-                server,
-                links[name],
-                settings.seed + n,
-                on_up=lambda: None,
-                on_lost=partial(self._on_lost, name),
+            at: SimulatedConnection(
+                clock, server, links[at], seed + n, on_up=lambda: None, on_lost=partial(self._on_lost, at)
             )
-            for n, (name, server) in enumerate(servers.items())
+            for n, (at, server) in enumerate(servers.items())
         }
         self._coming: Coming | None = None  # its request on the way to a server
-        self._name = settings.name
-        self._timeout_s = settings.timeout_s
+        self._name = name
+        self._timeout_s = timeout_s
         self._clock = clock
         self._servers = servers
         self._costs = costs
-        self._oracles = {
-            name: Oracle(
-                clock=clock,
-                connection=self.connections[name],
-                server=server,
-                robot=self.cpu,
-                costs=costs,
-                owner=settings.name,
-            )
-            for name, server in servers.items()
-        }
+        self._oracle = Oracle(clock, self.cpu, costs, name)
         self._number = -1  # of the current task
         self._working = self._paused = False
         self._used: str | None = None  # the server that runs the current task
@@ -79,12 +54,12 @@ class OtherRobot:
         """Its request on the way to this server."""
         return self._coming if self._used == server else None
 
-    def begin(self) -> None:
+    def start(self) -> None:
         if not self._working:
             self._working = True
             self._next(self._number)
 
-    def end(self) -> None:
+    def kill(self) -> None:
         """Stop working. The server finishes its request, and nobody reads the answer."""
         self._working = self._paused = False
         self._used = None
@@ -120,11 +95,9 @@ class OtherRobot:
         if self._paused:
             self._held = partial(self._decide, number)
             return
-        found = {name: oracle.cloud_s(number, coming=()) for name, oracle in self._oracles.items()}
-        times = {name: seconds for name, seconds in found.items() if seconds is not None}
-        fastest = min(times, key=times.__getitem__, default=None)
-        onboard_s = next(iter(self._oracles.values())).onboard_s(number)
-        if fastest is not None and times[fastest] < onboard_s:
+        times = {name: self._oracle.cloud_s(number, line) for name, line in self.connections.items()}
+        fastest = min(times, key=times.__getitem__)
+        if times[fastest] < self._oracle.onboard_s(number):
             self._send(fastest, number)
         else:
             self._run(number)
@@ -141,8 +114,7 @@ class OtherRobot:
         self._used, connection = server, self.connections[server]
         cpu_s, task = self._costs.seconds(CLOUD, number), self._costs.task(number)
         request = Message(task.bytes_out, f"{TASK}1", number)
-        arrives_s = connection.to_cloud.due_s(request, self._clock.now_s())
-        self._coming = None if arrives_s is None else (arrives_s, cpu_s)
+        self._coming = connection.to_cloud.due_s(request, self._clock.now_s()), cpu_s
         connection.send(request, partial(self._arrive, server, number, cpu_s))
         self._clock.after(self._timeout_s, partial(self._give_up, number))
 
@@ -154,7 +126,7 @@ class OtherRobot:
     def _reply(self, server: str, number: int, reply: Reply) -> None:
         then = self._received if reply.status == OK else self._give_up
         message = Message(self._costs.task(number).bytes_in, f"{TASK}1", number)
-        self.connections[server].reply(message, partial(then, number))
+        self.connections[server].to_robot.send(message, partial(then, number))
 
     def _received(self, number: int) -> None:
         sending_s = self._costs.cost.sending_s / self.cpu.share(1)

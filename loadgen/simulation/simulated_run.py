@@ -15,21 +15,19 @@ from offboard.loadgen.robot_files import late_executions
 from offboard.loadgen.scenario.event_timeline import Timeline
 from offboard.loadgen.scenario.interval_coverage import intervals_of
 from offboard.loadgen.scenario.outcome import Answered, Outcome, Reference
-from offboard.loadgen.scenario.outcome_files import is_probed
+from offboard.loadgen.scenario.outcome_files import is_probed, spent_of
 from offboard.loadgen.scenario.scenario import Scenario
-from offboard.loadgen.scenario.task_cost import spent_of
-from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks
-from offboard.loadgen.simulation.model.stepped_offloader import SteppedOffloader
-from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
-from offboard.loadgen.simulation.model.walker import Walk, Walker
+from offboard.loadgen.simulation.model.stepped_offloader import SteppedOffloader, Walk, Walker
+from offboard.loadgen.simulation.model.task_costs import RobotTasks
+from offboard.loadgen.simulation.simulated_stream import simulated_steps
 from offboard.loadgen.simulation.simulated_testbed import SimulatedTestbed
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client.policies import BOTH
 from offboard.robot_client.records.record import Record, as_dict
 from offboard.robot_client.records.trace import Trace
-from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites import heartbeat
 from offboard.robot_client.sites.runner import ONBOARD
+from offboard.testing.virtual_clock import VirtualClock
 
 HEARD_S = 1.0  # from connecting to the first task: a real robot has heard from its servers by then
 
@@ -62,7 +60,7 @@ def simulate(
         answered=run.answered(),
         references=run.references,
         deadline_s=scenario.workload.deadline_s,
-        costing=scenario.costing(),
+        costing=scenario.costing,
     )
 
 
@@ -87,6 +85,7 @@ class _Run:
         self, scenario: Scenario, tasks: Mapping[str, RobotTasks], noise: float, trace: Trace | None
     ) -> None:
         self._ended: list[_Ended] = []
+        self._steps: list[Answered] = []  # of a stream
         self.references: list[Reference] = []
         self._scenario = scenario
         self._clock = VirtualClock()
@@ -95,15 +94,8 @@ class _Run:
         self._in_flight = 0
         self._queue: deque[tuple[int, float]] = deque()  # tasks that are due, while too many are in flight
         robot = scenario.robot
-        policy, predictor = robot.names()
-        settings = Settings(
-            predictor=predictor,
-            window=robot.window,
-            heartbeats=robot.heartbeats,
-            objective=scenario.objective(),
-            energy=robot.energy(),
-            seed=scenario.seed,
-        )
+        policy, _ = robot.names()
+        settings = scenario.settings(scenario.seed)
         heartbeat_s = heartbeat.EVERY_S if settings.beats(policy) else 0.0
         self._testbed = SimulatedTestbed(
             scenario, tasks, self._clock, heartbeat_s=heartbeat_s, begins_s=self._zero_s, noise=noise
@@ -113,6 +105,7 @@ class _Run:
             [*self._testbed.clouds.values(), self._testbed.onboard],
             policy=settings.make_policy(policy),
             memories=settings.make_memories(policy),
+            allowance=settings.allowance(),
             timeout_s=robot.timeout_s,
             observers=[self._own] if trace is None else [self._own, trace.write],
             clock=self._clock,
@@ -123,7 +116,13 @@ class _Run:
             self._clock.at(self._zero_s + at_s, self._play_events)
         self._play_events()
         self._testbed.begin()
-        if self._scenario.workload.arrivals == CLOSED:
+        if self._scenario.workload.streams:
+            self._clock.pass_by(self._zero_s)
+            steps = simulated_steps(self._scenario, self.offload, self._testbed.costs, self._clock)
+            for step in steps:
+                self._steps.append(step)
+                self._play_events()
+        elif self._scenario.workload.arrivals == CLOSED:
             self._clock.pass_by(self._zero_s)
             for number in range(self._scenario.workload.tasks):
                 self._offload(number, self._clock.now_s())
@@ -159,7 +158,9 @@ class _Run:
 
     def _play_events(self) -> None:
         """Make all events happen that are due."""
-        for event in self._timeline.due(self._clock.now_s() - self._zero_s, len(self._ended)):
+        for event in self._timeline.due(
+            self._clock.now_s() - self._zero_s, len(self._ended) + len(self._steps)
+        ):
             self._testbed.happen(event)
 
     def _offload(self, number: int, due_s: float) -> None:
@@ -178,6 +179,8 @@ class _Run:
 
     def answered(self) -> list[Answered]:
         """All tasks, each with the runs that ended after the task itself."""
+        if self._steps:
+            return self._steps
         late = late_executions(ended.line for ended in self._ended)
         return [
             Answered(

@@ -1,7 +1,7 @@
 """The simulated testbed: the computers and links of a scenario, and what its events do to them."""
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from offboard.common.errors import ConfigError
@@ -13,16 +13,14 @@ from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.simulation.model.simulated_connection import SimulatedConnection
 from offboard.loadgen.simulation.model.simulated_cpu import SimulatedCpu
 from offboard.loadgen.simulation.model.simulated_server import SimulatedServer
-from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks
-from offboard.loadgen.simulation.model.task_costs import COSTS, DECIDING_CPU_S, Noise
-from offboard.loadgen.simulation.model.true_costs import TrueCosts
-from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
-from offboard.loadgen.simulation.oracle import Oracle
-from offboard.loadgen.simulation.other_robots import OtherRobot, RobotSettings
+from offboard.loadgen.simulation.model.task_costs import COSTS, DECIDING_CPU_S, Noise, RobotTasks
+from offboard.loadgen.simulation.model.true_costs import Oracle, TrueCosts
+from offboard.loadgen.simulation.other_robots import OtherRobot
 from offboard.loadgen.simulation.simulated_cloud import SimulatedCloud
-from offboard.loadgen.simulation.simulated_onboard import SimulatedOnboard
+from offboard.loadgen.simulation.virtual_site import SimulatedOnboard
 from offboard.loadgen.testbed.testbed import ROBOT, WAN, kind_of, servers_behind
 from offboard.robot_client.sites.runner import ONBOARD
+from offboard.testing.virtual_clock import VirtualClock
 
 ENDS = ("reset_after_ms", "truncate_bytes", "slow_close_ms")  # conditions of connections, not of messages
 FIRST_ROBOT_EVENTS = ("cpus", "hogs", "cut", "join")  # that the robot whose policy is tested can have
@@ -47,44 +45,45 @@ class SimulatedTestbed:
         noise: float = 1.0,
     ) -> None:
         seed, cpus = scenario.seed, scenario.robot.cpus
+        streams = scenario.workload.streams  # their policies run on accelerators of their own
+        noise = 0.0 if streams else noise  # it is in what they are shown
         self._links = {
             name: LinkFlags(**link).link.begun(begins_s) for name, link in scenario.links().items()
         }
-        self._servers = {part.name: SimulatedServer(clock, part) for part in scenario.servers}
+        self._servers = {
+            part.name: SimulatedServer(clock, replace(part, cpus=float(part.workers)) if streams else part)
+            for part in scenario.servers
+        }
         self._cpu = SimulatedCpu(clock, cpus)
         self.costs = TrueCosts(tasks[ROBOT], Noise(seed, noise))
-        self.onboard = SimulatedOnboard(clock, self._cpu, self.costs)
+        accelerator = SimulatedCpu(clock, 1.0) if streams else self._cpu
+        self.onboard = SimulatedOnboard(clock, accelerator, self.costs)
         self.clouds: dict[str, SimulatedCloud] = {}
-        self._oracles: dict[str, Oracle] = {}
-        self._sites: dict[str, str] = {}  # of each server
+        self._oracle = Oracle(clock, self._cpu, self.costs, ROBOT)
         for n, part in enumerate(scenario.servers):
-            name, server = part.name, self._servers[part.name]
-            self._sites[name] = part.site
-            self.clouds[name] = SimulatedCloud(
+            self.clouds[part.name] = SimulatedCloud(
                 clock,
-                server,
+                self._servers[part.name],
                 self._cpu,
                 self.costs,
                 site=part.site,
-                link=self._links[name],
+                link=self._links[part.name],
                 seed=seed + n * ROBOT_SEED_STEP,
                 heartbeat_s=heartbeat_s,
-            )
-            self._oracles[name] = Oracle(
-                clock=clock,
-                connection=self.clouds[name].connection,
-                server=server,
-                robot=self._cpu,
-                costs=self.costs,
-                owner=ROBOT,
             )
         self._others: dict[str, OtherRobot] = {}
         for n, name in enumerate(scenario.robots()[1:], 1):
             own_seed = seed + n * ROBOT_SEED_STEP
             costs = TrueCosts(tasks[name], Noise(own_seed, noise))
-            settings = RobotSettings(name, cpus, own_seed, scenario.robot.timeout_s)
             self._others[name] = OtherRobot(
-                settings, clock=clock, servers=self._servers, costs=costs, links=self._links
+                clock,
+                self._servers,
+                costs,
+                self._links,
+                name=name,
+                cpus=cpus,
+                seed=own_seed,
+                timeout_s=scenario.robot.timeout_s,
             )
         self._absent = absent_at_first(scenario.timeline())
         for name in self._absent & self._servers.keys():
@@ -94,7 +93,7 @@ class SimulatedTestbed:
         """Let the other robots start their first tasks."""
         for name, other in self._others.items():
             if name not in self._absent:
-                other.begin()
+                other.start()
 
     @property
     def deciding_s(self) -> float:
@@ -106,15 +105,13 @@ class SimulatedTestbed:
 
         They are infinite for a site that would never answer; a site without a connection is left out.
         """
-        found = {}
-        for name, oracle in self._oracles.items():
-            found[ONBOARD] = oracle.onboard_s(number)
-            if self.clouds[name].connection.up:
+        found = {ONBOARD: self._oracle.onboard_s(number)}
+        for name, cloud in self.clouds.items():
+            if cloud.connection.up:
                 coming = [
                     one for other in self._others.values() if (one := other.coming_to(name)) is not None
                 ]
-                seconds = oracle.cloud_s(number, coming=coming)
-                found[self._sites[name]] = math.inf if seconds is None else seconds
+                found[cloud.site] = self._oracle.cloud_s(number, cloud.connection, coming=coming)
         return found
 
     def happen(self, event: Event) -> None:
@@ -127,23 +124,17 @@ class SimulatedTestbed:
                 for name in self._changed(event):
                     for connection in self._connections(name):
                         connection.lose()
-            case "cpus":
-                for part, cpus in event.value.items():
-                    self._cpu_of(part).change(cpus=cpus)
-            case "hogs":
-                for part, count in event.value.items():
-                    self._cpu_of(part).change(hogs=count)
-            case action if event.value in self._servers:
-                self._happen_to_server(self._servers[event.value], action)
+            case "cpus" | "hogs":
+                for part, value in event.value.items():
+                    self._cpu_of(part).change(**{event.action: value})
             case action:
-                self._happen_to_robot(self._others[event.value], action)
+                _happen_to(self._servers.get(event.value) or self._others[event.value], action)
 
     def _changed(self, event: Event) -> Sequence[str]:
         """The servers whose links an event changes."""
         return tuple(self._links) if event.on is None else (event.on,)
 
     def _connections(self, server: str) -> list[SimulatedConnection]:
-        """The connections of all robots to a server."""
         others = (other.connections[server] for other in self._others.values())
         return [self.clouds[server].connection, *others]
 
@@ -158,25 +149,16 @@ class SimulatedTestbed:
             return self._servers[part].cpu
         return self._cpu if part == ROBOT else self._others[part].cpu
 
-    def _happen_to_server(self, server: SimulatedServer, action: str) -> None:
-        if action in ("kill", "stop", "restart"):
-            server.kill()
-        if action in ("start", "restart"):
-            server.start()
-        if action == "pause":
-            server.pause()
-        if action == "resume":
-            server.resume()
 
-    def _happen_to_robot(self, robot: OtherRobot, action: str) -> None:
-        if action in ("kill", "stop", "restart"):
-            robot.end()
-        if action in ("start", "restart"):
-            robot.begin()
-        if action == "pause":
-            robot.pause()
-        if action == "resume":
-            robot.resume()
+def _happen_to(part: SimulatedServer | OtherRobot, action: str) -> None:
+    if action in ("kill", "stop", "restart"):
+        part.kill()
+    if action in ("start", "restart"):
+        part.start()
+    if action == "pause":
+        part.pause()
+    if action == "resume":
+        part.resume()
 
 
 def check_simulated(scenario: Scenario) -> None:

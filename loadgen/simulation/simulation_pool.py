@@ -7,17 +7,33 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
-from typing import Any, Self
+from typing import Any
 
 from offboard.loadgen.play.run_files import ROBOT_SEED_STEP
 from offboard.loadgen.progress import progress
 from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.scenario import Scenario, Workload
 from offboard.loadgen.simulation.child_processes import end_quietly, starting
-from offboard.loadgen.simulation.model.simulated_tasks import OTHERS_TASKS_MAX, RobotTasks, find_tasks
+from offboard.loadgen.simulation.model.task_costs import OTHERS_TASKS_MAX, RobotTasks, find_tasks
 from offboard.loadgen.simulation.simulated_run import simulate
 from offboard.loadgen.testbed.testbed import ROBOT
 
+# The settings of a workload that its tasks depend on.
+MAKES_TASKS = (
+    "map",
+    "task",
+    "inputs",
+    "sizes",
+    "resolution",
+    "planner",
+    "jump",
+    "obstacles",
+    "radius_m",
+    "stream_hz",
+    "stream_horizon",
+    "stream_onboard_ms",
+    "stream_cloud_ms",
+)
 Wanted = tuple[Workload, int]  # a robot: its workload and its seed
 
 
@@ -29,7 +45,7 @@ class SimulationPool:
         self._pool: ProcessPoolExecutor | None = None
         self._known: dict[Wanted, RobotTasks] = {}
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "SimulationPool":
         if self._jobs > 1:
             # A planner that was compiled in this process does not survive a fork.
             context = multiprocessing.get_context("spawn")
@@ -113,15 +129,7 @@ def _wanted(scenario: Scenario) -> dict[str, Wanted]:
 
 def _key(workload: Workload, seed: int) -> Wanted:
     """The same key for all scenarios that have the same tasks."""
-    plain = Workload(map=workload.map, task=workload.task, inputs=workload.inputs, sizes=workload.sizes)
-    return replace(
-        plain,
-        resolution=workload.resolution,
-        planner=workload.planner,
-        jump=workload.jump,
-        obstacles=workload.obstacles,
-        radius_m=workload.radius_m,
-    ), seed
+    return Workload(**{name: getattr(workload, name) for name in MAKES_TASKS}), seed
 
 
 def _find_tasks(wanted: Wanted) -> RobotTasks:

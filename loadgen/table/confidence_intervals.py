@@ -26,26 +26,25 @@ Picks = npt.NDArray[np.intp]
 
 
 class Blocks:
-    """`resamples` resamples of a table with `rows` rows, each drawn in blocks of `length` rows.
+    """RESAMPLES resamples of a table with `rows` rows, each drawn in blocks of `length` rows.
 
     The same seed gives the same resamples, whatever is computed from them.
     """
 
-    def __init__(self, rows: int, *, length: int | None = None, resamples: int = RESAMPLES, seed: int = 1):
+    def __init__(self, rows: int, *, length: int | None = None, seed: int = 1):
         self.rows = rows
         self.length = min(rows, length or block_length(rows))
-        self._resamples = resamples
         self._seed = seed
 
     @cached_property
     def _starts(self) -> Picks:
-        shape = (self._resamples, math.ceil(self.rows / self.length))
+        shape = (RESAMPLES, math.ceil(self.rows / self.length))
         return np.random.default_rng(self._seed).integers(self.rows, size=shape)
 
     def picks(self) -> Iterator[Picks]:
         """Indices of rows (resamples x rows), a bounded number of resamples at a time to save memory."""
         step = max(1, BLOCK_CELLS_MAX // self.rows)
-        for at in range(0, self._resamples, step):
+        for at in range(0, RESAMPLES, step):
             starts = self._starts[at : at + step, :, None]
             within = (starts + np.arange(self.length)) % self.rows
             yield within.reshape(len(starts), -1)[:, : self.rows]
@@ -57,6 +56,11 @@ class Blocks:
         intervals.
         """
         return percentiles(self.resampled(figures))
+
+    def interval(self, figure: Callable[[Picks], Column]) -> tuple[float | None, float | None]:
+        """The low and the high end of one figure, of which there is one value for each resample."""
+        low, high = self.intervals(lambda picks: {"it": figure(picks)})
+        return low.get("it"), high.get("it")
 
     def resampled(self, figures: Callable[[Picks], dict[str, Any]]) -> dict[str, Any]:
         """The values of each figure in all resamples; empty below ROWS_MIN rows."""

@@ -1,6 +1,6 @@
 """Measured rows: reads tasks with both times known (size, onboard_s, cloud_s) from a trace or a CSV dataset.
 
-`predictor_evaluation` and `replay` compute figures from them. What else a dataset holds is read by
+`table_two` and `replay` compute figures from them. What else a dataset holds is read by
 `replay/dataset_file`.
 """
 
@@ -48,8 +48,16 @@ class Rows:
     def __len__(self) -> int:
         return len(self.size)
 
+    def counted(self) -> str:
+        """How many rows and left out tasks there are, in words."""
+        left_out = f" ({self.left_out} tasks without both times left out)" if self.left_out else ""
+        return f"{len(self)} rows{left_out}"
+
+    def about(self, path: Path) -> dict[str, Any]:
+        """What a table of these rows says in each of its lines."""
+        return {"source": str(path), "rows": len(self), "left_out": self.left_out}
+
     def since(self, start: int) -> "Rows":
-        """The rows from index `start` on."""
         return Rows(self.size[start:], self.onboard_s[start:], self.cloud_s[start:])
 
 
@@ -59,6 +67,10 @@ class Lived:
 
     waited_s: Column
     to_cloud: npt.NDArray[np.bool_]
+
+
+class NoOneTable(DataError):
+    """The tasks of a trace do not fit one table: there are several kinds, or a size has several numbers."""
 
 
 def read(path: Path, kind: str | None = None, *, least: int = 1) -> Rows:
@@ -105,11 +117,11 @@ def read_cells(path: Path, further: Collection[str] = ()) -> Iterator[tuple[str,
         raise DataError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from error
 
 
-def write_whole(path: Path, text: str) -> None:
+def write_whole(path: Path, content: str | bytes) -> None:
     """Write a file completely; if that fails, leave the old one as it was."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, text.encode())
+        replace_file(path, content.encode() if isinstance(content, str) else content)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
 
@@ -166,7 +178,6 @@ def _rows_of_cells(
 
 
 def _places(path: Path, header: Sequence[str], further: Collection[str]) -> Mapping[str, int]:
-    """Where each column is that is read."""
     if not header:
         raise DataError(f"{path}:1: the header is missing; the first line must be {','.join(HEADER)}")
     for name in (*HEADER, *further):
@@ -203,7 +214,7 @@ def _read_trace(path: Path, kind: str | None, least: int) -> Rows:
 def _check_one_kind(path: Path, first_lines: dict[str, int]) -> None:
     if len(first_lines) > 1:
         kinds = ", ".join(f"{name} (line {line})" for name, line in first_lines.items())
-        raise DataError(f"{path}: the trace holds tasks of several kinds: {kinds}; choose one with --kind")
+        raise NoOneTable(f"{path}: the trace holds tasks of several kinds: {kinds}; choose one with --kind")
 
 
 def _trace_row(where: str, fields: dict[str, Any]) -> Row | None:
@@ -221,7 +232,7 @@ def _trace_row(where: str, fields: dict[str, Any]) -> Row | None:
         return None
     size = fields["size"]
     if isinstance(size, list):
-        raise DataError(f"{where}: size: {short(size)} has several numbers; one is needed here")
+        raise NoOneTable(f"{where}: size: {short(size)} has several numbers; one is needed here")
     return number(where, "size", size), seconds[ONBOARD], seconds[CLOUD]
 
 

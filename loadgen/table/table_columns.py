@@ -10,15 +10,21 @@ from dataclasses import dataclass, replace
 from offboard.common.config import setting
 from offboard.common.errors import ConfigError
 from offboard.common.toml_file import unknown
-from offboard.loadgen.table.table_formats import Heading, Table, markdown_width, render
+from offboard.loadgen.table.table_formats import FORMATS, MARKDOWN, Heading, Table, markdown_width, render
 
 WIDTH = 100
-MARKDOWN = "md"
 GROUP = "columns of the table"
 
 
 @dataclass(frozen=True, kw_only=True)
-class ColumnSettings:
+class FormatSettings:
+    """How a command prints its tables."""
+
+    format: str = setting(MARKDOWN, "format of the tables", choices=FORMATS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColumnSettings(FormatSettings):
     """The columns that are printed; CSV and JSON always hold all of them."""
 
     columns: tuple[str, ...] = setting(
@@ -32,28 +38,27 @@ class ColumnSettings:
         False, "print all columns, however wide the table becomes", group=GROUP, name="all"
     )
 
-    def check_columns(self, headings: Iterable[str], format: str) -> None:
+    def check_columns(self, headings: Iterable[str]) -> None:
         """ConfigError if --columns is not about columns of `headings`, or not about Markdown or LaTeX."""
         if not self.columns:
             return
         if self.all_columns:
             raise ConfigError(f"--columns: {','.join(self.columns)} cannot be combined with --all")
-        if format in ("csv", "json"):
-            raise ConfigError(
-                f"--columns: {','.join(self.columns)} needs --format md or latex: {format} holds all columns"
-            )
+        if self.format in ("csv", "json"):
+            needed = f"needs --format md or latex: {self.format} holds all columns"
+            raise ConfigError(f"--columns: {','.join(self.columns)} {needed}")
         known = tuple(headings)
         for name in self.columns:
             if name not in known:
                 raise ConfigError(f"--columns: {unknown('column', name, known)}")
 
-    def text(self, tables: Sequence[Table], format: str) -> str:
-        """The tables as they are printed, in one of the formats."""
+    def text(self, tables: Sequence[Table]) -> str:
+        """The tables as they are printed."""
         if self.columns:
             tables = [_chosen(table, self.columns) for table in tables]
-        if format == MARKDOWN:
+        if self.format == MARKDOWN:
             tables = [_wrapped(table if self.all_columns else _fitting(table)) for table in tables]
-        return render(tables, format)
+        return render(tables, self.format)
 
 
 def _chosen(table: Table, names: Sequence[str]) -> Table:

@@ -7,9 +7,10 @@ import csv
 import io
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
+MARKDOWN = "md"
 UNDEFINED = "–"  # noqa: RUF001 (the dash for "no value" in tables)
 MARKDOWN_RULE_MIN = 3  # dashes under a heading
 
@@ -41,6 +42,17 @@ class Table:
     notes: tuple[str, ...] = ()
     first: tuple[str, ...] = ()
     ending: str = ""
+
+
+def column(heading: str, digits: int | None = None, *, latex: str | None = None, default: Any = None) -> Any:
+    """One field of a line, with its heading. Without `latex`, LaTeX has the same heading as Markdown."""
+    shown = Heading(heading, _latex_text(heading) if latex is None else latex, digits)
+    return field(default=default, metadata={"heading": shown})
+
+
+def headings_of(line: type) -> dict[str, Heading]:
+    """The headings of the fields that `column` made, in their order."""
+    return {one.name: one.metadata["heading"] for one in fields(line) if one.metadata}
 
 
 def render(tables: Sequence[Table], format: str) -> str:
@@ -79,7 +91,6 @@ def _markdown_line(texts: Sequence[str], widths: Sequence[int], numbers: Sequenc
 
 
 def _markdown_cells(table: Table) -> list[list[str]]:
-    """The headings and the lines."""
     return [[of.markdown for of in table.headings.values()], *(cells(table, line) for line in table.lines)]
 
 
@@ -131,7 +142,7 @@ def _cell(table: Table, line: Any, name: str) -> str:
     if digits is None:
         first = name == next(iter(table.headings))
         return f"{value}: {line.note}" if first and line.note else str(value)
-    return UNDEFINED if value is None else f"{value:z.{digits}f}"  # z: no -0.00000
+    return UNDEFINED if value is None else f"{round(float(value), digits) + 0.0:.{digits}f}"  # no -0.00000
 
 
 def _latex_cell(cell: str) -> str:
@@ -148,7 +159,7 @@ def _latex_text(text: str) -> str:
 
 
 _RENDERERS: dict[str, Callable[[Sequence[Table]], str]] = {
-    "md": _markdown,
+    MARKDOWN: _markdown,
     "csv": _csv,
     "json": _json,
     "latex": _latex,

@@ -1,4 +1,4 @@
-"""The settings of `loadgen table`, and those that it shares with `loadgen replay`."""
+"""The settings of `loadgen table`, and those that it shares with `loadgen replay` and `loadgen claims`."""
 
 from dataclasses import dataclass
 
@@ -6,8 +6,7 @@ from offboard.common.config import check, setting
 from offboard.common.errors import ConfigError
 from offboard.loadgen import rivals
 from offboard.loadgen.table.confidence_intervals import Blocks
-from offboard.loadgen.table.table_columns import ColumnSettings
-from offboard.loadgen.table.table_formats import FORMATS
+from offboard.loadgen.table.table_columns import ColumnSettings, FormatSettings
 from offboard.robot_client import predictors
 from offboard.robot_client.predictors.window import WINDOW_MAX
 
@@ -18,7 +17,20 @@ ALL = "all"
 
 
 @dataclass(frozen=True)
-class MeasuredTimesConfig(ColumnSettings):
+class RowsConfig(FormatSettings):
+    """The settings of every command that computes figures from measured rows."""
+
+    block: int | None = setting(
+        None,
+        "rows in each block of the bootstrap (default: the square root of the number of rows)",
+        minimum=1,
+    )
+    seed: int = setting(1, "seed of everything random: bootstrap, shuffled rows and predictors", minimum=0)
+    kind: str | None = setting(None, "kind of task, if the trace holds several kinds")
+
+
+@dataclass(frozen=True)
+class MeasuredTimesConfig(ColumnSettings, RowsConfig):
     """The settings that `table` and `replay` share."""
 
     feedback: str = setting(
@@ -28,21 +40,12 @@ class MeasuredTimesConfig(ColumnSettings):
         choices=(CHOSEN, FULL, BOTH),
     )
     bootstrap: bool = setting(False, "add a 95 % confidence interval to each figure")
-    block: int | None = setting(
-        None,
-        "rows in each block of the bootstrap (default: the square root of the number of rows)",
-        minimum=1,
-    )
-    seed: int = setting(1, "random seed of the bootstrap and of random predictors", minimum=0)
-    format: str = setting("md", "output format", choices=FORMATS)
-    kind: str | None = setting(None, "kind of task, if the trace holds several kinds")
 
     def modes(self) -> tuple[str, ...]:
         """The feedback modes; each gets its own table."""
         return (CHOSEN, FULL) if self.feedback == BOTH else (self.feedback,)
 
     def blocks(self, rows: int) -> Blocks:
-        """The resamples of a table with this number of rows."""
         return Blocks(rows, length=self.block, seed=self.seed)
 
 
@@ -61,8 +64,7 @@ class TableConfig(MeasuredTimesConfig):
         metavar="NAME,NAME,..",
     )
     every_window: bool = setting(
-        False,
-        "run slow predictors (forest, ARIMA, SARIMA, LSTMs) with every N, not only full; may take an hour",
+        False, "run slow predictors (forest, ARIMA, LSTMs) with every N, not only full; may take an hour"
     )
 
     def __post_init__(self) -> None:
@@ -76,7 +78,6 @@ class TableConfig(MeasuredTimesConfig):
                 rivals.predictor(name, "--predictors")
 
     def names(self) -> tuple[str, ...]:
-        """The predictors by name, each once."""
         named = (rivals.PREDICTORS if name == ALL else (name,) for name in self.predictors)
         return tuple(dict.fromkeys(name for group in named for name in group))
 

@@ -12,7 +12,6 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 from offboard.common.errors import ConfigError
 
@@ -65,12 +64,6 @@ class Quota:
             self._process = None
             atexit.unregister(self.close)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def _signal(self, number: signal.Signals) -> None:
         if self._process is None:
             return
@@ -94,6 +87,13 @@ def check_cpus(cpus: float) -> None:
         raise ConfigError(f"CPU quota {cpus} is not a number from {CPUS_MIN} to {CPUS_MAX:g}")
 
 
+def cgroup_us(cpus: float) -> tuple[int, int]:
+    """Quota and period of a cgroup in microseconds: 10 ms, or a longer period if the kernel needs it."""
+    check_cpus(cpus)
+    period_us = round(1e6 * max(CGROUP_PERIOD_S, CGROUP_QUOTA_S_MIN / cpus))
+    return round(cpus * period_us), period_us
+
+
 @dataclass(frozen=True, slots=True)
 class Place:
     """Where a cgroup may be made: its version, the process's current group, the parent of the new group."""
@@ -108,8 +108,7 @@ class CgroupQuota(Quota):
 
     def __init__(self, pid: int, cpus: float, place: Place) -> None:
         self.kind = f"cgroup v{place.version}"
-        self._version = place.version
-        self._home = place.home
+        self._place = place
         self._group = place.parent / f"offboard-{os.getpid()}-{pid}"
         _remove_left_behind(place.parent)
         self._group.mkdir()
@@ -122,9 +121,17 @@ class CgroupQuota(Quota):
             raise
 
     def set(self, cpus: float) -> None:
-        check_cpus(cpus)
-        self._write(self._version, cpus)
-        self.cpus, self.period_s = self._read(self._version)
+        quota_us, period_us = cgroup_us(cpus)
+        if self._place.version == 2:
+            (self._group / "cpu.max").open("r+").close()  # fails if the controller is not delegated to us
+            (self._group / "cpu.max").write_text(f"{quota_us} {period_us}")
+            quota_us, period_us = map(int, (self._group / "cpu.max").read_text().split())
+        else:
+            (self._group / "cpu.cfs_period_us").write_text(str(period_us))
+            (self._group / "cpu.cfs_quota_us").write_text(str(quota_us))
+            quota_us = int((self._group / "cpu.cfs_quota_us").read_text())
+            period_us = int((self._group / "cpu.cfs_period_us").read_text())
+        self.cpus, self.period_s = quota_us / period_us, period_us / 1e6
 
     def add(self, pid: int) -> None:
         (self._group / "cgroup.procs").write_text(str(pid))
@@ -134,31 +141,13 @@ class CgroupQuota(Quota):
             super().close()
             self._remove()
 
-    def _write(self, version: int, cpus: float) -> None:
-        period_us = round(1e6 * max(CGROUP_PERIOD_S, CGROUP_QUOTA_S_MIN / cpus))
-        quota_us = round(cpus * period_us)
-        if version == 2:
-            (self._group / "cpu.max").open("r+").close()  # fails if the controller is not delegated to us
-            (self._group / "cpu.max").write_text(f"{quota_us} {period_us}")
-        else:
-            (self._group / "cpu.cfs_period_us").write_text(str(period_us))
-            (self._group / "cpu.cfs_quota_us").write_text(str(quota_us))
-
-    def _read(self, version: int) -> tuple[float, float]:
-        if version == 2:
-            quota_us, period_us = map(int, (self._group / "cpu.max").read_text().split())
-        else:
-            quota_us = int((self._group / "cpu.cfs_quota_us").read_text())
-            period_us = int((self._group / "cpu.cfs_period_us").read_text())
-        return quota_us / period_us, period_us / 1e6
-
     def _remove(self) -> None:
         """Move the processes back and remove the group; a dead process may stay in it for a moment."""
         end = time.monotonic() + CLOSE_WAIT_S
         while self._group.exists() and time.monotonic() < end:
             with contextlib.suppress(OSError):
                 for pid in (self._group / "cgroup.procs").read_text().split():
-                    (self._home / "cgroup.procs").write_text(pid)
+                    (self._place.home / "cgroup.procs").write_text(pid)
             try:
                 self._group.rmdir()
             except OSError:

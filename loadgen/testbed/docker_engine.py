@@ -1,4 +1,4 @@
-"""The Docker engine: makes, finds and removes the containers and networks of one testbed run.
+"""The Docker engine: builds the images, and makes and removes the containers and networks of one testbed run.
 
 The only file that imports the Docker SDK; errors of the SDK become OffloadError. What a container runs is
 decided by `docker_testbed`.
@@ -7,13 +7,15 @@ decided by `docker_testbed`.
 import contextlib
 import itertools
 import os
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+import socket
+import subprocess
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from offboard.common.errors import ConfigError, MissingExtra, OffloadError
-from offboard.loadgen.testbed.process_owner import is_gone, owner, started
+from offboard.loadgen.progress import progress
+from offboard.loadgen.testbed.container_part import INPUTS
 
 try:
     import docker
@@ -28,6 +30,11 @@ RUN, OWNER = "offboard.run", "offboard.owner"  # labels of every container and n
 ANSWER_S = 60.0  # longest wait for one answer of the engine
 PIDS_MAX = 512  # processes and threads of one container
 SUBNET_TRIES = 5
+COMPOSE_FILE = Path("docker-compose.yml")
+COMPOSE_VERSION = ("docker", "compose", "version")
+BUILD = ("docker", "compose", "--progress", "quiet", "-f", str(COMPOSE_FILE), "build")
+ASK_S = 30.0
+BUILD_S = 1800.0
 Refusal = APIError  # the engine refused one request
 _numbers = itertools.count(1)
 
@@ -42,29 +49,7 @@ def docker_errors() -> Iterator[None]:
 
 
 def reason(error: Exception) -> str:
-    """The engine's own words for an error."""
     return str(getattr(error, "explanation", None) or error)
-
-
-@dataclass(frozen=True)
-class Container:
-    """Everything that a new container needs.
-
-    `folders` are bind mounts: our folder -> folder in the container, read-only if it is in `read_only`.
-    `ports` are published on free ports of 127.0.0.1. `address` is the fixed address on `network`; None: any.
-    """
-
-    name: str
-    image: str
-    program: str
-    command: list[str]
-    network: Any
-    folders: Mapping[Path, Path]
-    read_only: frozenset[Path] = frozenset()
-    environment: Mapping[str, str] = field(default_factory=dict)
-    address: Mapping[str, Any] | None = None
-    ports: tuple[int, ...] = ()
-    quota: Mapping[str, int] = field(default_factory=dict)
 
 
 def new_run() -> str:
@@ -92,29 +77,24 @@ class Engine:
         self._client.close()
 
     def remove_all(self) -> None:
-        """Remove every container and network of this run."""
         self._remove(self._run)
 
-    def create(self, wanted: Container) -> Any:
-        """Make a container that is as isolated as possible and runs as our own user."""
-        options: dict[str, Any] = dict(wanted.quota)
-        if wanted.ports:
-            options["ports"] = dict.fromkeys(wanted.ports, ("127.0.0.1", None))
-        if wanted.address is not None:
-            endpoint = self.api.create_endpoint_config(**wanted.address)
-            options["networking_config"] = {wanted.network.name: endpoint}
+    def create(
+        self, name: str, image: str, command: list[str], *, folders: Mapping[Path, Path], **options: Any
+    ) -> Any:
+        """Make a container that is as isolated as possible and runs as our own user.
+
+        `folders` are bind mounts: our folder -> folder in the container, read-only if it is in INPUTS.
+        """
         return self._client.containers.create(
-            wanted.image,
-            wanted.command,
-            entrypoint=[wanted.program],
-            name=self._name(wanted.name),
+            image,
+            command,
+            name=self._name(name),
             labels=self._labels(),
-            environment=dict(wanted.environment),
-            network=wanted.network.name,
             user=f"{os.getuid()}:{os.getgid()}",
             mounts=[
-                Mount(str(place), str(folder), type="bind", read_only=place in wanted.read_only)
-                for folder, place in wanted.folders.items()
+                Mount(str(place), str(folder), type="bind", read_only=place.is_relative_to(INPUTS))
+                for folder, place in folders.items()
             ],
             # A part that is cut off finds no names. It must not ask other servers, and must give up soon.
             dns=["127.0.0.1"],
@@ -128,6 +108,10 @@ class Engine:
             pids_limit=PIDS_MAX,
             **options,
         )
+
+    def fixed_address(self, network: Any, endpoint: Mapping[str, Any]) -> dict[str, Any]:
+        """The option `networking_config` of a new container that has this endpoint on its network."""
+        return {network.name: self.api.create_endpoint_config(**endpoint)}
 
     def create_open_network(self, name: str) -> Any:
         """A network that the host can reach; its members cannot reach each other."""
@@ -165,15 +149,13 @@ class Engine:
 
     @docker_errors()
     def _remove(self, run: str) -> None:
-        """Remove everything of a run; tries all, then raises the first failure."""
-        failed: list[Exception] = []
+        """Remove everything of a run, the containers before their networks; tries all, whatever fails."""
         label = {"label": f"{RUN}={run}"}
-        for container in self._client.containers.list(all=True, sparse=True, filters=label):
-            _try_to(failed, container.remove, force=True, v=True)
-        for network in self._client.networks.list(filters=label):
-            _try_to(failed, network.remove)
-        if failed:
-            raise failed[0]
+        with contextlib.ExitStack() as last:
+            for network in self._client.networks.list(filters=label):
+                last.callback(_remove_unless_gone, network)
+            for container in self._client.containers.list(all=True, sparse=True, filters=label):
+                last.callback(_remove_unless_gone, container, force=True, v=True)
 
     def _name(self, name: str) -> str:
         return f"{PREFIX}-{self._run}-{name}"
@@ -197,10 +179,54 @@ def _chunks(attached: Any) -> Iterator[bytes]:
             yield chunk
 
 
-def _try_to(failed: list[Exception], remove: Callable[..., object], **how: bool) -> None:
+def check_compose() -> None:
+    """ConfigError if images cannot be built here."""
+    if not COMPOSE_FILE.is_file():
+        raise ConfigError(f"--testbed: docker: {COMPOSE_FILE} not found; run this in a checkout of Offboard")
     try:
-        remove(**how)
-    except NotFound:
-        pass
-    except (DockerException, OSError) as error:
-        failed.append(error)
+        asked = subprocess.run(COMPOSE_VERSION, capture_output=True, text=True, timeout=ASK_S, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise ConfigError(f"--testbed: docker cannot be run: {error}") from error
+    if asked.returncode != 0:
+        message = (asked.stderr.strip() or "no message").splitlines()[-1]
+        raise ConfigError(f"--testbed: docker: `{' '.join(COMPOSE_VERSION)}` failed: {message}")
+
+
+def build_images(services: Iterable[str]) -> None:
+    """Build the images of these Compose services; Docker skips what has not changed."""
+    build = (*BUILD, *services)
+    try:
+        with progress("building images"):
+            code = subprocess.run(build, timeout=BUILD_S, check=False).returncode
+    except subprocess.TimeoutExpired as error:
+        raise OffloadError(f"`{' '.join(build)}` has not ended after {BUILD_S:g} s") from error
+    if code != 0:
+        raise OffloadError(f"`{' '.join(build)}` failed with exit code {code}")
+
+
+def owner(pid: int) -> str:
+    """A name that no other process ever has, on any machine: host, process namespace, pid and start time."""
+    return f"{_host()}/{pid}/{started(pid)}"
+
+
+def is_gone(name: str) -> bool:
+    """Whether the process with this name is known to be gone; False for a process of another host."""
+    host, pid, _ = name.rsplit("/", 2)
+    return host == _host() and name != owner(int(pid))
+
+
+def started(pid: int) -> int | None:
+    """The start time of a process, in kernel ticks since boot; None if there is no such process."""
+    try:
+        return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19])
+    except OSError:
+        return None
+
+
+def _host() -> str:
+    return f"{socket.gethostname()}/{Path('/proc/self/ns/pid').readlink()}"
+
+
+def _remove_unless_gone(made: Any, **how: bool) -> None:
+    with contextlib.suppress(NotFound):
+        made.remove(**how)

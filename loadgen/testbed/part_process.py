@@ -4,34 +4,33 @@
 """
 
 import contextlib
-import http.client
 import os
 import select
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from http import HTTPStatus
 from pathlib import Path
-from types import FrameType
-from typing import Any, NoReturn
+from typing import Any
 
-from offboard.common.errors import ConfigError, OffloadError
+from offboard.common.errors import OffloadError
 from offboard.loadgen.progress import drawn_on
 from offboard.loadgen.relay.relay_client import ask
 from offboard.loadgen.testbed.cpu_quota import Quota
-from offboard.loadgen.testbed.part_output import TAIL_BYTES, TAIL_LINES, Output
+from offboard.loadgen.testbed.real_testbed import (
+    KILL_S,
+    TAIL_BYTES,
+    TERMINATE_S,
+    Output,
+    last_lines,
+    poll_until_ready,
+)
 from offboard.loadgen.testbed.testbed import PART
 
 LAUNCH_S = 10.0
-POLL_S = 0.05
-TERMINATE_S = 5.0
-KILL_S = 5.0
 CHUNK_BYTES = 1 << 16
-USAGE_EXIT = 2
-INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 
 # A Python program that becomes the command argv[3:]. The kernel kills it when the testbed (process argv[1])
 # dies, even if it is stopped. The pipe argv[2] closes when it becomes the command. The parent is checked
@@ -102,6 +101,11 @@ class Child:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.process.pid, number)
 
+    def kill(self) -> None:
+        """End the process and its workers by SIGKILL."""
+        self.send(signal.SIGKILL)
+        self.process.wait(KILL_S)
+
     def finish_output(self) -> None:
         """Wait for the last output of a process that has ended, if it goes through us."""
         if self.output is not None:
@@ -111,11 +115,9 @@ class Child:
             self.process.stdout.close()
 
     def tail(self) -> str:
-        """The last lines that the process logged since its start."""
         with self.log.open("rb") as file:
             file.seek(max(self.log_start, self.log.stat().st_size - TAIL_BYTES))
-            lines = file.read().decode(errors="replace").splitlines()
-        return "\n".join(lines[-TAIL_LINES:]) or "(it logged nothing)"
+            return last_lines(file.read())
 
 
 def launch(part: Part, log: Path, *, again: bool) -> Child:
@@ -126,20 +128,11 @@ def launch(part: Part, log: Path, *, again: bool) -> Child:
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("ab" if again else "wb") as file:
         launched, launching = os.pipe()
-        command = [
-            sys.executable,
-            "-I",
-            "-S",
-            "-c",
-            LAUNCHER,
-            str(os.getpid()),
-            str(launching),
-            *part.command,
-        ]
+        launcher = [sys.executable, "-I", "-S", "-c", LAUNCHER, str(os.getpid()), str(launching)]
         through_us = part.shown and drawn_on(sys.stdout)
         output: Any = {"stdout": subprocess.PIPE if through_us else file, "stderr": subprocess.STDOUT}
         process = subprocess.Popen(
-            command,
+            [*launcher, *part.command],
             stdin=subprocess.DEVNULL,
             env={**os.environ, PART: part.name},
             start_new_session=True,
@@ -156,27 +149,16 @@ def launch(part: Part, log: Path, *, again: bool) -> Child:
 
 
 def wait_ready(child: Child, timeout_s: float) -> None:
-    """Poll until the part answers 200.
-
-    If it ends before, or takes too long, the error contains the end of its log.
-    """
+    """Wait until the part answers 200; otherwise the error contains the end of its log."""
     part = child.part
-    assert part.http is not None
-    end_s = time.monotonic() + timeout_s
-    while child.process.poll() is None:
-        with contextlib.suppress(OffloadError):
-            if ask(part.http, "GET", part.ready)[0] == http.client.OK:
-                return
-        if time.monotonic() > end_s:
-            raise OffloadError(
-                f"{part.name} was not ready within {timeout_s:g} s; its log ends with:\n{child.tail()}"
-            )
-        time.sleep(POLL_S)
-    code = child.process.returncode
-    if code == USAGE_EXIT:
-        raise ConfigError(child.tail())
-    raise OffloadError(
-        f"{part.name} ended during start with exit code {code}; {child.log} ends with:\n{child.tail()}"
+    http = part.http
+    assert http is not None
+
+    def ready() -> bool:
+        return ask(http, "GET", part.ready)[0] == HTTPStatus.OK
+
+    poll_until_ready(
+        part.name, ready, child.process.poll, tail=child.tail, log=child.log, timeout_s=timeout_s
     )
 
 
@@ -187,27 +169,4 @@ def end(child: Child) -> None:
         child.process.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):
             child.process.wait(TERMINATE_S)
-    child.send(signal.SIGKILL)
-    child.process.wait(KILL_S)
-
-
-def leave(number: int, _frame: FrameType | None) -> NoReturn:
-    """Handler for SIGTERM: raises SystemExit, so that `with` blocks end what they started."""
-    raise SystemExit(128 + number)
-
-
-@contextlib.contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Delay Ctrl-C and SIGTERM until the end of the block.
-
-    They are not blocked: children would inherit that.
-    """
-    kept: list[int] = []
-    before = {number: signal.signal(number, lambda n, _: kept.append(n)) for number in INTERRUPTS}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        for interrupt in set(kept):
-            signal.raise_signal(interrupt)
+    child.kill()

@@ -7,7 +7,7 @@ Each server has a relay of its own: the server `cloud` has `wan`, a server `edge
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 CLOUD, WAN, ROBOT = "cloud", "wan", "robot"
 PART = "OFFBOARD_PART"  # environment variable of each part that holds its name
@@ -25,7 +25,6 @@ def relay_of(server: str) -> str:
 
 
 def servers_among(parts: Iterable[str]) -> tuple[str, ...]:
-    """The names of the servers, in their order."""
     return tuple(part for part in parts if kind_of(part) == CLOUD)
 
 
@@ -54,6 +53,16 @@ class Setup:
     site: str = ""
 
 
+def endpoint_flags(setups: Mapping[str, Setup], endpoints: Mapping[str, str]) -> dict[str, str]:
+    """The flags with which a robot finds the servers at these endpoints."""
+    further = ",".join(
+        f"{setups[server].site or server}={endpoint}"
+        for server, endpoint in endpoints.items()
+        if server != CLOUD
+    )
+    return {"cloud": endpoints[CLOUD], **({"site": further} if further else {})}
+
+
 @dataclass(frozen=True, slots=True)
 class Usage:
     """Resident memory, and open files and sockets, of a part and its worker processes."""
@@ -70,7 +79,7 @@ class Testbed(Protocol):
 
     out: Path
 
-    def __enter__(self) -> Self: ...
+    def __enter__(self) -> "Testbed": ...
 
     def __exit__(self, *_: object) -> None: ...
 
@@ -101,10 +110,7 @@ class Testbed(Protocol):
         """A description of the CPU quota of a running part, for people; None: no quota."""
 
     def set_hogs(self, part: str, count: int) -> None:
-        """Set how many busy processes compete with a running part for its CPU quota.
-
-        They end with the part.
-        """
+        """Set how many busy processes compete with a running part for its CPU quota, until the part ends."""
 
     def set_link(self, server: str | None = None, **changes: Any) -> dict[str, Any]:
         """Change conditions of the link to a server, or of all links, named as in PUT /link of the relay.

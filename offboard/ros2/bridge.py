@@ -1,7 +1,6 @@
 """The planner server for robots with ROS 2, in a process without ROS: it speaks DDS by cyclonedds.
 
-It has the topics of the node, but not its action. What the messages mean is `topics`; their types are
-`dds_types`.
+It has the topics of the node, but not its action. What the messages mean is `topics`.
 """
 
 import contextlib
@@ -14,22 +13,24 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from offboard.common.errors import ConfigError
+from offboard.common.errors import ConfigError, MissingExtra
 from offboard.robot_client.offloader import Offloader
 from offboard.ros2.converters import Library
-from offboard.ros2.dds_types import TYPES
-from offboard.ros2.diagnostics import Diagnostics
 from offboard.ros2.parameters import Parameters
 from offboard.ros2.planner_server import SUCCEEDED, Outcome
-from offboard.ros2.topics import SameFrames, Topics
+from offboard.ros2.topics import Diagnostics, SameFrames, Topics
 
-# Imported after `dds_types`, which says how to install cyclonedds.
-from cyclonedds.core import Listener, Policy, Qos  # isort: skip
-from cyclonedds.domain import Domain, DomainParticipant  # isort: skip
-from cyclonedds.pub import DataWriter  # isort: skip
-from cyclonedds.sub import DataReader  # isort: skip
-from cyclonedds.topic import Topic  # isort: skip
-from cyclonedds.util import duration  # isort: skip
+try:
+    from cyclonedds.core import Listener, Policy, Qos
+    from cyclonedds.domain import Domain, DomainParticipant
+    from cyclonedds.idl import make_idl_struct
+    from cyclonedds.idl.types import array, byte, float32, float64, int8, int32, sequence, uint32
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.sub import DataReader
+    from cyclonedds.topic import Topic
+    from cyclonedds.util import duration
+except ImportError as error:
+    raise MissingExtra("a bridge without ROS", "dds") from error
 
 # The type information of Fast DDS differs from ours although the types are the same; 1.15 is its vendor id.
 # Where ROS is limited to its computer (ROS_AUTOMATIC_DISCOVERY_RANGE), it listens to no multicast, so the
@@ -52,6 +53,58 @@ LAST = Policy.History.KeepLast(1)
 LATCHED = Qos(RELIABLE, LAST, Policy.Durability.TransientLocal)
 NEWEST = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(5))
 EACH = Qos(RELIABLE, Policy.History.KeepLast(10))
+
+TYPES: dict[str, Any] = {}  # the classes of the messages of ROS
+
+
+def _message(name: str, /, **fields: Any) -> Any:
+    """Make the class of messages with these fields, under the name that they have on DDS."""
+    package, _, kind = name.split("/")
+    found = TYPES[name] = make_idl_struct(kind, f"{package}.msg.dds_.{kind}_", fields)
+    return found
+
+
+_time = _message("builtin_interfaces/msg/Time", sec=int32, nanosec=uint32)
+_header = _message("std_msgs/msg/Header", stamp=_time, frame_id=str)
+_point = _message("geometry_msgs/msg/Point", x=float64, y=float64, z=float64)
+_quaternion = _message("geometry_msgs/msg/Quaternion", x=float64, y=float64, z=float64, w=float64)
+_pose = _message("geometry_msgs/msg/Pose", position=_point, orientation=_quaternion)
+_stamped = _message("geometry_msgs/msg/PoseStamped", header=_header, pose=_pose)
+_uncertain = _message("geometry_msgs/msg/PoseWithCovariance", pose=_pose, covariance=array[float64, 36])
+_message("geometry_msgs/msg/PoseWithCovarianceStamped", header=_header, pose=_uncertain)
+_message(
+    "sensor_msgs/msg/LaserScan",
+    header=_header,
+    angle_min=float32,
+    angle_max=float32,
+    angle_increment=float32,
+    time_increment=float32,
+    scan_time=float32,
+    range_min=float32,
+    range_max=float32,
+    ranges=sequence[float32],
+    intensities=sequence[float32],
+)
+_info = _message(
+    "nav_msgs/msg/MapMetaData",
+    map_load_time=_time,
+    resolution=float32,
+    width=uint32,
+    height=uint32,
+    origin=_pose,
+)
+_message("nav_msgs/msg/OccupancyGrid", header=_header, info=_info, data=sequence[int8])
+_message("nav_msgs/msg/Path", header=_header, poses=sequence[_stamped])
+_value = _message("diagnostic_msgs/msg/KeyValue", key=str, value=str)
+_status = _message(
+    "diagnostic_msgs/msg/DiagnosticStatus",
+    level=byte,
+    name=str,
+    message=str,
+    hardware_id=str,
+    values=sequence[_value],
+)
+_message("diagnostic_msgs/msg/DiagnosticArray", header=_header, status=sequence[_status])
 
 DDS = Library(TYPES.__getitem__, lambda values: values.tolist())
 

@@ -6,16 +6,18 @@ What the node does is in `node`.
 import logging
 import os
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from offboard.common.command_line import load
-from offboard.common.config import as_dict
-from offboard.ros2.config import Ros2Config
+from offboard.common.config import as_dict, check, setting
+from offboard.common.errors import ConfigError
+from offboard.robot_client.flags import DecisionFlags, ServerFlags
 
 if TYPE_CHECKING:
     from offboard.robot_client.offloader import Offloader
-    from offboard.ros2.diagnostics import Diagnostics
+    from offboard.ros2.topics import Diagnostics
 
 ROS_ARGS = "--ros-args"
 ABOUT = (
@@ -24,6 +26,27 @@ ABOUT = (
 )
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Ros2Config(DecisionFlags, ServerFlags):
+    """Which servers the robot may use, how it decides, and what it records.
+
+    What nav2 sets by parameters (tolerance, frames, topics) are parameters of the node.
+    """
+
+    bridge: bool = setting(
+        False, "speak DDS without ROS, by cyclonedds: topics only, and no action (extra dds)"
+    )
+    trace: Path | None = setting(None, "file that gets a line for every goal")
+    metrics: str | None = setting(None, "address where Prometheus reads /metrics", metavar="HOST:PORT")
+
+    def __post_init__(self) -> None:
+        check(self)
+        self.check_servers()
+        self.check_decisions()
+        if self.memory is not None and self.memory == self.trace:
+            raise ConfigError(f"--memory: {self.memory} is also the file of --trace")
 
 
 def run_ros2(argv: Sequence[str]) -> int:
@@ -36,26 +59,22 @@ def run_ros2(argv: Sequence[str]) -> int:
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     serve = _bridge(for_ros) if config.bridge else _node(for_ros)
     log.info("settings: %s", as_dict(config))
-    from offboard.robot_client.records.recording import Recording
-    from offboard.ros2.diagnostics import Diagnostics
+    from offboard.robot_client.offloader import Offloader
     from offboard.ros2.planner_server import prepare
-    from offboard.ros2.stop import connect
+    from offboard.ros2.topics import Diagnostics
 
-    with ExitStack() as stack:
-        recording = Recording(trace=config.trace, metrics=config.metrics)
-        stack.callback(recording.close)
-        facts = Diagnostics()
-        offload = stack.enter_context(
-            connect(
-                config.cloud,
-                sites=config.sites,
-                policy=config.policy,
-                timeout_s=config.timeout_s,
-                keys=config.keys,
-                settings=config.settings(),
-                observers=[facts, *recording.observers],
-            )
-        )
+    facts = Diagnostics()
+    with Offloader.connect(
+        config.cloud,
+        sites=config.sites or config.further(),
+        policy=config.policy,
+        timeout_s=config.timeout_s,
+        keys=config.keys,
+        observers=[facts],
+        metrics=config.metrics,
+        trace=config.trace,
+        settings=config.settings(),
+    ) as offload:
         for line in prepare(offload, config.connect_s):
             log.warning("starting without %s: goals are planned elsewhere; remedy: robot-client check", line)
         serve(offload, facts)

@@ -7,18 +7,17 @@ It replaces nav2's `planner_server`: same action, same topics, same parameters. 
 import contextlib
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 from offboard.common.errors import ConfigError
 from offboard.common.planning.planner import Pose
 from offboard.robot_client.offloader import Offloader
 from offboard.ros2.converters import pose_of
-from offboard.ros2.diagnostics import Diagnostics
 from offboard.ros2.parameters import Parameters
 from offboard.ros2.planner_server import CANCELED, SUCCEEDED, UNKNOWN, Outcome, PendingGoal
 from offboard.ros2.ros_messages import ROS, find
-from offboard.ros2.topics import NAME, SAME, SameFrames, Topics
+from offboard.ros2.topics import NAME, SAME, Diagnostics, SameFrames, Topics
 from offboard.ros2.topics import Transforms as Frames
 
 try:
@@ -34,6 +33,7 @@ except ImportError as error:
         "'ros-kilted-rclpy[fastrtps]' ros-kilted-nav-msgs (docs/ros2.md)"
     ) from error
 
+# A node without a timer may miss SIGTERM: rclpy wakes it before it ends the context.
 DIAGNOSTICS_EVERY_S = 1.0
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 RESULTS_KEPT_S = 10  # for a client that asks late; Jazzy would keep the paths of 15 minutes
@@ -174,15 +174,7 @@ class TransformBuffer:
         if not self._buffer.can_transform(seen_from, frame, Time()):
             return None
         found = self._buffer.lookup_transform(seen_from, frame, Time()).transform
-        return pose_of(_Placed(found.translation, found.rotation))
-
-
-@dataclass(frozen=True, slots=True)
-class _Placed:
-    """A transform with the field names of a pose."""
-
-    position: Any
-    orientation: Any
+        return pose_of(SimpleNamespace(position=found.translation, orientation=found.rotation))
 
 
 @contextlib.contextmanager

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from offboard.common.errors import ConfigError
-from offboard.ros2.planner_server import Limits
 
 PARAMETER_FLAGS = ("-p", "--param")
 
@@ -17,11 +16,15 @@ PARAMETER_FLAGS = ("-p", "--param")
 class Parameters:
     """What a plan and its topics depend on.
 
-    action: its name. robot_frame: the frame of the robot. costmap: the map is nav2's costmap.
-    scan_topic: empty for no scan.
+    radius_m: of the robot. tolerance_m: how far from an occupied goal a path may end.
+    planners: the planner ids that goals may ask for. frame: of the map. robot_frame: of the robot.
+    action: its name. costmap: the map is nav2's costmap. scan_topic: empty for no scan.
     """
 
-    limits: Limits
+    radius_m: float
+    tolerance_m: float
+    planners: tuple[str, ...]
+    frame: str
     action: str
     robot_frame: str
     allow_unknown: bool
@@ -35,14 +38,11 @@ class Parameters:
         planners = tuple(declare("planner_plugins", ["GridBased"]))
         if not planners:
             raise ConfigError("planner_plugins: it is empty; it must name a planner")
-        limits = Limits(
+        return cls(
             radius_m=_distance(declare, "robot_radius", 0.1),
             tolerance_m=_distance(declare, f"{planners[0]}.tolerance", 0.5),
             planners=planners,
             frame=declare("global_frame", "map"),
-        )
-        return cls(
-            limits=limits,
             action=declare("action_name", "compute_path_to_pose"),
             robot_frame=declare("robot_base_frame", "base_link"),
             allow_unknown=declare(f"{planners[0]}.allow_unknown", True),

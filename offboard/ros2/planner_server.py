@@ -8,17 +8,19 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import CancelledError
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.common.errors import OffloadError, Unwanted
+from offboard.common.errors import OffloadError
 from offboard.common.planning.planner import Plan, Point, Pose, plan_path
 from offboard.common.tasks import kind_of
+from offboard.robot_client.execution.call_future import CallFuture
 from offboard.robot_client.offloader import Offloader
 from offboard.ros2.converters import poses_along
-from offboard.ros2.stop import Stop
+from offboard.ros2.parameters import Parameters
 from offboard.ros2.world import View, World, nearest_free
 
 # Statuses are nav2's error codes by name; the planner returns the others itself.
@@ -37,20 +39,6 @@ MESSAGES = {
 CLOSE_WAIT_S = 5.0
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """The parameters of nav2 that change a plan.
-
-    radius_m: of the robot. tolerance_m: how far from an occupied goal a path may end.
-    planners: the planner ids that goals may ask for. frame: of the map.
-    """
-
-    radius_m: float = 0.1
-    tolerance_m: float = 0.5
-    planners: tuple[str, ...] = ("GridBased",)
-    frame: str = "map"
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,20 +70,18 @@ class PendingGoal:
     goal: Goal
     done: Callable[[Outcome], None]
     accepted_s: float
-    stop: Stop = field(default_factory=Stop)
+    call: CallFuture[Plan] | None = None
+    stopped: bool = False
     canceled: bool = False
 
 
 class PlannerServer:
-    """Plans in a thread of its own. At most one goal is planned, and at most one waits.
+    """Plans in a thread of its own. At most one goal is planned, and at most one waits."""
 
-    `offload` must come from `stop.connect`.
-    """
-
-    def __init__(self, offload: Offloader, world: World, limits: Limits) -> None:
+    def __init__(self, offload: Offloader, world: World, parameters: Parameters) -> None:
         self._offload = offload
         self._world = world
-        self._limits = limits
+        self._parameters = parameters
         self._changed = threading.Condition()
         self._running: PendingGoal | None = None
         self._waiting: PendingGoal | None = None
@@ -108,8 +94,7 @@ class PlannerServer:
         pending = PendingGoal(goal, done, time.perf_counter())
         with self._changed:
             replaced, self._waiting = self._waiting, pending
-            if self._running is not None:
-                self._running.stop.stop()
+            self._stop(self._running)
             self._changed.notify()
         if replaced is not None:
             self._end(replaced, self._stopped(replaced))
@@ -122,7 +107,7 @@ class PlannerServer:
             waits = self._waiting is pending
             if waits:
                 self._waiting = None
-            pending.stop.stop()
+            self._stop(pending)
         if waits:
             self._end(pending, self._stopped(pending))
 
@@ -130,8 +115,7 @@ class PlannerServer:
         """End all goals, and wait for the thread."""
         with self._changed:
             self._closed = True
-            if self._running is not None:
-                self._running.stop.stop()
+            self._stop(self._running)
             self._changed.notify()
         self._thread.join(CLOSE_WAIT_S)
 
@@ -149,15 +133,21 @@ class PlannerServer:
 
     def _answer(self, pending: PendingGoal) -> Outcome:
         try:
-            with pending.stop.within():
-                return self._plan(pending.goal)
-        except Unwanted:
+            return self._plan(pending)
+        except CancelledError:
             return self._stopped(pending)
         except (OffloadError, ValueError) as error:
             return Outcome(ABORTED, UNKNOWN, str(error))
         except Exception as error:  # a goal without an answer would leave nav2 waiting
             log.exception("a goal failed; remedy: report this traceback")
             return Outcome(ABORTED, UNKNOWN, f"{type(error).__name__}: {error}")
+
+    def _stop(self, pending: PendingGoal | None) -> None:
+        """End this goal within milliseconds. Called under the lock."""
+        if pending is not None:
+            pending.stopped = True
+            if pending.call is not None:
+                pending.call.cancel()
 
     def _stopped(self, pending: PendingGoal) -> Outcome:
         if pending.canceled:
@@ -168,16 +158,14 @@ class PlannerServer:
     def _end(self, pending: PendingGoal, outcome: Outcome) -> None:
         pending.done(replace(outcome, seconds=time.perf_counter() - pending.accepted_s))
 
-    def _plan(self, goal: Goal) -> Outcome:
-        view, limits = self._world.view(), self._limits
-        if goal.planner and goal.planner not in limits.planners:
-            known = ", ".join(limits.planners)
+    def _plan(self, pending: PendingGoal) -> Outcome:
+        goal, view, given = pending.goal, self._world.view(), self._parameters
+        if goal.planner and goal.planner not in given.planners:
+            known = ", ".join(given.planners)
             return Outcome(ABORTED, INVALID_PLANNER, f"planner {goal.planner!r}; known: {known}")
         for frame in (goal.frame, goal.start_frame if goal.start else ""):
-            if frame not in ("", limits.frame):
-                return Outcome(
-                    ABORTED, TF_ERROR, f"a pose in frame {frame!r}; the map is in {limits.frame!r}"
-                )
+            if frame not in ("", given.frame):
+                return Outcome(ABORTED, TF_ERROR, f"a pose in frame {frame!r}; the map is in {given.frame!r}")
         if view is None:
             return Outcome(ABORTED, TIMEOUT, "no map was published yet")
         start = goal.start or view.pose
@@ -185,30 +173,35 @@ class PlannerServer:
             return Outcome(ABORTED, TF_ERROR, "the pose of the robot is not known yet")
         view = seen_from(view, start)
         end = Point(goal.pose.x, goal.pose.y)
-        plan = self._ask(view, start, end)
+        plan = self._ask(pending, view, start, end)
         if plan.status == GOAL_OCCUPIED:
-            near = nearest_free(view, end, radius_m=self._radius_m(view), tolerance_m=limits.tolerance_m)
+            near = nearest_free(view, end, radius_m=self._radius_m(view), tolerance_m=given.tolerance_m)
             if near is not None:
                 goal = replace(goal, pose=Pose(near.x, near.y, goal.pose.yaw))
-                plan = self._ask(view, start, near)
+                plan = self._ask(pending, view, start, near)
         if plan.status != NONE:
             return Outcome(ABORTED, plan.status, MESSAGES.get(plan.status, plan.status))
         return Outcome(SUCCEEDED, poses=poses_along(plan.metres, start, goal.pose))
 
-    def _ask(self, view: View, start: Pose, end: Point) -> Plan:
-        return self._offload(
-            plan_path,
-            view.grid,
-            view.scan,
-            pose=start,
-            goal=end,
-            radius_m=self._radius_m(view),
-            costs=view.costs,
-        )
+    def _ask(self, pending: PendingGoal, view: View, start: Pose, end: Point) -> Plan:
+        """The answer of the planner. CancelledError if the goal is stopped."""
+        with self._changed:
+            if pending.stopped:
+                raise CancelledError
+            call = pending.call = self._offload.submit(
+                plan_path,
+                view.grid,
+                view.scan,
+                pose=start,
+                goal=end,
+                radius_m=self._radius_m(view),
+                costs=view.costs,
+            )
+        return call.result()
 
     def _radius_m(self, view: View) -> float:
         """Costs already keep the robot away from obstacles."""
-        return self._limits.radius_m if view.costs is None else 0.0
+        return self._parameters.radius_m if view.costs is None else 0.0
 
 
 def seen_from(view: View, start: Pose) -> View:

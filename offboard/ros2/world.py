@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from offboard.common.planning.maps import FREE, UNKNOWN, GridMap, in_cells, passable
 from offboard.common.planning.planner import Point, Pose, Scan, scan_hits
-from offboard.common.planning.route import Hits
+from offboard.common.planning.workspaces import Hits
 
 SCAN_AGE_MAX_S = 1.0  # an older scan no longer says where obstacles are
 # nav2 publishes the costs of its costmap as 0 to 100: 1 to 98 for costs 1 to 252, then inscribed and lethal.

@@ -1,27 +1,42 @@
 """The steps of `robot-client check`: each one finds out one thing about a server, or fails with a remedy.
 
-How the questions are sent is in `network` and `session`.
+How the questions are sent is in `network`.
 """
 
 import statistics
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
 from offboard.common import VERSION as SOFTWARE
 from offboard.common.empty_task import EMPTY
-from offboard.common.security.exposure import on_loopback
+from offboard.common.security.address import on_loopback
 from offboard.common.security.keys import ROBOT, SERVER, robot_keys
 from offboard.common.tasks import hashes
-from offboard.common.text.wording import duration
 from offboard.common.wire import messages as wire
-from offboard.robot_client.check.network import Address, Listener, connect, identify, reason, resolve
-from offboard.robot_client.check.outcome import FAIL, OK, SKIP, Line, StepFailed
-from offboard.robot_client.check.session import ConnectionLost, Session
+from offboard.common.wording import duration
+from offboard.robot_client.check import network
+from offboard.robot_client.check.network import Listener, Session, StepFailed
 from offboard.robot_client.check.task_comparison import compare, load_kinds
-from offboard.robot_client.sites.connection import UNKNOWN_ROBOT, HandshakeFailure
+from offboard.robot_client.cloud.connection import UNKNOWN_ROBOT, HandshakeFailure
+from offboard.robot_client.sites.endpoint import host_and_port
 from offboard.robot_client.sites.runner import CLOUD
 
+OK, FAIL, SKIP = "ok", "FAIL", "skip"
 PINGS = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """The outcome of one step: its status is OK, FAIL or SKIP."""
+
+    status: str
+    step: str
+    text: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.status:<5} {self.step:<16}  {self.text}".rstrip()
 
 
 class Check:
@@ -41,7 +56,8 @@ class Check:
         key: bytes | None = None,
     ) -> None:
         self._endpoint = endpoint
-        self._address = Address.of(endpoint)
+        self._host, port = host_and_port(endpoint)
+        self._port = int(port)
         self._folder = keys
         self._keys = None if keys is None else robot_keys(keys, CLOUD, key)
         self._kinds, self._chosen = load_kinds(modules), bool(modules)
@@ -49,8 +65,10 @@ class Check:
         self._ips: list[str] = []
         self._ip = ""  # the one that is used
         self._listener = Listener.OTHER
-        self._session: Session | None = None
-        self._server: wire.Hello | None = None
+        self._opened = ExitStack()
+        # Made by the steps "keys" and "hello":
+        self._session: Session
+        self._server: wire.Hello
 
     def run(self) -> Iterator[Line]:
         """The line of each step, as soon as the step is over. After a failed step, all others are skipped."""
@@ -65,43 +83,33 @@ class Check:
             "empty task": self._run_empty_task,
         }
         failed = False
-        try:
+        with self._opened:
             for name, step in steps.items():
-                if failed:
-                    yield Line(SKIP, name)
-                    continue
-                line = self._take(name, step)
-                failed = line.status == FAIL
+                line = Line(SKIP, name) if failed else self._take(name, step)
+                failed = failed or line.status == FAIL
                 yield line
-        finally:
-            if self._session is not None:
-                self._session.close()
 
     def _take(self, name: str, step: Callable[[], str]) -> Line:
         try:
             return Line(OK, name, step())
         except StepFailed as failed:
             return Line(FAIL, name, str(failed))
-        except ConnectionLost:
-            remedy = "look into the log of the server; it may have been stopped, or have cut this robot off"
-            return Line(FAIL, name, str(StepFailed("the server closed the connection", remedy)))
 
     def _resolve(self) -> str:
-        host = self._address.host
         try:
-            self._ips = resolve(self._address)
+            self._ips = network.resolve(self._host, self._port)
         except OSError as error:
             raise StepFailed(
-                f"{host}: {reason(error)}",
+                f"{self._host}: {network.reason(error)}",
                 "correct the name, or add it to DNS or /etc/hosts; containers must share a network",
             ) from error
         self._ip = self._ips[0]
-        return f"{host} -> {' and '.join(self._ips)}"
+        return f"{self._host} -> {' and '.join(self._ips)}"
 
     def _connect(self) -> str:
-        port = self._address.port
+        port = self._port
         try:
-            self._ip = connect(self._ips, self._address, self._timeout_s)
+            self._ip = network.connect(self._ips, port, self._timeout_s)
         except ConnectionRefusedError as error:
             raise StepFailed(
                 f"nothing listens on port {port} of {self._ip}",
@@ -109,17 +117,17 @@ class Check:
             ) from error
         except OSError as error:
             raise StepFailed(
-                f"port {port} of {self._ip}: {reason(error)}",
+                f"port {port} of {self._ip}: {network.reason(error)}",
                 "check that the computer is on and can be reached, and that no firewall blocks the port",
             ) from error
         return f"port {port} of {self._ip}"
 
     def _identify(self) -> str:
         try:
-            self._listener = identify(self._ip, self._address, self._timeout_s)
+            self._listener = network.identify(self._ip, self._port, self._timeout_s)
         except OSError as error:
-            raise StepFailed(f"no second connection: {reason(error)}", "check again") from error
-        where = f"port {self._address.port}"
+            raise StepFailed(f"no second connection: {network.reason(error)}", "check again") from error
+        where = f"port {self._port}"
         if self._listener is Listener.HTTP:
             raise StepFailed(
                 f"an HTTP server listens on {where}",
@@ -151,6 +159,7 @@ class Check:
                 "start the server with --keys (`cloud-server keys` makes them), or leave out --keys here",
             )
         self._session = Session(self._endpoint, self._keys, self._timeout_s)
+        self._opened.callback(self._session.close)
         outcome = self._session.handshake()
         if isinstance(outcome, HandshakeFailure) and outcome.text == UNKNOWN_ROBOT:
             raise StepFailed(
@@ -167,28 +176,26 @@ class Check:
         return "encrypted (CURVE); each side knows the other" if encrypted else "none; nothing is encrypted"
 
     def _say_hello(self) -> str:
-        assert self._session is not None
         try:
-            self._server = self._session.hello(hashes())
+            server = self._session.hello(hashes())
         except wire.VersionMismatch as error:
             remedy = f"install the same version of Offboard on both sides; this robot has {SOFTWARE}"
             raise StepFailed(str(error), remedy) from error
-        if self._server is None:
+        if server is None:
             raise StepFailed(
                 f"the server has not answered within {self._timeout_s:g} s",
                 "wait until it is ready (/ready of its --http address answers 200) and check again",
             )
-        size = self._server.message_bytes_max / 2**20
-        versions = f"Offboard {self._server.software} there, {SOFTWARE} here"
+        self._server = server
+        size = server.message_bytes_max / 2**20
+        versions = f"Offboard {server.software} there, {SOFTWARE} here"
         return f"wire version {wire.VERSION}; {versions}; messages up to {size:g} MiB"
 
     def _compare_tasks(self) -> str:
-        assert self._server is not None
         server = self._server
         return compare(self._kinds, server.tasks, chosen=self._chosen, software=server.software)
 
     def _ping(self) -> str:
-        assert self._session is not None
         round_trips_s = []
         for number in range(1, PINGS + 1):
             seconds = self._session.ping(number)
@@ -202,8 +209,6 @@ class Check:
         return f"median {duration(median_s)}, worst {duration(max(round_trips_s))} of {PINGS}"
 
     def _run_empty_task(self) -> str:
-        assert self._session is not None
-        assert self._server is not None
         if EMPTY not in self._server.tasks:
             raise StepFailed(
                 f"the server has no task {EMPTY}, which every server of this version has",

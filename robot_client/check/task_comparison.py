@@ -6,12 +6,17 @@ from collections.abc import Mapping, Sequence
 from offboard.common import VERSION as SOFTWARE
 from offboard.common.empty_task import EMPTY
 from offboard.common.errors import ConfigError
-from offboard.common.source.comparison import difference, other_sources, versions
-from offboard.common.source.reading import read_files_of_robot
-from offboard.common.source.uncovered import not_compared
-from offboard.common.tasks import Kind, kinds, load_modules
+from offboard.common.source.comparison import (
+    difference,
+    not_compared,
+    other_sources,
+    read_files_of_robot,
+    versions,
+)
+from offboard.common.source.task_modules import load_modules
+from offboard.common.tasks import Kind, kinds
 from offboard.common.variants import AT
-from offboard.robot_client.check.outcome import StepFailed
+from offboard.robot_client.check.network import StepFailed
 from offboard.robot_client.sites.runner import CLOUD
 
 COMPARED = "functions, setups, packing, dataclasses and what covers= names"

@@ -1,17 +1,19 @@
 """The runners of the sites that tasks can use now: those that stay, and those of the servers in use.
 
-Which servers are in use is decided in `roster`; the threads that read lists are in `following`.
+Which servers are in use is decided in `roster`; the threads that read lists are in `server_lists`.
 """
 
 import logging
 import threading
 import time
 from collections.abc import Callable, Collection, ItemsView, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
 
 from offboard.common.errors import ConfigError, OffloadError
 from offboard.common.variants import group_of
 from offboard.robot_client.discovery.roster import Roster, Server
-from offboard.robot_client.sites.absence import Absent
+from offboard.robot_client.sites.absence import Absent, SiteView
 from offboard.robot_client.sites.runner import ONBOARD, Runner
 
 LEAVING_MIN_S = 5.0  # for which a server that is no longer used may still get tasks that began before
@@ -103,6 +105,14 @@ class PresentSites(Mapping[str, Runner]):
             self._leaving = [one for one in self._leaving if one not in ended]
         for _, runner, _ in ended:
             runner.close()
+
+    def views(self) -> Mapping[str, SiteView]:
+        """Each site as it is now, by its name."""
+        found = {}
+        for site, runner in self.now.items():
+            look = getattr(runner, "look", SiteView)  # a runner of the user's own may have none
+            found[site] = replace(look(), in_flight=self.in_flight(site))
+        return MappingProxyType(found)
 
     def on_close(self, act: Callable[[], None]) -> None:
         """Call this when the sites are closed."""

@@ -1,6 +1,6 @@
 """Which of the listed servers a robot uses now. Pure: no clock, socket or thread.
 
-Lists come from `sites_file`, `dns_name` or a simulation; `present_sites` connects to the servers in use.
+Lists come from `server_lists` or a simulation; `present_sites` connects to the servers in use.
 """
 
 import math

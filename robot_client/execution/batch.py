@@ -9,25 +9,19 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from offboard.common.errors import Overtaken, TaskError
-from offboard.common.tasks import Kind, Task, first_number
-from offboard.common.text.wording import duration
+from offboard.common.tasks import Task, first_number
+from offboard.common.wording import duration
 from offboard.robot_client.execution.call_threads import CallThreads
-from offboard.robot_client.execution.placement import (
-    BUDGET_SHARE,
-    SERVER_IN_FLIGHT_MAX,
-    Queue,
-    Start,
-    next_start,
-    takeover,
-)
+from offboard.robot_client.execution.placement import SERVER_IN_FLIGHT_MAX, Queue, Start, next_start, takeover
 from offboard.robot_client.policies import Decision, Forecast, Outlook
 from offboard.robot_client.predictors.base import WARM_UP
 from offboard.robot_client.records.record import Record
-from offboard.robot_client.sites.clock import Clock
 from offboard.robot_client.sites.runner import ONBOARD, Execution
+from offboard.robot_client.sites.waiting import Clock
 
 NAME = "map"
 THREADS_MIN = 40  # calls at a time, at least: servers may come while a batch runs
+BUDGET_SHARE = 0.5  # of the timeout of a server: a queue of tasks there may take this long
 LOOK_AHEAD = 32  # waiting tasks that may be placed next
 RECHECK_S = 0.05  # the longest wait before running tasks are checked again: one may be overdue
 
@@ -55,7 +49,7 @@ class Batch:
 
     `sites`: those that may be used. They may change while the batch runs.
     `predict`: makes the forecast of a size, without the wait for this batch's own tasks on each site.
-    `run`: runs a task to its end; called in threads.
+    `run`: runs a task to its end; called in threads. `leave`: ends the runs that are under way.
     `timeout_s`: how long a server has for a task.
     """
 
@@ -66,6 +60,7 @@ class Batch:
         *,
         predict: Predict,
         run: Run,
+        leave: Callable[[], object],
         clock: Clock,
         timeout_s: float,
     ) -> None:
@@ -77,14 +72,19 @@ class Batch:
         self._queues: dict[str, Queue] = {}  # also those of sites that have left
         self._predict = predict
         self._run = run
+        self._leave = leave
         self._clock = clock
         self._running: dict[Future[tuple[Execution, Record]], int] = {}
         self._placed: dict[int, Placed] = {}
         self._values: dict[int, Any] = {}
+        self._records: dict[int, Record] = {}
         self._errors: dict[int, BaseException] = {}
 
-    def run(self) -> list[Any]:
-        """The results in the order of the tasks; if tasks failed, the first error, when all have ended."""
+    def run(self, *, records: bool) -> list[Any]:
+        """The results in the order of the tasks; if tasks failed, the first error, when all have ended.
+
+        `records`: each result comes with its record, as a pair.
+        """
         threads = CallThreads(max(THREADS_MIN, SERVER_IN_FLIGHT_MAX * len(self._own())), NAME)
         try:
             while self._waiting or self._running:
@@ -95,11 +95,15 @@ class Batch:
                 self._clock.wait(list(self._running), RECHECK_S)
                 for done in [one for one in self._running if one.done()]:
                     self._finish(done)
+        except BaseException:  # Ctrl-C, or the code of a site: nobody waits for what still runs
+            self._leave()
+            raise
         finally:
             threads.close(wait=True)
         if self._errors:
             raise self._errors[min(self._errors)]
-        return [self._values[number] for number in range(len(self._tasks))]
+        numbers = range(len(self._tasks))
+        return [(self._values[n], self._records[n]) if records else self._values[n] for n in numbers]
 
     def _next(self) -> tuple[int, str, str] | None:
         """The task that should start now, with its site and the reason."""
@@ -171,8 +175,9 @@ class Batch:
             self._errors[number] = error
             return
         answer, record = done.result()
-        self._values[number] = answer.value
+        self._values[number], self._records[number] = answer.value, record
         if answer.failure is not None:
+            answer.failure.record = record
             self._errors[number] = answer.failure
         for one in record.executions:
             if one.site in self._queues and not isinstance(one.failure, Overtaken):
@@ -183,11 +188,6 @@ class Batch:
             queue.hear(execution.queue_s, execution.run_s)
         else:
             queue.hear(None, None)
-
-
-def arguments(kind: Kind, items: Iterable[Any]) -> list[tuple[Any, ...]]:
-    """The arguments of each item."""
-    return [kind.bind(kind.arguments_in(item), {}) for item in items]
 
 
 def _usable(forecast: Forecast) -> Mapping[str, Outlook]:

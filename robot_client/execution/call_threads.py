@@ -25,8 +25,9 @@ class CallThreads:
         self._lock = threading.Lock()
         self._unended = 0
 
-    def start(self, function: Callable[..., T], *args: Any) -> "Future[T]":
-        call: Future[T] = Future()
+    def start(self, function: Callable[..., T], *args: Any, call: "Future[T] | None" = None) -> "Future[T]":
+        """Make a call in a thread; returns `call`, or a new future if that is None."""
+        call = Future() if call is None else call
         with self._lock:
             self._unended += 1
         call.add_done_callback(self._end)

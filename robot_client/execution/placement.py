@@ -15,7 +15,6 @@ SERVER_IN_FLIGHT = 2  # one task runs while the next one is on its way
 SERVER_IN_FLIGHT_MAX = 8
 ONBOARD_IN_FLIGHT = 1  # onboard runs one task at a time, and no task is on its way
 QUEUED, UNQUEUED = 1.0, 0.1  # wait for a worker over run time: above, fewer tasks at once; below, more
-BUDGET_SHARE = 0.5  # of the timeout of a server: a queue of tasks there may take this long
 PACE_MIN = 0.1
 OVERDUE = 0.1  # of its predicted time: an overdue task should still need at least this long
 

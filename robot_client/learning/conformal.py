@@ -9,10 +9,11 @@ from bisect import bisect_left, insort
 from collections import deque
 
 from offboard.robot_client.policies.prediction_errors import ERRORS_MIN, SPREADS_90, PredictionErrors, unit_s
-from offboard.robot_client.predictors.line import RATE, RunningMean
+from offboard.robot_client.predictors.line import RunningMean
 
 COVERAGE = 0.9  # share of the times that an interval should hold
 ERRORS_MAX = 100  # the last ones
+STEP = 0.05  # by which one time that is outside makes the interval wider, as a share of the errors
 
 
 class Conformal:
@@ -82,7 +83,7 @@ class Conformal:
         return (low_s if low_s > 0 else 0.0), (high_s if high_s > 0 else 0.0)
 
     def _adapt(self, *, missed: bool) -> None:
-        outside = self._outside + RATE * (1 - COVERAGE - missed)  # below 0: wider than all errors seen
+        outside = self._outside + STEP * (1 - COVERAGE - missed)  # below 0: wider than all errors seen
         self._outside = min(COVERAGE, max(COVERAGE - 1, outside))
         self._ends = None
 

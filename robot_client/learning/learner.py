@@ -3,10 +3,11 @@
 What is learned of one site is in `site`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from typing import Any
 
 from offboard.common.errors import Overtaken
 from offboard.common.tasks import Size, Task
@@ -26,7 +27,9 @@ class PendingTask:
     `runners`: those of the sites that were present then. `absent`: why some are not in the forecast.
     `amount`: what the predictors were asked for.
     `started_s`: by the clock of the offloader. `call`: may name one more site while the task runs.
-    `answered`: gets the answer and when it came, for a caller that waits until a deadline.
+    `answered`: gets answer, record and when it came, for a caller that waits until a deadline.
+    `caller`: the `CallFuture` of its call, if it has one.
+    `so_far`: its runs at the moment, once they have begun. `refused`: as in the record.
     `work`: what a result told. `ended`: the runs that a probe is compared by.
     """
 
@@ -44,7 +47,11 @@ class PendingTask:
     absent: Mapping[str, str]
     call: "Future[str] | None" = None
     deadline_s: float | None = None
-    answered: "Future[tuple[Execution, float]] | None" = None
+    answered: "Future[tuple[Execution, Any, float]] | None" = None
+    caller: Any = None
+    so_far: Callable[[], tuple[Execution, ...]] | None = None
+    refused: str | None = None
+    cancelled: bool = False
     work: float | None = None
     ended: dict[str, Execution] = field(default_factory=dict)
 

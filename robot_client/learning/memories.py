@@ -5,7 +5,7 @@ What is known of one kind is in `kind`; the file that memories are saved to is i
 
 from collections.abc import Callable, Collection
 
-from offboard.common.source.reading import is_reading
+from offboard.common.source.comparison import is_reading
 from offboard.common.tasks import Kind
 from offboard.robot_client.learning.kind import KindMemory
 from offboard.robot_client.learning.memory_file import KeptKind
@@ -71,6 +71,10 @@ class Memories:
         if self._store is not None and not is_reading(kind):
             self._store.recall(found, sites)
         return found
+
+    def lost_s(self, kind: Kind, site: str) -> float:
+        """What the quality that answers of this site lose is worth, in seconds."""
+        return self._s_per_quality * (1.0 - kind.at(site).quality) if kind.variants else 0.0
 
     def due(self, now_s: float) -> bool:
         """Whether the memories should be saved now."""

@@ -4,8 +4,8 @@ When the file is read and written is in `store`.
 """
 
 import json
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from offboard.common import VERSION as SOFTWARE
@@ -97,37 +97,19 @@ def _site(given: Any, kind_source: str) -> KeptSite:
 
 
 def _observation(given: Any) -> Observation:
-    return Observation(
-        size=_size(given["size"]),
-        amount=_size(given["amount"]),
-        work=_maybe(given["work"]),
-        seconds=_number(given["seconds"]),
-        ok=_fact(given["ok"]),
-        condition=_condition(given["condition"]),
-        predicted_s=None if given["predicted_s"] is None else _number(given["predicted_s"], -NUMBER_MAX),
-        waited_s=_number(given["waited_s"]),
-        bytes_out=_number(given["bytes_out"]),
-        bytes_in=_number(given["bytes_in"]),
-        cpu_s=_maybe(given["cpu_s"]),
-        run_s=_maybe(given["run_s"]),
-        queue_s=_maybe(given["queue_s"]),
-        bound=_fact(given["bound"]),
-    )
+    readers = {one.name: _READERS[one.type] for one in fields(Observation)}
+    readers["predicted_s"] = _signed
+    return Observation(**{name: read(given[name]) for name, read in readers.items()})
 
 
 def _condition(given: Any) -> Condition:
     unknown = given.keys() - set(Condition._fields)
     if unknown:
         raise ValueError(f"unknown condition {sorted(unknown)[0]!r}")
-    return Condition(
-        round_trip_s=_maybe(given["round_trip_s"]),
-        silent=_fact(given["silent"]),
-        queue=int(_number(given["queue"])),
-        load=_number(given["load"]),
-        wait_s=_number(given["wait_s"]),
-        capacity=_share(given["capacity"]),
-        server_load=_number(given["server_load"]),
-    )
+    found = {name: _READERS[of](given[name]) for name, of in Condition.__annotations__.items()}
+    if not 0 < found["capacity"] <= 1:
+        raise ValueError(f"{found['capacity']} where a share above 0 to 1 was expected")
+    return Condition(**found)
 
 
 def _size(given: Any) -> Size:
@@ -142,17 +124,26 @@ def _number(given: Any, least: float = 1 / NUMBER_MAX) -> float:
     return float(given)
 
 
-def _share(given: Any) -> float:
-    if not 0 < _number(given) <= 1:
-        raise ValueError(f"{given} where a share above 0 to 1 was expected")
-    return float(given)
-
-
 def _maybe(given: Any) -> float | None:
     return None if given is None else _number(given)
+
+
+def _signed(given: Any) -> float | None:
+    """A prediction, which may be below 0."""
+    return None if given is None else _number(given, -NUMBER_MAX)
 
 
 def _fact(given: Any) -> bool:
     if not isinstance(given, bool):
         raise TypeError(f"{given!r} where true or false was expected")
     return given
+
+
+_READERS: dict[Any, Callable[[Any], Any]] = {  # by the type of a field
+    float: _number,
+    float | None: _maybe,
+    int: lambda given: int(_number(given)),
+    bool: _fact,
+    Size: _size,
+    Condition: _condition,
+}

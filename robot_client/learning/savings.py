@@ -6,7 +6,7 @@ Which site a task would have been sent to is said by `policies/observe.py`.
 import math
 from dataclasses import dataclass
 
-from offboard.common.text.wording import duration, with_bounds
+from offboard.common.wording import duration, with_bounds
 from offboard.robot_client.policies.prediction_errors import student_90
 from offboard.robot_client.predictors.base import WARM_UP
 

@@ -9,7 +9,7 @@ import importlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from offboard.common.class_path import MODULE_CLASS, find_class
+from offboard.common.config import MODULE_CLASS, find_class
 from offboard.common.errors import ConfigError
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
@@ -128,11 +128,11 @@ def names() -> tuple[str, ...]:
     return tuple(_RULES)
 
 
-def check_name(name: str, where: str = "policy", allowed: str = HELP) -> None:
+def check_name(name: str, where: str = "policy") -> None:
     """ConfigError unless all parts of the name are known or a path; `where` names its flag or field."""
     *wrappers, rule = full_name(name).split(":")
     if rule not in _RULES and "." not in rule:
-        raise ConfigError(f"{where}: {name!r} is not one of {allowed}")
+        raise ConfigError(f"{where}: {name!r} is not one of {HELP}")
     for n, wrapper in enumerate(wrappers):
         if wrapper not in _WRAPPERS or wrapper in wrappers[:n]:
             known = ", ".join(_WRAPPERS)

@@ -5,7 +5,6 @@ The wrappers `probe`, `hedge` and `budget` ask for what is left; the offloader t
 
 import math
 
-from offboard.common.errors import ConfigError
 from offboard.common.token_bucket import Bucket
 from offboard.robot_client.predictors.base import WARM_UP
 
@@ -31,11 +30,6 @@ class Allowance:
         *,
         first: float = DUPLICATES_MAX,
     ) -> None:
-        if not 0 <= duplicates <= 1:
-            raise ConfigError(f"duplicates {duplicates}: must be a share of tasks from 0 to 1")
-        for name, cap in (("bytes", bytes_a_minute), ("joules", joules_a_minute)):
-            if cap is not None and not cap >= 0:
-                raise ConfigError(f"{name} a minute {cap}: must be 0 or more")
         self._second = Bucket(duplicates, DUPLICATES_MAX, first if duplicates else 0.0)
         self._bytes, self._joules = _of_a_minute(bytes_a_minute), _of_a_minute(joules_a_minute)
         self._at_s: float | None = None

@@ -6,8 +6,8 @@ The windows and the least squares that the rule was published with are in `predi
 from collections.abc import Mapping
 from functools import partial
 
-from offboard.common.text.wording import duration
 from offboard.common.variants import group_of
+from offboard.common.wording import duration
 from offboard.robot_client.policies.decision import Decision
 from offboard.robot_client.policies.forecast import Forecast, cheapest, costs_of, home
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from offboard.common.errors import DeadlineMissed
-from offboard.common.text.wording import duration, with_interval
+from offboard.common.wording import duration, with_interval
 from offboard.robot_client.policies.forecast import Forecast, Outlook
 
 

@@ -7,12 +7,13 @@ import math
 from collections.abc import Mapping
 from functools import partial
 
-from offboard.common.text.wording import duration
+from offboard.common.wording import duration
 from offboard.robot_client.policies.decision import Decision, Hedge, Policy
 from offboard.robot_client.policies.forecast import Forecast, Outlook, cheapest
 from offboard.robot_client.policies.prediction_errors import ERRORS_MIN, SPREADS_90, unit_s, widened_s
 from offboard.robot_client.sites.runner import ONBOARD
 
+NONE_LEFT = "no second run is left"  # a part of the reason
 TAIL_SHARE = 0.2  # of the errors, the largest ones: they say how much longer a late task may take
 BEYOND = 0.25  # of the distance from the median to the largest error: later than that, no task has ended
 
@@ -21,7 +22,7 @@ class WithHedges:
     """Adds a hedge: if the chosen site has not answered after some time, the task starts on a second one too.
 
     - Which site: of those that are known and not silent, the one that should take the least time. If there is
-      none, onboard, of which nothing is known yet: a first call must not wait for a server alone.
+      none, onboard, of which nothing is known yet: a call must not wait for one known server alone.
     - When: `late_after_s` says it, from the past errors of the chosen site.
     - Whether: if a second run is left, and before the deadline, if there is one.
 
@@ -51,7 +52,7 @@ class WithHedges:
         return Decision(decision.site, why, decision.policy, second=second, latest=decision.latest)
 
 
-def late_after_s(outlook: Outlook, worth_s: float) -> float | None:
+def late_after_s(outlook: Outlook, worth_s: float, lost_s: float = 0.0) -> float | None:
     """After how many seconds a run on this site is late, if a second run is worth `worth_s`; None: unknown.
 
     It is the age from which on past tasks needed longest. An error is what a task took beyond its prediction,
@@ -67,20 +68,26 @@ def late_after_s(outlook: Outlook, worth_s: float) -> float | None:
     is late after 1 + 1 = 2 s; if it takes longer, after 1 + 9 + 9 / 4 = 12.25 s.
 
     With fewer than ten errors, a run is late after 95 % of times that are normal around the prediction.
+
+    `lost_s`: what the quality is worth that the second run would lose, a part of `worth_s`. If no past task
+    was late by more than the second run is worth, that run starts this much later: the better answer should
+    still come.
     """
     if outlook.predicted_s is None:
         return None
     scores, count = outlook.errors.scores, len(outlook.errors.scores)
     if count < ERRORS_MIN:
-        return None if outlook.spread_s is None else outlook.predicted_s + SPREADS_90 * outlook.spread_s
+        if outlook.spread_s is None:
+            return None
+        return outlook.predicted_s + SPREADS_90 * outlook.spread_s + lost_s
     unit, largest = unit_s(outlook.predicted_s, outlook.errors.usual_s), scores[-1]
     tail = scores[count - round(TAIL_SHARE * count) :]
     late = largest + BEYOND * (largest - scores[count // 2])
     if unit * (largest - tail[0]) > worth_s:  # otherwise no rest in the tail was so long
         age, rest = _longest_rest(tail)
         if unit * rest > worth_s:
-            late = age
-    return max(0.0, outlook.predicted_s + widened_s(unit * late, outlook.error_s or 0.0))
+            late, lost_s = age, 0.0
+    return max(0.0, outlook.predicted_s + widened_s(unit * late, outlook.error_s or 0.0)) + lost_s
 
 
 def _longest_rest(tail: tuple[float, ...]) -> tuple[float, float]:
@@ -98,7 +105,7 @@ def _longest_rest(tail: tuple[float, ...]) -> tuple[float, float]:
 def _planned(first: str, forecast: Forecast) -> Hedge | str:
     """The hedge of a task that runs on this site, or why it has none."""
     if forecast.duplicates < 1:
-        return "no second run is left"
+        return NONE_LEFT
     chosen = forecast.sites[first]
     others = {
         site: one.predicted_s + one.quality.lost_s - chosen.quality.lost_s
@@ -115,7 +122,8 @@ def _planned(first: str, forecast: Forecast) -> Hedge | str:
             return "no second site answers"
         return "no second site is known" if forecast.deadline_s is None else "no second site is as good"
     second = cheapest(others)
-    after_s = late_after_s(chosen, others[second])
+    lost_s = 0.0 if others[second] == math.inf else forecast.sites[second].quality.lost_s
+    after_s = late_after_s(chosen, others[second], max(0.0, lost_s - chosen.quality.lost_s))
     if after_s is None or after_s <= 0:  # a line below 0 does not say when a task is late
         return f"unknown when {first} is late"
     if forecast.deadline_s is not None and after_s >= forecast.deadline_s:

@@ -13,6 +13,7 @@ from offboard.robot_client.policies.forecast import WHOLE, Forecast, Outlook, Qu
 from offboard.robot_client.policies.prediction_errors import SPREADS_90, PredictionErrors, widened_s
 from offboard.robot_client.sites.runner import ONBOARD, Execution
 
+OBJECTIVE = "objective"  # the heading of its options in the help
 S_PER_QUALITY = 1.0  # seconds that the whole quality is worth
 FEW_TIMES = 3.0  # predicted times that a task onboard may take before a deadline, by few runs
 LONGEST = 1.1  # of its slowest run, by enough runs
@@ -106,12 +107,33 @@ class Energy:
     (Balasubramanian et al., Energy Consumption in Mobile Phones, IMC 2009, table 4).
     """
 
-    compute_w: float = setting(0.9, "power that one busy core draws above idle, in watts", minimum=0.0)
-    idle_w: float = setting(0.0, "power drawn while waiting for an answer, in watts", minimum=0.0)
-    radio_j_byte: float = setting(7e-6, "energy per byte sent or received, in joules", minimum=0.0)
+    compute_w: float = setting(
+        0.9,
+        "power that one busy core draws above idle, in watts",
+        group=OBJECTIVE,
+        rare=True,
+        minimum=0.0,
+        maximum=1e4,
+    )
+    idle_w: float = setting(
+        0.0,
+        "power drawn while waiting for an answer, in watts",
+        group=OBJECTIVE,
+        rare=True,
+        minimum=0.0,
+        maximum=1e4,
+    )
+    radio_j_byte: float = setting(
+        7e-6,
+        "energy to send or receive one byte, in joules",
+        group=OBJECTIVE,
+        rare=True,
+        minimum=0.0,
+        maximum=1.0,
+    )
 
     def __post_init__(self) -> None:
-        check(self)
+        check(self, "")
 
     def onboard_j(self, cpu_s: float) -> float:
         """Joules of computing for `cpu_s` CPU seconds."""

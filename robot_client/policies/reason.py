@@ -1,7 +1,7 @@
 """Why a site was chosen, in words: predictions, what was measured, and how old the other sites are."""
 
 from offboard.common.tasks import show_size
-from offboard.common.text.wording import duration, with_interval
+from offboard.common.wording import duration, with_interval
 from offboard.robot_client.policies.forecast import WHOLE, Forecast, Outlook
 from offboard.robot_client.sites.runner import ONBOARD, Condition
 

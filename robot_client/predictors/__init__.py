@@ -1,6 +1,6 @@
 """The registry of predictors: the two that robots need, by name, and any other by the path of its class."""
 
-from offboard.common.class_path import MODULE_CLASS, find_class
+from offboard.common.config import MODULE_CLASS, find_class
 from offboard.common.errors import ConfigError
 from offboard.robot_client.predictors.base import Model, Prediction, Predictor
 
@@ -27,5 +27,5 @@ def make(name: str, window: int, seed: int = 0) -> Predictor | Model:
 
 def check_name(name: str, where: str = "predictor", allowed: str = HELP) -> None:
     """ConfigError unless the name is known or a path; `where` names its flag or field. Loads nothing."""
-    if name not in _CLASSES and "." not in name:
+    if name not in _CLASSES and ("." not in name or ":" in name):
         raise ConfigError(f"{where}: {name!r} is not one of {allowed}")

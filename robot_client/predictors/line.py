@@ -12,24 +12,22 @@ PACE = 0.01  # by which a site becomes slower or faster from one task to the nex
 ODD = 3.0  # standard deviations: a time farther from the line is an outlier
 RATE = 0.05  # of the running means, once there are enough times
 TAIL_MAX = 2.0  # usual times: a longer outlier counts as this much in the mean of the outliers
-SLOPES = 4.0  # times the expected slope: so uncertain is the first one
 
 
 class Line:
-    """`a + b x` seconds on top of `known` seconds, for an amount `x` whose usual value is near 1.
+    """`a + b x` seconds on top of `apart_s` seconds, for an amount `x` whose usual value is near 1.
 
     With `together`, `a` and `b` change by the same factor, because a site that slows down is slower for all
     amounts. Otherwise they change independently, each in proportion to itself: the delay of a link and its
-    bandwidth have nothing to do with each other. `slope`: the largest `b` that one time may suggest.
+    bandwidth have nothing to do with each other.
     """
 
     __slots__ = (
-        "_noise", "_paa", "_pab", "_pbb", "_side", "_tail", "_together", "_usual", "a", "b", "count", "slope",
+        "_noise", "_paa", "_pab", "_pbb", "_side", "_tail", "_together", "_usual", "a", "b", "count",
     )  # fmt: skip
 
-    def __init__(self, *, together: bool, slope: float | None = None) -> None:
+    def __init__(self, *, together: bool) -> None:
         self._together = together
-        self.slope = slope
         self.count = 0
         self.a = self.b = 0.0
         self._noise = NOISE * NOISE  # variance in units of the squared usual time
@@ -62,23 +60,22 @@ class Line:
         variance = self._paa + 2.0 * x * self._pab + x * x * self._pbb
         return math.sqrt(variance) if variance > 0.0 else 0.0
 
-    def learn(self, x: float, y: float, known: float = 0.0) -> None:
-        """An amount `x` took `y` seconds beyond `known`."""
+    def learn(self, x: float, y: float, apart_s: float = 0.0) -> None:
+        """An amount `x` took `y` seconds beyond `apart_s`."""
         self.count += 1
         if self.count == 1:
-            self._begin(x, y, known)
+            self._begin(x, y, apart_s)
             return
         rate = max(RATE, 1.0 / self.count)
         error, usual = y - self.a - self.b * x, self._usual
-        unit = 0.5 * (max(0.0, self.a + self.b * x + known) + usual) or 1.0
-        self._usual += rate * (min(y + known, ODD * usual) - usual)
-        self._loosen(PACE * PACE, known)
+        unit = 0.5 * (max(0.0, self.a + self.b * x + apart_s) + usual) or 1.0
+        self._usual += rate * (min(y + apart_s, ODD * usual) - usual)
+        self._loosen(PACE * PACE, apart_s)
         variance, reach = self._reach(x, unit)
         side = math.copysign(1.0, error) if abs(error) > reach else 0.0
         changed = side < 0 or (side != 0 and side == self._side)
         if changed:
-            error = min(error, unit)  # a change at most doubles the time, until the next one confirms it
-            self._loosen(min(1.0, (error / unit) ** 2), known)
+            self._loosen(min(1.0, (error / unit) ** 2), apart_s)
             variance, reach = self._reach(x, unit)
         self._side = side
         beyond = min(max(0.0, error - reach) / unit, TAIL_MAX)
@@ -95,33 +92,30 @@ class Line:
         self._paa = self._noise * y * y + 0.25 * y * y
         self._pab, self._pbb = 0.0, (0.5 * self.b) ** 2
 
-    def bound(self, x: float, y: float, known: float) -> None:
-        """The amount `x` takes at most `y` seconds beyond `known`."""
+    def bound(self, x: float, y: float, apart_s: float) -> None:
+        """The amount `x` takes at most `y` seconds beyond `apart_s`."""
         if not self.count:
-            self.learn(x, y, known)
+            self.learn(x, y, apart_s)
         elif self.a + self.b * x > y:
             self.a = y - self.b * x
-            self._paa = max(self._paa, self._noise * (self.a + known) ** 2)
+            self._paa = max(self._paa, self._noise * (self.a + apart_s) ** 2)
 
-    def _begin(self, x: float, y: float, known: float) -> None:
-        self._usual = unit = y + known or 1.0
-        half = uncertain = 0.5 * y if x > 0 else 0.0
-        if self.slope is not None:
-            half = max(half, NOISE * unit)  # of a short time, noise may hide as much
-            half, uncertain = min(half, self.slope), min(half, SLOPES * self.slope)
-        self.b = half
+    def _begin(self, x: float, y: float, apart_s: float) -> None:
+        """Half of the first time belongs to its amount. As much is uncertain, or what noise hides."""
+        self._usual = unit = y + apart_s or 1.0
+        self.b = half = 0.5 * y if x > 0 else 0.0
         self.a = max(0.0, y - self.b * x)
-        square = uncertain * uncertain
+        square = max(half, NOISE * unit) ** 2 if x > 0 else 0.0
         self._paa, self._pab, self._pbb = square * x * x + self._noise * unit * unit, -square * x, square
 
-    def _loosen(self, share: float, known: float) -> None:
+    def _loosen(self, share: float, apart_s: float) -> None:
         """Intercept and slope may have changed by the root of this share."""
         if self._together:
             self._paa += share * self.a * self.a
             self._pab += share * self.a * self.b
             self._pbb += share * self.b * self.b
         else:
-            self._paa += share * (max(0.0, self.a) + known) ** 2
+            self._paa += share * (max(0.0, self.a) + apart_s) ** 2
             self._pbb += share * self.b * self.b
 
     def _reach(self, x: float, unit: float) -> tuple[float, float]:

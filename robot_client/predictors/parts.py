@@ -6,7 +6,7 @@ part is learned with; `learning/site.py` decides which executions say anything.
 
 import math
 
-from offboard.common.host.load import LOADED
+from offboard.common.load import LOADED
 from offboard.common.tasks import first_number
 from offboard.robot_client.predictors.base import WARM_UP, Call, Prediction, Run, check_observation
 from offboard.robot_client.predictors.line import Line, RunningMean
@@ -129,9 +129,7 @@ class Parts:
             self._loaded.learn(x, alone_s)
 
     def _learn_network(self, moved: float, rest_s: float, rtt_s: float, *, bound: bool) -> None:
-        if not self._bytes:
-            self._bytes = moved
-            self._network.slope = moved / FIRST_BYTES_S
+        self._bytes = self._bytes or moved
         x = moved / self._bytes if self._bytes else 0.0
         if bound:
             self._network.bound(x, rest_s, rtt_s)

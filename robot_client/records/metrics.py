@@ -12,7 +12,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.registry import Collector
 
 from offboard.common.live.live_port import LivePort
-from offboard.common.live.robot_live import RobotLive
+from offboard.common.live.look import RobotLive
 from offboard.robot_client.learning.regret import Regret
 from offboard.robot_client.records.record import Record, as_dict
 from offboard.robot_client.records.trace import Trace
@@ -52,6 +52,10 @@ class Metrics:
         about = "Executions beyond the first of a task: warm-up, measuring, probes, hedges, fallbacks"
         name = "offboard_robot_duplicate_executions"
         self._duplicates = _ByLabels(Counter(name, about, ["kind"], registry=r))
+        about, name = "Calls without an answer by their deadline", "offboard_robot_missed_deadlines"
+        self._missed = _ByLabels(Counter(name, about, ["kind"], registry=r))
+        about = "Calls that their program cancelled after they had begun"
+        self._cancelled = _ByLabels(Counter("offboard_robot_cancelled_calls", about, ["kind"], registry=r))
         about = "1 if the last task of this kind could use the site; 0 if it was silent or absent"
         self._usable = _ByLabels(Gauge("offboard_robot_site_usable", about, site, registry=r))
         counted = self._tasks, self._executions, self._interval, self._decisions
@@ -64,7 +68,11 @@ class Metrics:
     def __call__(self, record: Record) -> None:
         if record.started_at >= self.live.due_at:
             self.live.keep(record, record.started_at)
-        self._tasks[record.kind, record.used or "none"].inc()
+        if record.cancelled:
+            self._cancelled[record.kind,].inc()
+        else:
+            self._tasks[record.kind, record.used or "none"].inc()
+            self._missed[record.kind,].inc(record.missed_deadline)
         self._waited[record.kind,].observe(record.waited_s)
         self._decisions[record.kind, record.decision.site, record.decision.policy].inc()
         self._duplicates[record.kind,].inc(len(record.executions) - 1)
@@ -111,7 +119,11 @@ class Metrics:
 
     def watch(self, trace: Trace) -> None:
         """Also serve how many records `trace` has lost."""
-        self._registry.register(_Lost(trace))
+        self.show(_Lost(trace))
+
+    def show(self, collector: Any) -> None:
+        """Also serve the metrics that `collect` of this object yields."""
+        self._registry.register(collector)
 
     def serve(self, address: str, where: str) -> None:
         """Answer GET /metrics and /live in background threads until `close`."""

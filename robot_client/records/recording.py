@@ -8,15 +8,19 @@ import logging
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from offboard.common.errors import is_interrupt
-from offboard.common.live.robot_live import RobotLive
+from offboard.common.live.look import RobotLive
 from offboard.robot_client.learning.learner import PendingTask
 from offboard.robot_client.learning.regret import Regret
 from offboard.robot_client.learning.savings import Savings
 from offboard.robot_client.records.record import Late, Record
 from offboard.robot_client.records.trace import Trace
 from offboard.robot_client.sites.runner import Execution
+
+if TYPE_CHECKING:
+    from offboard.robot_client.records.metrics import Metrics
 
 Observer = Callable[[Record], None]
 
@@ -33,6 +37,7 @@ class Recording:
     def __init__(self, *, trace: Path | str | None, metrics: str | None) -> None:
         self.observers: tuple[Observer, ...] = ()
         self.live: RobotLive[Record] | None = None
+        self._served: Metrics | None = None
         with ExitStack() as opened:
             file = self._trace = None if trace is None else Trace(Path(trace))
             if file is not None:
@@ -41,13 +46,18 @@ class Recording:
             if metrics is not None:
                 from offboard.robot_client.records.metrics import serve_metrics  # only where it is wanted
 
-                served = serve_metrics(metrics, "metrics")
+                served = self._served = serve_metrics(metrics, "metrics")
                 opened.callback(served.close)
                 if file is not None:
                     served.watch(file)
                 self.observers += (served,)
                 self.live = served.live
             self._opened = opened.pop_all()
+
+    def show(self, collector: Any) -> None:
+        """Also serve the metrics that `collect` of this object yields, if any are served."""
+        if self._served is not None:
+            self._served.show(collector)
 
     def leave_to_parent(self) -> None:
         """In a forked process: its end must not touch the file."""
@@ -62,14 +72,17 @@ class Recording:
 def record_of(
     pending: PendingTask,
     executions: tuple[Execution, ...],
-    answer: Execution,
+    answer: Execution | None,
     *,
     ended_s: float,
-    late: tuple[Late, ...],
-    regret: Regret | None,
-    savings: Savings | None,
+    late: tuple[Late, ...] = (),
+    regret: Regret | None = None,
+    savings: Savings | None = None,
 ) -> Record:
-    """The record of a task that was answered at `ended_s`, on the clock of the offloader."""
+    """The record of a task that was answered at `ended_s`, on the clock of the offloader.
+
+    `answer`: None if its caller does not wait for one any more.
+    """
     return Record(
         i=pending.i,
         id=pending.id,
@@ -78,7 +91,7 @@ def record_of(
         sites=pending.forecast.sites,
         decision=pending.decision,
         executions=tuple([execution.without_value() for execution in executions]),
-        used=answer.site if answer.ok else None,
+        used=answer.site if answer is not None and answer.ok else None,
         waited_s=ended_s - pending.started_s,
         amount=pending.amount,
         work=pending.work,
@@ -89,6 +102,8 @@ def record_of(
         started_at=pending.started_at,
         deadline_s=pending.deadline_s,
         savings=savings,
+        refused=pending.refused,
+        cancelled=pending.cancelled,
     )
 
 

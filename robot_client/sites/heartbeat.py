@@ -1,14 +1,14 @@
 """Heartbeats: small messages that a server answers at once.
 
 An answer shows that the server is there, how long a round trip takes, how many tasks wait in its queue, and
-how busy its CPU is. Pure: times come in as arguments. Sending is left to `cloud`.
+how busy its CPU is. `Heartbeat` is pure: times come in as arguments. Sending is left to `cloud`.
 """
 
+import time
 from collections import deque
 from random import Random
 from typing import NamedTuple
 
-from offboard.robot_client.sites.background import Background
 from offboard.robot_client.sites.runner import Condition
 
 EVERY_S = 0.5  # between two heartbeats: an outage is noticed at most this much later
@@ -19,6 +19,7 @@ SILENT_S = 0.25  # a site is silent if nothing came for longer than this, and lo
 SLACK_S = 0.02  # an answer is late if it takes this much longer than usual, and longer than round trips vary
 UNANSWERED_MAX = 16  # heartbeats that are remembered
 LEAST_OF = 2  # the shortest of that many round trips counts: one stalled segment does not make a slow link
+LOADED_SLOWER = 3  # times as long are the pauses of background work on a loaded robot
 
 
 class ServerReport(NamedTuple):
@@ -37,7 +38,7 @@ class Heartbeat:
     background: makes pauses longer on a loaded robot, and knows when the robot hears late.
     """
 
-    def __init__(self, every_s: float, seed: int = 0, background: Background | None = None) -> None:
+    def __init__(self, every_s: float, seed: int = 0, background: "Background | None" = None) -> None:
         self._every_s = every_s
         self._background = background or Background()
         self._random = Random(seed)
@@ -167,3 +168,34 @@ class Heartbeat:
             return
         self._varies_s += 1 / 4 * (abs(round_trip_s - self._smooth_s) - self._varies_s)
         self._smooth_s += 1 / 8 * (round_trip_s - self._smooth_s)
+
+
+class Background:
+    """What background work must know of the tasks of the robot: both need the same CPU.
+
+    On a tenth of a CPU, or next to a library that holds the interpreter's lock, a robot that computes hears
+    late from other sites. Shared by all runners of one offloader.
+
+    loaded: other programs take so much of the CPU that measured times show it.
+    """
+
+    def __init__(self) -> None:
+        self.loaded = False
+        self._computing = 0
+        self._computed_s = float("-inf")  # when a run onboard last ended
+
+    def pause_s(self, usual_s: float) -> float:
+        """The seconds to wait before the next step of work that is usually done this often."""
+        return LOADED_SLOWER * usual_s if self.loaded else usual_s
+
+    def begin(self) -> None:
+        """A run onboard begins. Called under the lock of the onboard runner, like `end`."""
+        self._computing += 1
+
+    def end(self) -> None:
+        self._computing -= 1
+        self._computed_s = time.perf_counter()
+
+    def computed_since(self, at_s: float) -> bool:
+        """Whether a task ran onboard at this time of `time.perf_counter`, or later."""
+        return self._computing > 0 or self._computed_s >= at_s

@@ -13,6 +13,8 @@ from functools import partial
 from queue import SimpleQueue
 from typing import Any
 
+from offboard.common import cpu_time
+from offboard.common.cpu_time import SELF
 from offboard.common.errors import (
     OffloadError,
     Overtaken,
@@ -22,16 +24,11 @@ from offboard.common.errors import (
     is_interrupt,
     of_task,
 )
-from offboard.common.host import cpu_time
-from offboard.common.host.cgroup import SELF
-from offboard.common.host.load import LOADED, Load
-from offboard.common.host.load_watch import LoadWatch
+from offboard.common.load import LOADED, Load, LoadWatch
+from offboard.common.task_call import call_while, join_all, traceback_of
 from offboard.common.task_states import TaskStates
 from offboard.common.tasks import Kind, Task
-from offboard.common.threads import join_all
-from offboard.common.tracebacks import traceback_of
-from offboard.common.wanted import call_while
-from offboard.robot_client.sites.background import Background
+from offboard.robot_client.sites.heartbeat import Background
 from offboard.robot_client.sites.runner import NOTHING, ONBOARD, Condition, Execution, Sending
 
 ABANDONED_MAX = 4  # cancelled runs that go on at the same time
@@ -144,7 +141,7 @@ class OnboardRunner:
     def cancel(self, task: Task) -> None:
         """Remove the task from the queue, or let its run stop early.
 
-        Its run is left alone past ABANDONED_MAX, and if no thread can be started.
+        Past ABANDONED_MAX, and if no thread can be started, the run keeps its place until it ends.
         """
         with self._lock:
             run = self._runs.get(task.id)
@@ -152,12 +149,11 @@ class OnboardRunner:
                 return
             if run.thread is None:
                 del self._runs[task.id]
-            elif task.kind.setup is not None:
-                run.wanted = False
-                return
-            elif self._abandoned == ABANDONED_MAX or not self._start(self._work):
-                return
             else:
+                run.wanted = False
+                keeps = task.kind.setup is not None or self._abandoned == ABANDONED_MAX
+                if keeps or not self._start(self._work):
+                    return
                 self._abandon(run)
         run.future.set_result(_overtaken(run, started=run.thread is not None))
 
@@ -325,5 +321,5 @@ def _call(run: _Run, state: tuple[Any, ...], states: TaskStates) -> Execution:
 
 def _overtaken(run: _Run, *, started: bool) -> Execution:
     seconds = time.perf_counter() - run.published_s - run.future.setup_s()
-    failure = Overtaken("another site answered first")
+    failure = Overtaken("its answer is no longer needed")
     return Execution(ONBOARD, seconds, failure=failure, censored=True, started=started)

@@ -3,7 +3,6 @@
 Which site runs a task is decided in `policies`.
 """
 
-import re
 from dataclasses import dataclass, field, fields
 from numbers import Real
 from operator import attrgetter
@@ -20,9 +19,6 @@ if TYPE_CHECKING:  # --help needs only the names of the sites
 ONBOARD, CLOUD = variants.ONBOARD, variants.CLOUD
 TIMEOUT_S = 2.0  # default time that a remote site has for a task
 TIMEOUT_MAX_S = 24 * 3600.0
-PORT_MAX = 65_535
-
-_ENDPOINT = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5})")
 
 
 class Packed(NamedTuple):
@@ -65,6 +61,7 @@ class Execution:
     started: false if the task certainly never ran there.
     packed: what was made smaller before it was sent; `network_s` leaves out the time for it.
     held_up: the run failed while the heartbeats of the site were unanswered or late.
+    after_s: when the run began, counted from the first run of its task.
     """
 
     site: str
@@ -81,6 +78,7 @@ class Execution:
     started: bool = True
     packed: tuple[Packed, ...] = ()
     held_up: bool = False
+    after_s: float = 0.0
 
     def without_value(self) -> "Execution":
         """A copy for the record, without the result, which may be large."""
@@ -172,10 +170,3 @@ def checked_timeout(timeout_s: float, name: str = "timeout_s") -> float:
     if isinstance(given, bool) or not (isinstance(given, Real) and 0 < timeout_s <= TIMEOUT_MAX_S):
         raise ConfigError(f"{name} {timeout_s!r}: must be a number above 0, at most {TIMEOUT_MAX_S:g}")
     return float(timeout_s)
-
-
-def check_endpoint(where: str, endpoint: str) -> None:
-    """Raise ConfigError unless this is the endpoint of a server; `where` names its flag or field."""
-    match = _ENDPOINT.fullmatch(endpoint)
-    if match is None or not 0 < int(match[2]) <= PORT_MAX:
-        raise ConfigError(f"{where}: {endpoint!r} is not tcp://HOST:PORT with a port 1 to {PORT_MAX}")

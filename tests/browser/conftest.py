@@ -75,7 +75,7 @@ def dataset_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report on a CSV file of 300 rows, with one more predictor."""
     folder = tmp_path_factory.mktemp("dataset")
     (folder / "rows.csv").write_text(csv_of(THOUSAND[:300]))
-    run_report(folder / "rows.csv", ReportConfig(out=folder, predictors=("recursive-least-squares",)))
+    run_report(folder / "rows.csv", ReportConfig(out=folder, predictors=("parts",)))
     return folder / "report.html"
 
 

@@ -26,7 +26,7 @@ def shoot(report: Path, picture: Path) -> None:
         browser = chromium.launch(playwright, path)
         page = browser.new_page(viewport={"width": WIDTH, "height": 800}, color_scheme="light")
         page.goto(report.resolve().as_uri())
-        box = page.locator(".charts").bounding_box()
+        box = page.locator("#pictures").bounding_box()
         assert box is not None, "a report has charts"
         clip = {"x": 0, "y": 0, "width": WIDTH, "height": box["y"] + box["height"] + MARGIN}
         png = page.screenshot(full_page=True, clip=clip)

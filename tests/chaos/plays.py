@@ -1,4 +1,4 @@
-"""How many scenarios and faults are played: some in `make test`, all in `make chaos`, which sets CHAOS=1."""
+"""How many scenarios and faults are played: some in `make test-all`, all in `make chaos` (CHAOS=1)."""
 
 import os
 

@@ -1,6 +1,6 @@
 """The list of faults, played on both testbeds: no answer is lost, wrong or very late, and nothing is left.
 
-`make test` plays some of them once. `make chaos` plays all, 20 times on loopback and 3 times in containers.
+`make test-all` plays some of them once, `make chaos` all: 20 times on loopback and 3 times in containers.
 """
 
 import contextlib

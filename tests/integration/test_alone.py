@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from offboard.loadgen.robot_files import read_trace
-from offboard.loadgen.table.site_disturbance import measure
+from offboard.loadgen.table.measurement_notes import measure
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import PINNED

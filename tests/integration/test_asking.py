@@ -31,23 +31,30 @@ TOLERANCE = 0.2  # of the saving: the parts of this test share two cores
 
 
 def test_the_example_of_the_page_runs(tmp_path: Path) -> None:
-    """Its program asks, submits, meets one deadline and misses another, and observes."""
+    """Its programs ask, submit, meet one deadline and miss another, observe, and cancel."""
     blocks = dict(re.findall(r"```python\n# (\w+\.py)\n(.*?)```", PAGE, re.DOTALL))
     (tmp_path / "mydetector.py").write_text(blocks["mydetector.py"])
     with server(tmp_path, "mydetector") as (endpoint, _):
-        (tmp_path / "ask.py").write_text(blocks["ask.py"].replace("tcp://127.0.0.1:5555", endpoint))
-        done = subprocess.run(
-            [sys.executable, "ask.py"], cwd=tmp_path, capture_output=True, text=True, timeout=120
-        )
-    print(done.stdout)
-    assert done.returncode == 0, done.stderr
-    cloud, onboard, submitted, in_time, missed, saved = done.stdout.splitlines()
-    said = r"[\d.]+ m?s \[(up to|[\d.]+,) [\d.]+\], in time with \d+%"
-    assert re.fullmatch(f"cloud {said}", cloud)
-    assert re.fullmatch(f"onboard {said}", onboard)
+        said = {}
+        for name in ("ask.py", "cancel.py"):
+            (tmp_path / name).write_text(blocks[name].replace("tcp://127.0.0.1:5555", endpoint))
+            done = subprocess.run(
+                [sys.executable, name], cwd=tmp_path, capture_output=True, text=True, timeout=120
+            )
+            assert done.returncode == 0, done.stderr
+            print(done.stdout)
+            said[name] = done.stdout.splitlines()
+    new, old = said["cancel.py"]
+    assert new.startswith("{'class': ")
+    assert re.search(r"cancelled after [\d.]+ m?s, with .* under way$|^it had not begun$|^{'class': ", old)
+    cloud, onboard, submitted, in_time, missed, saved = said["ask.py"]
+    time_said = r"[\d.]+ m?s \[(up to|[\d.]+,) [\d.]+\], in time with \d+%"
+    assert re.fullmatch(f"cloud {time_said}", cloud)
+    assert re.fullmatch(f"onboard {time_said}", onboard)
     assert submitted == in_time
     assert submitted.startswith("{'class': ")
-    assert re.fullmatch(rf"task detect: no answer within 0.001 s; expected: cloud {said}; .* [\d.]+", missed)
+    expected = rf"task detect: no answer within 0.001 s; expected: cloud {time_said}; .* [\d.]+"
+    assert re.fullmatch(expected, missed)
     assert re.match(r"detect (None|-?[\d.]+ m?s per task \[.* tasks would be sent, \d+ were measured)", saved)
 
 
@@ -72,8 +79,11 @@ def test_a_call_misses_its_deadline_in_an_outage_and_is_answered_onboard_later(
         print(f"waited {waited_s:.3f} s: {missed.value}")
         assert 0.3 <= waited_s < 0.9
         assert missed.value.expected[CLOUD].seconds is not None
-        record = records.get(timeout=WAIT_S)
-    assert (record.used, record.deadline_s) == (ONBOARD, 0.3)
+        record, by_then = records.get(timeout=WAIT_S), missed.value.record
+    assert (by_then.id, by_then.used, by_then.missed_deadline) == (record.id, None, True)
+    assert [one.site for one in by_then.executions] == [CLOUD]
+    assert by_then.happened.startswith("cloud had not answered after 3")
+    assert (record.used, record.deadline_s, record.missed_deadline) == (ONBOARD, 0.3, True)
     assert [one.site for one in record.executions] == [CLOUD, ONBOARD]
     last = list(read_trace(path))[-1]
     assert last["deadline_s"] == 0.3

@@ -31,7 +31,7 @@ def measure(out: Path) -> dict[str, float]:
     with LocalTestbed(out, SETUPS, commands=ROBOT) as bed:
         bed.start()
         bed.start("robot")
-        assert bed.wait("robot", RUN_S) == 0, bed.child("robot").tail()
+        assert bed.wait("robot", RUN_S) == 0, bed.children["robot"].tail()
     lines = [json.loads(line) for line in (out / "logs" / "robot.log").read_text().splitlines()]
     for line in lines:
         assert line["where"] != "all" or min(line["onboard"], line["cloud"]) > 0, line

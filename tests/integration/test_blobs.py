@@ -13,8 +13,8 @@ from offboard.cloud_server.executors.thread_executor import ThreadExecutor
 from offboard.cloud_server.metrics import Metrics
 from offboard.cloud_server.server import Limits, Server
 from offboard.common.tasks import Task, kind_of, task
-from offboard.robot_client.sites.blob_uploads import INLINE_BYTES_MAX, INLINE_SHARE, NEW_AFTER
-from offboard.robot_client.sites.cloud import CloudRunner
+from offboard.robot_client.cloud.cloud_runner import CloudRunner
+from offboard.robot_client.sites.outgoing import INLINE_BYTES_MAX, INLINE_SHARE, NEW_AFTER
 from offboard.robot_client.sites.runner import Execution
 
 pytestmark = pytest.mark.integration

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from offboard.common.host.cgroup import quota_group, usage_file
+from offboard.common.cpu_time import quota_group, usage_file
 from offboard.loadgen.testbed.cpu_quota import CgroupQuota, hold
 
 pytestmark = pytest.mark.integration
@@ -22,8 +22,8 @@ BURNT_S = 0.3
 # After that it computes for short times, and measures how much more its clock shows than the process used.
 PAIR = f"""
 import statistics, subprocess, sys, time
-from offboard.common.host import cpu_time
-from offboard.common.host.cgroup import SELF, usage_file
+from offboard.common import cpu_time
+from offboard.common.cpu_time import SELF, usage_file
 burner = "import time\\nwhile time.process_time() < {BURNT_S}: pass\\nprint(time.process_time())"
 sys.stdin.readline()
 print(usage_file(SELF))
@@ -91,7 +91,7 @@ def ask(pair: subprocess.Popen[str]) -> tuple[str, list[float]]:
 
 def test_a_process_under_a_quota_counts_its_whole_group(pair: subprocess.Popen[str]) -> None:
     """The clock counts other processes of the group, and resolves runs shorter than the kernel's tick."""
-    with hold(pair.pid, 0.9) as quota:
+    with contextlib.closing(hold(pair.pid, 0.9)) as quota:
         if not isinstance(quota, CgroupQuota):
             pytest.skip("this machine does not let us make a cgroup with a CPU quota")
         with counted(quota) as possible:

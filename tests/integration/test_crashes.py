@@ -8,6 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent import futures
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 
 from offboard.cloud_server.executors import worker
-from offboard.cloud_server.executors.task_run import Call, Outcome
+from offboard.cloud_server.executors.executor import Call, Outcome
 from offboard.cloud_server.executors.worker_pool import WorkerPool
 from offboard.common.errors import CloudTimeout, TaskFailed
 from offboard.common.wire.messages import decode, encode
@@ -198,7 +199,7 @@ def test_a_task_that_checks_keeps_its_worker(
     assert value(run(executor, "process_id")) == pid
     wanted[0] = True
     future = submit(executor, "look", str(begun), wanted=lambda: wanted[0])
-    with pytest.raises(TimeoutError):
+    with pytest.raises(futures.TimeoutError):
         future.result(5 * worker.LOOK_S)
     wanted[0] = False
     assert future.result(WAIT_S).error.startswith("Unwanted")
@@ -355,4 +356,4 @@ def test_a_robot_gets_the_reason_and_others_are_served(
 
 
 def metrics(bed: LocalTestbed) -> str:
-    return httpx.get(f"http://{bed.cloud_http}/metrics").text
+    return httpx.get(f"http://{bed.parts['cloud'].http}/metrics").text

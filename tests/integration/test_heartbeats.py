@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator
+from concurrent import futures
 from contextlib import closing, contextmanager, suppress
 from types import NoneType
 
@@ -12,10 +13,10 @@ from offboard import Offloader, Settings
 from offboard.common.tasks import Task, kind_of, kinds, task
 from offboard.common.wire import messages as wire
 from offboard.common.wire.messages import Hello, Message, Ping, Pong, Reply, Request
-from offboard.robot_client.sites import cloud
-from offboard.robot_client.sites.cloud import CloudRunner
+from offboard.robot_client.cloud.cloud_runner import CloudRunner
+from offboard.robot_client.sites import conversation
 from offboard.robot_client.sites.heartbeat import EVERY_S
-from offboard.robot_client.sites.shared_reader import LINGER_S
+from offboard.robot_client.sites.waiting import LINGER_S
 
 pytestmark = pytest.mark.integration
 
@@ -80,7 +81,7 @@ def met(heartbeat_s: float) -> Iterator[tuple[CloudRunner, Peer]]:
 
 def test_a_heartbeat_that_is_due_soon_is_sent_before_a_task(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its answer is read while the caller waits for the answer of the task."""
-    monkeypatch.setattr(cloud, "EARLY_S", 2 * HARDLY_EVER_S)
+    monkeypatch.setattr(conversation, "EARLY_S", 2 * HARDLY_EVER_S)
     with met(HARDLY_EVER_S) as (runner, peer):
         answer = runner.submit(Task(kind_of(nothing), (), 0.0), WAIT_S)
         ping, request = peer.hear(), peer.hear()
@@ -90,7 +91,7 @@ def test_a_heartbeat_that_is_due_soon_is_sent_before_a_task(monkeypatch: pytest.
         until_s = time.monotonic() + WAIT_S
         while runner.condition().queue != 7:
             assert time.monotonic() < until_s, "the answer to the heartbeat was not read"
-            with suppress(TimeoutError):
+            with suppress(futures.TimeoutError):
                 answer.result(0.01)
         peer.say(Reply(request.id, "ok", body=wire.encode(None, (), blobs=False).frames))
         assert answer.result(WAIT_S).ok

@@ -12,10 +12,11 @@ import pytest
 import zmq
 
 from offboard import Offloader
+from offboard.common.logs import PAUSE_S
 from offboard.common.wire import messages as wire
 from offboard.common.wire.messages import Hello, Ping, Pong
-from offboard.robot_client.sites.cloud_socket import RECONNECT_MS
-from offboard.robot_client.sites.connection import LOG_LINES_MAX, LOG_PAUSE_S
+from offboard.robot_client.cloud.cloud_socket import RECONNECT_MS
+from offboard.robot_client.cloud.connection import LOG_LINES_MAX
 from tests.integration.test_heartbeats import Peer, met
 from tests.probes import echo
 
@@ -40,7 +41,7 @@ def say_junk(peer: Peer) -> int:
 
 
 def test_junk_gives_one_line_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
-    """Within LOG_PAUSE_S at most one bad message is logged; the robot still sends heartbeats."""
+    """Within PAUSE_S at most one bad message is logged; the robot still sends heartbeats."""
     with caplog.at_level(logging.WARNING), met(HEARTBEAT_S) as (runner, peer):
         sent = sum(say_junk(peer) for _ in range(ROUNDS))
         for _ in range(3):
@@ -50,7 +51,7 @@ def test_junk_gives_one_line_in_the_log(caplog: pytest.LogCaptureFixture) -> Non
         assert runner.condition().round_trip_s is not None
     dropped = [one.getMessage() for one in caplog.records if "message dropped" in one.getMessage()]
     assert len(dropped) == 1, f"{sent} sent"
-    assert f"(others within {LOG_PAUSE_S:g} s are not logged)" in dropped[0]
+    assert f"(others within {PAUSE_S:g} s are not logged)" in dropped[0]
 
 
 @pytest.fixture
@@ -72,7 +73,7 @@ def test_a_flood_of_two_wire_versions_delays_no_task(flooding: str, caplog: pyte
             longest_s = max(longest_s, time.monotonic() - start_s)
     lines = about_connection(caplog)
     assert len(lines) == LOG_LINES_MAX, lines
-    assert lines[-1].endswith(f"(others within {LOG_PAUSE_S:g} s are not logged)")
+    assert lines[-1].endswith(f"(others within {PAUSE_S:g} s are not logged)")
     assert longest_s <= TIMEOUT_S + SLACK_S
 
 
@@ -119,4 +120,4 @@ def bind(socket: "zmq.Socket[bytes]", endpoint: str) -> None:
 
 
 def about_connection(caplog: pytest.LogCaptureFixture) -> list[str]:
-    return [one.getMessage() for one in caplog.records if one.name.endswith("sites.connection")]
+    return [one.getMessage() for one in caplog.records if one.name.endswith("cloud.connection")]

@@ -9,6 +9,8 @@ import httpx
 import pytest
 
 from offboard.common.live.live_files import LOOKS
+from offboard.common.live.live_port import LivePort
+from offboard.common.live.look import RobotLive
 from tests.probes import echo
 
 pytestmark = pytest.mark.integration
@@ -78,3 +80,17 @@ def test_metrics_and_foreign_pages(testbed: Callable[..., Any], connect: Callabl
     offload.close()
     with pytest.raises(httpx.ConnectError):
         httpx.get(f"http://{address}/metrics")
+
+
+def test_connections_of_a_moment_wait_until_they_are_accepted() -> None:
+    """While a port accepts nothing, 24 are made; one that is dropped would be tried again after seconds."""
+    port = LivePort("127.0.0.1:0", "--port", source=RobotLive(dict))
+    try:
+        port._server.shutdown()
+        address = ("127.0.0.1", port._server.server_port)
+        opened = [socket.create_connection(address, timeout=5) for _ in range(24)]
+        assert len(opened) == 24
+        for one in opened:
+            one.close()
+    finally:
+        port.close()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from offboard.common.host.cgroup import SELF, quota_group
+from offboard.common.cpu_time import SELF, quota_group
 
 pytestmark = [
     pytest.mark.integration,
@@ -25,8 +25,8 @@ HOG = "while True: pass"
 WATCHED = """
 import os, sys, time
 os.sched_setaffinity(0, {int(sys.argv[1])})
-from offboard.common.host.cgroup import SELF
-from offboard.common.host.load import EVERY_S, Load
+from offboard.common.cpu_time import SELF
+from offboard.common.load import EVERY_S, Load
 
 def idle_s():
     with open("/proc/stat") as file:

@@ -86,7 +86,7 @@ robot = {"robot": Setup({"busy": True}, cpus=0.1)}
 with processes.LocalTestbed(Path(sys.argv[1]), robot, commands=COMMANDS) as bed:
     bed.start()
     bed.start("robot")
-    print(bed.quota("robot").kind, flush=True)
+    print(bed.children["robot"].quota.kind, flush=True)
     if sys.argv[3] == "paused":
         bed.pause("robot")
         print("paused", flush=True)
@@ -153,7 +153,7 @@ def robot_ms(testbed: LocalTestbed) -> float:
     """The shortest round trip that a robot measures; other load on the machine can only make it longer."""
     testbed.start("robot")
     assert testbed.wait("robot", WAIT_S) == 0
-    return float(testbed.child("robot").tail())
+    return float(testbed.children["robot"].tail())
 
 
 def test_the_three_parts_work_together(tmp_path: Path, commands: Any) -> None:
@@ -209,9 +209,9 @@ def test_a_quota_holds_from_the_start(tmp_path: Path, commands: Any) -> None:
     robot = {"robot": Setup({"busy": True}, cpus=0.25)}
     with LocalTestbed(tmp_path / "out", robot, commands=commands) as testbed:
         testbed.start("robot")
-        child = testbed.child("robot")
+        child = testbed.children["robot"]
         start_s = time.monotonic()
-        quota = testbed.quota("robot")
+        quota = child.quota
         assert quota is not None
         assert quota.cpus == 0.25
         shares, before = [], (start_s, 0.0)

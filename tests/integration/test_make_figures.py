@@ -49,9 +49,9 @@ def step(name: str, *commands: str, more: str = "") -> str:
 
 def started(root: Path, *steps: str, flags: tuple[str, ...] = ()) -> "subprocess.Popen[str]":
     """The program, which measures these steps."""
-    (root / STEPS).write_text("".join(['[[section]]\ntitle = "S"\n', *steps]))
+    (root / STEPS).write_text("".join(['[[section]]\npage = "s"\ntitle = "S"\n', *steps]))
     return subprocess.Popen(
-        [sys.executable, "-P", "-m", "benchmarks.figures", *flags],
+        [sys.executable, "-m", "benchmarks.figures", *flags],
         cwd=root,
         env={**os.environ, "PYTHONPATH": str(root)},
         stdout=subprocess.PIPE,

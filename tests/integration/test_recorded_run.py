@@ -14,8 +14,12 @@ pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
 
 @pytest.mark.parametrize(
     ("name", "recorded", "tasks"),
-    [("link-plans", "5g-rural.csv", 40), ("link-frames", "3g-tram.csv", 20)],
-    ids=["5g-rural", "3g-tram"],
+    [
+        ("link-plans", "5g-rural.csv", 40),
+        ("link-frames", "3g-tram.csv", 20),
+        ("link-stream", "5g-rural.csv", 600),
+    ],
+    ids=["5g-rural", "3g-tram", "stream"],
 )
 def test_a_recording_is_played(tmp_path: Path, name: str, recorded: str, tasks: int) -> None:
     """No task is lost or wrong, and the recording begins with the tasks; the files hold its hash."""

@@ -10,8 +10,9 @@ from typing import Any
 
 import pytest
 
-from offboard.loadgen.robot import answers, references
+from offboard.loadgen.robot import answers
 from offboard.loadgen.robot_files import read_trace, reference_path
+from offboard.loadgen.scenario.outcome_files import read_lines
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.robot_client.policies import PINNED
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
@@ -132,7 +133,7 @@ def test_references_are_measured_on_each_site_alone(
     assert len(records) == 20
     assert PINNED not in {record["decision"]["policy"] for record in records.values()}
     asked = {line["i"]: line for line in answers.read(tmp_path / "a.jsonl")}
-    lines = list(references.read(reference_path(kept)))
+    lines = read_lines(reference_path(kept))
     assert [line["i"] for line in lines] == [4, 9, 14, 19]
     for line in lines:
         record = records[asked[line["i"]]["id"]]
@@ -209,7 +210,7 @@ def test_inputs_can_be_measured_and_referenced(testbed: Callable[..., LocalTestb
     said = robot("call", *flags, *measuring, "--cloud", bed.endpoint, "--trace", kept)
     assert "8 tasks answered" in said
     assert "run on each site alone and on both at once: 2 of 2 tasks" in said
-    assert [line["i"] for line in references.read(reference_path(kept))] == [3, 7]
+    assert [line["i"] for line in read_lines(reference_path(kept))] == [3, 7]
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 import pytest
 
-from offboard.robot_client.sites.cloud import CLOSE_WAIT_S
+from offboard.robot_client.cloud.cloud_runner import CLOSE_WAIT_S
 from tests.cables import TIMEOUT_S
 from tests.namespaces import run_alone
 

@@ -14,8 +14,8 @@ from offboard.common.tasks import kind_of
 from offboard.loadgen.play.play_scenario import play
 from offboard.loadgen.play.run_files import EVENTS, TRACE
 from offboard.loadgen.robot_files import read_trace
-from offboard.loadgen.scenario.outage_recovery import read_outage
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
+from offboard.loadgen.scenario.site_shares import read_outage
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from offboard.loadgen.relay.control_api import BODY_BYTES_MAX
-from offboard.loadgen.relay.link.delay_samples import SAMPLES_MAX
+from offboard.loadgen.relay.link.link import SAMPLES_MAX
 from offboard.loadgen.relay.link_schedule import EVENTS_MAX
 from offboard.loadgen.relay.wan import WanConfig
 from tests.flags import completed

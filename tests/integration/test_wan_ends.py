@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from offboard.loadgen.relay.link.link import Link
-from offboard.loadgen.relay.tcp.relay import Relay
+from offboard.loadgen.relay.tcp.relay import Relay, RelaySettings
+from offboard.robot_client.cloud.connection import BROKEN_HANDSHAKE
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.sites.connection import BROKEN_HANDSHAKE
 from tests import probes
 from tests.curves import Served, until
 from tests.relays import WAIT_S, echo, is_reset, receive, round_trip_s, silent, wait_until
@@ -196,7 +196,7 @@ def test_a_reset_of_a_new_connection_is_not_lost() -> None:
         found = []
         listening = socket.create_server(("127.0.0.1", 0))
         target = listening.getsockname()[:2]
-        relay = Relay(target, Link(), seed=0, connections_max=8, buffer_bytes=1 << 20)
+        relay = Relay(target, Link(), RelaySettings(seed=0, connections_max=8, buffer_bytes=1 << 20))
 
         def accept() -> asyncio.BaseProtocol:
             protocol = relay.accept()

@@ -16,7 +16,7 @@ import scipy.stats
 from offboard.loadgen.relay.link.link import SEGMENT_BYTES, Link, LinkConditions
 from offboard.loadgen.relay.tcp import forwarder
 from offboard.loadgen.relay.tcp.link_record import LinkRecord
-from offboard.loadgen.relay.tcp.relay import Relay
+from offboard.loadgen.relay.tcp.relay import Relay, RelaySettings
 from tests.relays import WAIT_S, echo, quietest, read_record, receive, round_trip_s, stop, wait_until
 
 pytestmark = pytest.mark.integration
@@ -198,6 +198,7 @@ def test_lost_bytes_are_marked_in_the_record(cloud: Any, wan: Any, tmp_path: Pat
     assert [line["how"] for line in lines if line["what"] == "closed"] == ["stopped"]
 
 
+@pytest.mark.alone  # it measures times
 def test_the_record_does_not_change_the_delay(cloud: Any, wan: Any, tmp_path: Path) -> None:
     """With a record and 15 ms in each direction, the median round trip still takes 30 to 31.5 ms."""
     relay = wan(cloud(echo), "--delay-ms", "15", "--truth", str(tmp_path / "link.jsonl"))
@@ -223,8 +224,8 @@ def test_chunks_under_way_are_bounded(tmp_path: Path, monkeypatch: pytest.Monkey
         cloud = await asyncio.start_server(talk, "127.0.0.1", 0)
         record = LinkRecord(path, loop.time())
         link = Link(up=LinkConditions(delay_ms=500))
-        options = {"seed": 0, "connections_max": 1, "buffer_bytes": 1 << 20}
-        relay = Relay(cloud.sockets[0].getsockname(), link, record=record, **options)
+        settings = RelaySettings(seed=0, connections_max=1, buffer_bytes=1 << 20)
+        relay = Relay(cloud.sockets[0].getsockname(), link, settings, record=record)
         server = await loop.create_server(relay.accept, "127.0.0.1", 0)
         with socket.create_connection(server.sockets[0].getsockname()) as client:
             client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -63,7 +63,11 @@ def start(folder: Path, *flags: str, log: Path) -> "subprocess.Popen[bytes]":
 def refusal(folder: Path, *flags: str) -> tuple[int, Sequence[str]]:
     """The exit code of a server that does not start, and the lines that are no log."""
     log = folder / "refused.log"
-    code = start(folder, *flags, log=log).wait(START_S)
+    process = start(folder, *flags, log=log)
+    try:
+        code = process.wait(START_S)
+    finally:
+        process.kill()  # one that is not refused would take the CPU of the tests after it
     return code, [line for line in log.read_text().splitlines() if line.startswith("cloud-server: ")]
 
 

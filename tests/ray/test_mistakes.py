@@ -61,7 +61,9 @@ def test_a_cluster_of_another_ray_version_is_one_line(tmp_path: Path, fresh: Cal
 def offboard_in(folder: Path, replaced: str, by: str, file: str) -> Path:
     """A copy of Offboard with one changed file."""
     for package in PACKAGES:
-        shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(
+            ROOT / package, folder / package, symlinks=True, ignore=shutil.ignore_patterns("__pycache__")
+        )
     changed = (folder / file).read_text()
     assert replaced in changed
     (folder / file).write_text(changed.replace(replaced, by))

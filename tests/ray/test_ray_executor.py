@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
+from offboard.cloud_server.executors.executor import Call
 from offboard.cloud_server.executors.ray_actor import ActorSetup
-from offboard.cloud_server.executors.task_run import Call
 from offboard.common.errors import ConfigError
 from offboard.common.wire.blobs import StoredBlob
 from tests.ray.handles import Clock, StandIn

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from offboard.cloud_server.executors.executor import Call
 from offboard.cloud_server.executors.ray_actor import ActorSetup
-from offboard.cloud_server.executors.task_run import Call
 from offboard.cloud_server.executors.worker import FAILED_PAUSE_S, Assignment, Died
 from tests.executor_tasks import call, value
 from tests.ray.handles import PID, Clock, Handle, StandIn

@@ -8,6 +8,7 @@ import json
 import os
 import queue
 import secrets
+import signal
 import subprocess
 import sys
 import threading
@@ -45,7 +46,9 @@ class Process:
             stdout=subprocess.PIPE,
             stderr=self._err,
             text=True,
-            env=os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"} | environ,
+            env=os.environ
+            | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", "PYTHONFAULTHANDLER": "1"}
+            | environ,
             cwd=ROOT,
         )
         self._lines: queue.Queue[str] = queue.Queue()
@@ -76,17 +79,21 @@ class Process:
     def log(self) -> str:
         return self._log.read_text()
 
+    def terminate(self) -> int:
+        """Ask the process to end; returns its exit code. If it hangs, its log then says where."""
+        self.process.terminate()
+        try:
+            return self.process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            self.process.send_signal(signal.SIGABRT)
+            return self.process.wait()
+
     def close(self) -> int:
         """End the process; returns its exit code."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         self.process.stdin.close()  # the end of its commands ends a peer
-        self.process.terminate()
-        try:
-            code = self.process.wait(END_S)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            code = self.process.wait()
+        code = self.terminate()
         self._reader.join(END_S)
         self.process.stdout.close()
         self._err.close()

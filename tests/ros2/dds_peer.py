@@ -22,8 +22,7 @@ from cyclonedds.util import duration
 from offboard.common.planning.maps import GridMap
 from offboard.common.planning.planner import Pose
 from offboard.ros2 import converters as ros
-from offboard.ros2.bridge import DDS, EACH, LATCHED, SETTINGS
-from offboard.ros2.dds_types import TYPES
+from offboard.ros2.bridge import DDS, EACH, LATCHED, SETTINGS, TYPES
 
 WAIT_S = 30.0
 MAP = ros.Header("map")

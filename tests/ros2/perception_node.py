@@ -13,6 +13,9 @@ from offboard.ros2 import image_array
 from offboard.ros2.node import until_shutdown
 from tests.ros2.spots import brightest_spot
 
+# rclpy wakes the node on SIGTERM before it ends its context. A node without a timer may then wait for ever.
+AWAKE_S = 1.0
+
 
 class Detector(Node):
     """Says where the brightest spot of each image is."""
@@ -33,4 +36,6 @@ class Detector(Node):
 
 rclpy.init()
 with until_shutdown():
-    rclpy.spin(Detector(sys.argv[1]))
+    detector = Detector(sys.argv[1])
+    while rclpy.ok():
+        rclpy.spin_once(detector, timeout_sec=AWAKE_S)

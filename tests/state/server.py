@@ -5,9 +5,8 @@ import signal
 import socket
 import sys
 from pathlib import Path
-from typing import Self
 
-from offboard.loadgen.testbed.part_process import KILL_S, Child, Part, end, launch, wait_ready
+from offboard.loadgen.testbed.part_process import Child, Part, end, launch, wait_ready
 from tests.state import served
 
 READY_S = 60.0
@@ -31,7 +30,7 @@ class Server:
         text = Path(served.__file__).read_text()
         (folder / "other_served.py").write_text(text.replace("    return ", "    return 'wrong', "))
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Server":
         self.heal()
         return self
 
@@ -57,9 +56,7 @@ class Server:
             wait_ready(self._child, READY_S)
 
     def kill(self) -> None:
-        child = self._known()
-        child.send(signal.SIGKILL)
-        child.process.wait(KILL_S)
+        self._known().kill()
         self.state = DOWN
 
     def stop(self) -> None:

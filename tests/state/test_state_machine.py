@@ -1,4 +1,4 @@
-"""A robot under abuse, driven by a state machine: a minute in `make test`, ten minutes in `make state`."""
+"""A robot under abuse, driven by a state machine: a minute in `make test-all`, ten in `make state`."""
 
 import random
 import time

@@ -12,13 +12,12 @@ import pytest
 from numpy.typing import NDArray
 
 from offboard.common.errors import Unwanted
-from offboard.common.planning import informed_workspaces, jump_points, maps, workspaces
+from offboard.common.planning import ASTAR, DIJKSTRA, JPS, PLANNERS, jump_points, maps, search, workspaces
 from offboard.common.planning.dijkstra import PAUSE_CELLS
 from offboard.common.planning.map_files import read_map
 from offboard.common.planning.planner import Point, Pose, Scan, plan_path
-from offboard.common.planning.planner_names import ASTAR, DIJKSTRA, JPS, PLANNERS
 from offboard.common.planning.search import NO_HITS, Cell, Field, Hits, Route
-from offboard.common.wanted import call_while
+from offboard.common.task_call import call_while
 from tests.mazes import (
     BENCHMARKS,
     FORMS,
@@ -223,7 +222,7 @@ def test_arrays_grow_when_they_are_full(monkeypatch: pytest.MonkeyPatch, planner
     """A search that starts with tiny arrays finds the same route with the same work."""
     free = noise(200, 200, 0.1)
     first = Field(free).route((0, 0), (199, 199), planner=planner)
-    for module in (workspaces, informed_workspaces):
+    for module in (workspaces, search):
         monkeypatch.setattr(module, "first_capacity", lambda *_: 8)
     monkeypatch.setattr(jump_points, "NODES_MAX", 4)
     again = Field(free).route((0, 0), (199, 199), planner=planner)

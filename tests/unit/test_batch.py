@@ -2,7 +2,8 @@
 
 import re
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent import futures
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
@@ -17,8 +18,9 @@ from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies.allowance import DUPLICATES_MAX, Allowance
 from offboard.robot_client.predictors.base import WARM_UP
 from offboard.robot_client.records.record import Record
-from offboard.robot_client.settings import Settings
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, UNMEASURED, Condition, Execution
+from offboard.robot_client.sites.heartbeat import EVERY_S, IDLE_S
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
+from offboard.testing import Bench
 from tests.fakes import ScriptedRunner
 
 WAIT_S = 5.0
@@ -279,14 +281,14 @@ def test_no_task_runs_twice_without_permission(
 ) -> None:
     """Without an allowance, or with duplicate=False, the batch waits for the slow server."""
     offload, cloud, onboard, _ = straggling(make, function, **options)
+    before = len(onboard.tasks)
     done = mapped(offload, function, [2, 2])
     cloud.wait_for(1)
-    before = len(onboard.tasks)
-    with pytest.raises(TimeoutError):
+    with pytest.raises(futures.TimeoutError):
         done.result(0.3)
     cloud.release()
     assert len(done.result(WAIT_S)) == 2
-    assert len(onboard.tasks) == before
+    assert len(onboard.tasks) == before + 1
     assert not cloud.cancelled
 
 
@@ -315,32 +317,33 @@ def test_a_pinned_batch_runs_on_its_site_only(make: Make) -> None:
         offload.map(stamp_once, [1], where="both")
 
 
-def test_a_batch_leaves_out_an_unavailable_site(make: Make) -> None:
+def ran_on(records: Sequence[Record]) -> set[str]:
+    """The sites on which these tasks ran."""
+    return {one.site for record in records for one in record.executions}
+
+
+def test_a_batch_leaves_out_an_unavailable_site() -> None:
     """While the cloud is absent, onboard runs the batch, even if it is pinned to the cloud."""
-    cloud = ScriptedRunner(CLOUD, answers(CLOUD), unavailable="not connected")
-    assert make(cloud, ScriptedRunner(ONBOARD, answers(ONBOARD))).map(doubled, range(20)) == [
-        2 * one for one in range(20)
-    ]
-    assert not cloud.tasks
-    assert make(cloud, ScriptedRunner(ONBOARD, answers(ONBOARD))).map(doubled, [1, 2], where=CLOUD) == [2, 4]
+    with Bench() as bench:
+        bench.cloud.gone()
+        assert bench.offload.map(doubled, range(20)) == [2 * one for one in range(20)]
+        assert bench.offload.map(doubled, [1, 2], where=CLOUD) == [2, 4]
+    assert ran_on(bench.records) == {ONBOARD}
 
 
 def test_a_batch_leaves_out_a_silent_site() -> None:
     """A site that does not answer heartbeats gets no task until it answers again."""
-    cloud = ScriptedRunner(CLOUD, answers(CLOUD))
-    offload = Offloader(
-        [cloud, ScriptedRunner(ONBOARD, answers(ONBOARD, 1.0))],
-        policy=policies.make(policies.DEFAULT),
-        memories=Settings(window=20).make_memories(policies.DEFAULT),
-    )
-    with offload:
-        warm(offload)
-        before, cloud.measured = len(cloud.tasks), Condition(silent=True)
-        assert offload.map(doubled, range(20)) == [2 * one for one in range(20)]
-        assert len(cloud.tasks) == before
-        cloud.measured = UNMEASURED
-        offload.map(doubled, range(20))
-        assert len(cloud.tasks) > before
+    with Bench(onboard_s=1.0) as bench:
+        warm(bench.offload)
+        bench.cloud.dead()
+        bench.clock.pass_by(EVERY_S + IDLE_S)
+        before = len(bench.records)
+        assert bench.offload.map(doubled, range(20)) == [2 * one for one in range(20)]
+        assert ran_on(bench.records[before:]) == {ONBOARD}
+        bench.cloud.back()
+        bench.clock.pass_by(EVERY_S + IDLE_S)
+        bench.offload.map(doubled, range(20))
+        assert ran_on(bench.records[before + 20 :]) >= {CLOUD}
 
 
 def test_caps_hold_for_a_batch(make: Make) -> None:

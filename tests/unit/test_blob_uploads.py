@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from offboard.robot_client.sites.blob_uploads import KEPT, NEW_AFTER, BlobUploads
+from offboard.robot_client.sites.outgoing import KEPT, NEW_AFTER, BlobUploads
 
 BYTES = 100_000
 MESSAGE_BYTES_MAX = 2**24

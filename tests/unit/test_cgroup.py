@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from offboard.common.host.cgroup import parse_usage, usage_file
+from offboard.common.cpu_time import parse_usage, usage_file
 from tests.cgroups import Machine
 
 DOCKER = "/docker/48d9"

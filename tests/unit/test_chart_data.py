@@ -7,8 +7,8 @@ import pytest
 
 from offboard.loadgen.report import chart_data
 from offboard.loadgen.table.measured_rows import Rows, read
-from offboard.loadgen.table.predictor_evaluation import Evaluation
 from offboard.loadgen.table.table_settings import TableConfig
+from offboard.loadgen.table.table_two import Evaluation
 from tests.reports import write_rows
 from tests.table_loops import THOUSAND
 
@@ -27,20 +27,6 @@ def test_lines_and_their_crossing_by_hand() -> None:
     assert found.crossing == pytest.approx(2.0)
     assert found.crossing_inside
     assert (found.low, found.high) == (0, 3)
-
-
-def test_share_of_the_cloud_by_hand() -> None:
-    """The share over two tasks starts with the second task."""
-    sides = np.array([True, True, False, False, True])
-    np.testing.assert_array_equal(chart_data.share_percent(sides, 2), [np.nan, 100, 50, 0, 50])
-    np.testing.assert_array_equal(chart_data.share_percent(sides, 1), [100, 100, 0, 0, 100])
-
-
-@pytest.mark.parametrize(("tasks", "over"), [(1, 1), (7, 3), (39, 19), (40, 20), (999, 20), (2000, 40)])
-def test_the_share_is_taken_over_20_tasks(tasks: int, over: int) -> None:
-    """In a short run it is taken over half of the tasks, in a long run over one part in 50."""
-    found = chart_data.decisions("paper", np.ones(tasks), np.ones(tasks, dtype=bool), first=1, seed=1)
-    assert (found.over, found.of) == (over, tasks)
 
 
 def test_distribution_by_hand() -> None:

@@ -5,7 +5,7 @@ from concurrent.futures import Future
 
 import pytest
 
-from offboard.robot_client.sites.clock import SystemClock
+from offboard.robot_client.sites.waiting import SystemClock
 
 
 class Waited(Future[int]):

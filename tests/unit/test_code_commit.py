@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from offboard.loadgen.play.code_commit import changed_code, commit_here
+from offboard.loadgen.play.machine import changed_code, commit_here
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="no git; remedy: apt-get install git")
 
@@ -40,6 +40,7 @@ def commit(name: str, text: str) -> None:
         "docs/figures/a.json",
         "docs/page.md",
         "README.md",
+        "mkdocs.yml",
         "tests/unit/test_a.py",
         "tests/ray/a.py",
         "loadgen/scenarios/a.toml",

@@ -7,23 +7,25 @@ from typing import Any
 
 import pytest
 
+from offboard.__main__ import main
 from offboard.cloud_server.config import ServerConfig
+from offboard.common import VERSION
 from offboard.common.command_line import Command, CommandParser, add_flags, load, run_command, run_commands
 from offboard.common.config import REQUIRED, flag_of, setting, settings_of
 from offboard.common.errors import ConfigError, DataError, OffloadError
 from offboard.common.security.keys import KeysConfig
 from offboard.loadgen.__main__ import DemoConfig, RunConfig
-from offboard.loadgen.claims.claims_settings import ClaimsConfig
+from offboard.loadgen.claims.claim import ClaimsConfig
 from offboard.loadgen.compare.compare_settings import CompareConfig
 from offboard.loadgen.export.export import ExportConfig
 from offboard.loadgen.play.measure_dataset import DatasetConfig
 from offboard.loadgen.relay.wan import WanConfig
-from offboard.loadgen.replay.replay import ReplayConfig
+from offboard.loadgen.replay.replay_settings import ReplayConfig
 from offboard.loadgen.report.report import ReportConfig
 from offboard.loadgen.robot.config import CallConfig, DriveConfig
 from offboard.loadgen.table.table_settings import TableConfig
 
-SHOWN_MAX = 16  # flags in --help, --help itself included
+SHOWN_MAX = 17  # flags in --help; --help itself and --version included
 CONFIGS = (
     DriveConfig,
     CallConfig,
@@ -66,7 +68,7 @@ def flags_in(help: str) -> list[str]:
 def test_help_shows_the_common_flags_and_help_all_shows_all(
     cls: type, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """--help has at most 16 flags, and no rare one; --help-all has every field."""
+    """--help has at most 16 flags next to --version, and no rare one; --help-all has every field."""
     common = flags_in(shown(["--help"], cls, capsys))
     assert len(common) <= SHOWN_MAX, common
     fields = settings_of(cls)
@@ -199,3 +201,23 @@ def test_help_prints_the_usage(capsys: pytest.CaptureFixture[str]) -> None:
     """--help prints the same usage to stdout, with exit code 0."""
     assert run_commands("tool", "A tool.", commands([]), ["--help"]) == 0
     assert "  drive  drive on a map\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        ([], "offboard"),
+        (["client"], "robot-client"),
+        (["server"], "cloud-server"),
+        (["bench"], "loadgen"),
+    ],
+)
+def test_each_command_prints_its_version(
+    words: list[str], name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """--version prints the name of the command and the version of Offboard, with exit code 0."""
+    try:
+        code: object = main([*words, "--version"])
+    except SystemExit as ended:
+        code = ended.code
+    assert (code, capsys.readouterr().out) == (0, f"{name} {VERSION}\n")

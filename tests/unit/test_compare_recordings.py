@@ -10,7 +10,6 @@ import pytest
 from offboard.common.errors import ConfigError, DataError
 from offboard.loadgen.compare.compare import run_compare
 from offboard.loadgen.compare.compare_settings import CompareConfig
-from offboard.loadgen.compare.recording_figures import Figures, Taken, figures_of
 from offboard.loadgen.compare.recording_table import (
     Comparison,
     family_table,
@@ -18,7 +17,16 @@ from offboard.loadgen.compare.recording_table import (
     sentence,
     tables,
 )
-from offboard.loadgen.compare.recordings import at_rate, check_events, find_recordings, from_link, over
+from offboard.loadgen.compare.recordings import (
+    Figures,
+    Taken,
+    at_rate,
+    check_events,
+    figures_of,
+    find_recordings,
+    from_link,
+    over,
+)
 from offboard.loadgen.scenario.outcome import Answered, Outcome, Reference
 from offboard.loadgen.scenario.scenario_file import LINKS, find_scenario, read_scenario
 from tests.mazes import warm

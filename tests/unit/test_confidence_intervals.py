@@ -19,8 +19,8 @@ def means(values: np.ndarray, blocks: Blocks) -> tuple[float, float]:
 
 def test_a_resample_consists_of_blocks_of_neighbours() -> None:
     """A resample is as long as the table; the rows of a block are neighbours, also across the table's end."""
-    (picks,) = Blocks(10, length=4, resamples=50).picks()
-    assert picks.shape == (50, 10)
+    (picks,) = Blocks(10, length=4).picks()
+    assert picks.shape == (bootstrap.RESAMPLES, 10)
     for at in (1, 2, 3, 5, 6, 7, 9):
         assert ((picks[:, at] - picks[:, at - 1]) % 10 == 1).all()
     assert set(picks[:, 0]) == set(range(10))

@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import pytest
 
-from offboard.robot_client.sites.connection import (
+from offboard.common.logs import PAUSE_S
+from offboard.robot_client.cloud.connection import (
     CONNECT_EVERY_S,
     HELLO_EVERY_S,
     LOG_LINES_MAX,
-    LOG_PAUSE_S,
     NO_HANDSHAKE,
     UNKNOWN_ROBOT,
     Action,
@@ -177,13 +177,13 @@ def test_a_lost_server_that_is_back_is_logged_once(caplog: pytest.LogCaptureFixt
 
 
 def test_a_server_that_comes_and_goes_does_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
-    """The first lines are logged, and then one in LOG_PAUSE_S, which says that others are not."""
+    """The first lines are logged, and then one in PAUSE_S, which says that others are not."""
     connection = Connection("cloud", ENDPOINT)
     pauses = 3
     with caplog.at_level(logging.INFO):
         for number in range(1001):
             connection.handshake_succeeded(NOW_S)
-            connection.other_version(VERSIONS, NOW_S + number / 1000 * (pauses + 0.5) * LOG_PAUSE_S)
+            connection.other_version(VERSIONS, NOW_S + number / 1000 * (pauses + 0.5) * PAUSE_S)
     lines = [record.getMessage() for record in caplog.records]
     left_out = [line for line in lines if line.endswith("(others within 10 s are not logged)")]
     assert len(lines) == LOG_LINES_MAX + pauses

@@ -7,11 +7,11 @@ import pytest
 from tests.constants import constants, constants_in
 
 ROOT = Path(__file__).parents[2]
-CONSTANTS_MAX = 46
+CONSTANTS_MAX = 63  # 17 of them in streams
 
 
 def test_there_are_few_constants() -> None:
-    """Learning, predictors, policies and the heartbeat have at most CONSTANTS_MAX; all are printed."""
+    """Learning, predictors, policies, heartbeat and streams have at most CONSTANTS_MAX; all are printed."""
     found = constants(ROOT)
     print(*found, sep="\n")
     assert len(found) <= CONSTANTS_MAX

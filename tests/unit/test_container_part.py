@@ -12,8 +12,8 @@ from offboard.common.errors import ConfigError
 from offboard.loadgen.play.part_setups import setups
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.testbed.container_part import IMAGES, as_popen, as_seen, measured, quota, service_of
-from offboard.loadgen.testbed.part_output import Output
-from offboard.loadgen.testbed.process_owner import is_gone, owner
+from offboard.loadgen.testbed.docker_engine import is_gone, owner
+from offboard.loadgen.testbed.real_testbed import Output
 
 
 def test_flags_name_files_where_they_are_mounted(tmp_path: Path) -> None:

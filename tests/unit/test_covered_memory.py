@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from offboard.common.source.covered_files import CoveredFiles
-from offboard.common.source.reading import read_files_of_robot
+from offboard.common.source.comparison import read_files_of_robot
+from offboard.common.source.covers import CoveredFiles
 from offboard.common.tasks import kind_of, task
 from offboard.robot_client.sites.runner import CLOUD
 from tests.memory_robot import Robot

@@ -15,14 +15,19 @@ import pytest
 
 from offboard.common import VERSION, tasks
 from offboard.common.errors import ConfigError
-from offboard.common.source import covered_files
-from offboard.common.source.comparison import difference
-from offboard.common.source.covered_files import CoveredFiles
-from offboard.common.source.covers import COVERS_MAX, VERSION_LENGTH_MAX
-from offboard.common.source.reading import is_reading, kind_in_use, read_files_of_robot, read_files_of_server
-from offboard.common.source.uncovered import not_compared, uncovered
+from offboard.common.source import covers
+from offboard.common.source.comparison import (
+    difference,
+    is_reading,
+    kind_in_use,
+    not_compared,
+    read_files_of_robot,
+    read_files_of_server,
+    uncovered,
+)
+from offboard.common.source.covers import COVERS_MAX, VERSION_LENGTH_MAX, CoveredFiles
 from offboard.common.tasks import Kind, hashes, kind_named, kind_of, task
-from offboard.robot_client.check.outcome import StepFailed
+from offboard.robot_client.check.network import StepFailed
 from offboard.robot_client.check.task_comparison import compare
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
@@ -187,7 +192,7 @@ def test_what_is_no_file_is_refused_and_never_waited_for(
 
 def test_a_file_over_the_limit_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Before it is read, or while it grows."""
-    monkeypatch.setattr(covered_files, "FILE_BYTES_MAX", 3)
+    monkeypatch.setattr(covers, "FILE_BYTES_MAX", 3)
     path = tmp_path / "model"
     path.write_bytes(b"1234")
     with pytest.raises(ConfigError, match=r"model: over .* GiB; use version= for such a file"):
@@ -205,7 +210,7 @@ def test_a_file_is_read_in_pieces(tmp_path: Path) -> None:
 
     path = tmp_path / "model"
     with path.open("wb") as file:
-        file.truncate(64 * covered_files.PIECE_BYTES)
+        file.truncate(64 * covers.PIECE_BYTES)
     files = CoveredFiles("large", [path])
     tracemalloc.start()
     try:
@@ -214,7 +219,7 @@ def test_a_file_is_read_in_pieces(tmp_path: Path) -> None:
     finally:
         tracemalloc.stop()
     assert files.digest
-    assert peak < 3 * covered_files.PIECE_BYTES, peak
+    assert peak < 3 * covers.PIECE_BYTES, peak
 
 
 def test_a_file_that_cannot_be_read_to_its_end_keeps_the_task_onboard(

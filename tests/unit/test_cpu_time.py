@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from offboard.common.host.cpu_time import Clock
+from offboard.common.cpu_time import Clock
 
 ROOT = Path(__file__).parents[2]
 TOLERANCE_S = 0.05  # CPU time of starting and ending a process
@@ -52,7 +52,7 @@ def test_without_a_file_the_clock_counts_this_process(tmp_path: Path) -> None:
 
 FORKED = """
 import os, time
-from offboard.common.host import cpu_time
+from offboard.common import cpu_time
 real_time, real_file = time.process_time, cpu_time.usage_file
 
 def fork():

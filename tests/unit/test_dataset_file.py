@@ -10,9 +10,10 @@ from offboard.common.errors import DataError
 from offboard.loadgen.export.export import ExportConfig, run_export
 from offboard.loadgen.replay.dataset_file import COLUMNS, measured_tasks, read_dataset, write_dataset
 from offboard.loadgen.replay.recorded_tasks import RecordedTask, read_tasks
-from offboard.loadgen.replay.replay import ReplayConfig, replay
+from offboard.loadgen.replay.replay import replay
+from offboard.loadgen.replay.replay_settings import ReplayConfig
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
-from offboard.loadgen.simulation.model.simulated_tasks import find_tasks
+from offboard.loadgen.simulation.model.task_costs import find_tasks
 from offboard.loadgen.simulation.simulated_run import simulate
 from offboard.loadgen.table.measured_rows import read
 from offboard.robot_client.records.trace import Trace
@@ -151,13 +152,13 @@ def test_a_dataset_is_replayed_as_its_trace(trace: Path, tmp_path: Path, policy:
 
 
 def test_the_columns_change_what_a_policy_decides(trace: Path, tmp_path: Path) -> None:
-    """Where the round trip changes, `greedy` does better with all columns than with sizes and times alone."""
+    """Where the round trip changes, the default does better with all columns than with times alone."""
     run_export(trace, ExportConfig(csv=tmp_path / "d.csv"))
     tasks = read_dataset(tmp_path / "d.csv")
     assert all(task.work is not None for task in tasks)
     bare = of_rows(read(tmp_path / "d.csv"))
     whole_s, bare_s = (
-        replay(given, "greedy", ReplayConfig(window=WINDOW), feedback="chosen").spent_s.mean()
+        replay(given, "default", ReplayConfig(window=WINDOW), feedback="chosen").spent_s.mean()
         for given in (tasks, bare)
     )
     assert whole_s < bare_s

@@ -10,9 +10,9 @@ from benchmarks.figures.markdown_tables import tables_of
 from benchmarks.figures.step import DATASETS
 from offboard.loadgen.scenario.scenario_file import shipped
 from offboard.loadgen.table.measured_rows import read
-from offboard.loadgen.table.predictor_evaluation import Evaluation
+from offboard.loadgen.table.table_formats import render
 from offboard.loadgen.table.table_settings import PAPER_WINDOWS, TableConfig
-from offboard.loadgen.table.table_two import read_tables, table_text
+from offboard.loadgen.table.table_two import Evaluation, read_tables
 from tests.table_loops import expected_table, lines_of, replay, rows_of
 
 FOLDER = Path(__file__).parents[2] / "loadgen" / "datasets"
@@ -42,7 +42,7 @@ def test_a_dataset_holds_a_thousand_measured_rows(name: str) -> None:
 def test_every_printed_figure_equals_plain_loops(name: str, feedback: str) -> None:
     """On measured rows, too, every printed figure equals an independent computation."""
     text = (FOLDER / f"{name}.csv").read_text()
-    found = lines_of(table_text(FOLDER / f"{name}.csv", TableConfig(feedback=feedback)))
+    found = lines_of(render(read_tables(FOLDER / f"{name}.csv", TableConfig(feedback=feedback)), "md"))
     assert found == expected_table(rows_of(text), PAPER_WINDOWS, feedback)
 
 
@@ -72,7 +72,7 @@ def test_the_results_page_has_what_the_command_prints(name: str) -> None:
     if rows["sha256"] != hashlib.sha256((FOLDER / f"{name}.csv").read_bytes()).hexdigest():
         pytest.skip(f"the file is of other rows of {name}.csv, as the page says: make figures")
     config = TableConfig(feedback="both", all_columns=True)
-    lines = config.text(read_tables(FOLDER / f"{name}.csv", config), "md").splitlines()
+    lines = config.text(read_tables(FOLDER / f"{name}.csv", config)).splitlines()
     tables = tables_of(lines)
     assert len(tables) == 2  # of each feedback
     assert tables == tables_of(measured["output"])

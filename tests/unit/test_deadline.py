@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import itertools
 import queue
 import subprocess
 import sys
@@ -16,15 +17,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from offboard import Settings
 from offboard.common.errors import ConfigError, DeadlineMissed, TaskFailed
-from offboard.common.tasks import Task, task
-from offboard.robot_client import policies, predictors
-from offboard.robot_client.learning.memories import Memories
+from offboard.common.tasks import task
+from offboard.robot_client import predictors
 from offboard.robot_client.lifetime import ASYNC_CALLS_MAX
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.records.record import Record
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
-from tests.fakes import ScriptedRunner
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
+from offboard.testing import Bench
 
 WAIT_S = 20.0  # longer than any step of a test takes on a busy machine
 SHORT_S = 0.05
@@ -167,27 +168,16 @@ def test_a_call_runs_although_its_thread_begins_after_the_deadline(
 
 def test_a_deadline_prefers_the_site_that_misses_it_least() -> None:
     """The cloud is faster in the mean, but misses more often; only the call with a deadline stays onboard."""
-    took = {ONBOARD: [0.1], CLOUD: [0.02] * 4 + [0.3]}
-    counts = dict.fromkeys(took, 0)
-
-    def script(site: str) -> ScriptedRunner:
-        def answer(one: Task) -> Execution:
-            counts[site] += 1
-            return Execution(site, took[site][counts[site] % len(took[site])], one.args[0])
-
-        return ScriptedRunner(site, answer)
-
-    memories = Memories(lambda: predictors.make(predictors.LEAST_SQUARES, 50))
-    runners = [script(site) for site in took]
-    with Offloader(runners, policy=policies.make("greedy"), memories=memories) as made:
+    took_s = itertools.cycle([0.02] * 4 + [0.3])
+    settings = Settings(predictor=predictors.LEAST_SQUARES)
+    with Bench(onboard_s=0.1, cloud_s=lambda _: next(took_s), policy="greedy", settings=settings) as bench:
         for number in range(100):
-            made(deadline_echo, 3, where=(ONBOARD, CLOUD)[number % 2])
-        made(deadline_echo, 3)
-        assert made.last is not None
-        assert made.last.decision.site == CLOUD
-        made(deadline_echo, 3, deadline_s=0.2)
-        assert made.last.decision.site == ONBOARD
-        chances = made.expect(deadline_echo, 3, deadline_s=0.2)
+            bench.offload(deadline_echo, 3, where=(ONBOARD, CLOUD)[number % 2])
+        bench.offload(deadline_echo, 3)
+        assert bench.records[-1].decision.site == CLOUD
+        bench.offload(deadline_echo, 3, deadline_s=0.2)
+        assert bench.records[-1].decision.site == ONBOARD
+        chances = bench.offload.expect(deadline_echo, 3, deadline_s=0.2)
     print({site: one.in_time for site, one in chances.items()})
     assert chances[CLOUD].in_time == pytest.approx(0.8, abs=0.1)
     assert chances[ONBOARD].in_time == pytest.approx(1.0, abs=0.03)

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 import pytest
 
 from offboard.common.errors import CloudBroken, ConfigError
-from offboard.robot_client.discovery.dns_name import DnsName, check_dns
 from offboard.robot_client.discovery.roster import Server
+from offboard.robot_client.discovery.server_lists import DnsName
+from offboard.robot_client.sites.endpoint import check_dns
 
 
 def answer(monkeypatch: pytest.MonkeyPatch, *addresses: str) -> None:

@@ -13,8 +13,8 @@ from offboard.robot_client.policies.allowance import Allowance
 from offboard.robot_client.policies.expectation import Expectation
 from offboard.robot_client.policies.prediction_errors import ERRORS_MIN
 from offboard.robot_client.settings import Settings
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
-from tests.fakes import ScriptedRunner
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
+from offboard.testing import Bench
 from tests.virtual import VirtualClock, VirtualRunner
 
 ONBOARD_S, CLOUD_S = 0.1, 0.05  # of a task of size 1
@@ -96,17 +96,15 @@ def test_asking_runs_and_counts_nothing(robot: Robot) -> None:
 
 def test_a_site_that_cannot_take_the_task_says_why() -> None:
     """Its expectation has the reason, and prints as it."""
-    cloud = ScriptedRunner(CLOUD, lambda _: Execution(CLOUD, 0.1), unavailable="not connected")
-    onboard = ScriptedRunner(ONBOARD, lambda _: Execution(ONBOARD, 0.1, 1.0))
-    memories = Settings().make_memories(policies.DEFAULT)
-    with Offloader([cloud, onboard], policy=policies.make("greedy"), memories=memories) as offload:
+    with Bench(onboard_s=0.1) as bench:
+        bench.cloud.gone()
         for _ in range(3):
-            offload(expected_echo, 1.0)
-        expected = offload.expect(expected_echo, 1.0)
+            bench.offload(expected_echo, 1.0)
+        expected = bench.offload.expect(expected_echo, 1.0)
     assert expected[CLOUD] == Expectation(absent="not connected")
     assert str(expected[CLOUD]) == "not connected"
     assert expected[ONBOARD].seconds == pytest.approx(0.1)
-    assert not cloud.tasks
+    assert {one.site for record in bench.records for one in record.executions} == {ONBOARD}
 
 
 @pytest.mark.parametrize("calls", [ERRORS_MIN // 2, 3 * ERRORS_MIN])

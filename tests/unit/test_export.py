@@ -13,9 +13,8 @@ from rosbags.rosbag2 import Reader
 
 from offboard.common.errors import ConfigError
 from offboard.loadgen.__main__ import main
-from offboard.loadgen.export.mcap_file import McapFile, new_mcap
+from offboard.loadgen.export.mcap_file import McapFile, new_mcap, number
 from offboard.loadgen.export.recording import plan_of, read_recording
-from offboard.loadgen.export.ros_topics import number
 from offboard.ros2.converters import grid_of, path_poses, pose_of, scan_of
 from tests.drives import drive
 from tests.extras import needs

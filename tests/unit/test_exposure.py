@@ -9,8 +9,8 @@ import pytest
 
 from offboard.cloud_server.config import ServerConfig
 from offboard.common.errors import ConfigError
-from offboard.common.security import exposure
-from offboard.common.security.exposure import on_loopback, warn_each_minute
+from offboard.common.security import address
+from offboard.common.security.address import on_loopback, warn_each_minute
 from offboard.loadgen.relay.wan import WanConfig
 
 
@@ -63,21 +63,21 @@ def test_an_insecure_process_keeps_warning(monkeypatch: pytest.MonkeyPatch) -> N
     """It logs one warning at once, and one after each pause."""
     thrice, said = threading.Event(), list[str]()
 
-    class Count(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            said.append(record.getMessage())
-            if len(said) == 3:
-                thrice.set()
+    def count(record: logging.LogRecord) -> bool:
+        said.append(record.getMessage())
+        if len(said) == 3:
+            thrice.set()
+            threading.Event().wait()  # the thread stays here, and does not warn during other tests
+        return True
 
-    handler = Count()
-    monkeypatch.setattr(exposure, "INSECURE_WARNING_S", 0.001)
-    exposure.log.addHandler(handler)
+    monkeypatch.setattr(address, "INSECURE_WARNING_S", 0.001)
+    address.log.addFilter(count)
     try:
         warn_each_minute(["--http: x is open"])
         assert thrice.wait(5)
     finally:
         monkeypatch.undo()
-        exposure.log.removeHandler(handler)
+        address.log.removeFilter(count)
     assert said[0] == (
         "--insecure: --http: x is open: anyone who can reach this process may use it; "
         "remedy: set the missing flags"

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from offboard.common.class_path import find_class
+from offboard.common.config import find_class
 from offboard.common.errors import ConfigError, MissingExtra
-from offboard.loadgen import rivals
+from offboard.loadgen.scenario.scenario import RobotPart
 from offboard.loadgen.scenario.scenario_file import read_scenario
 from offboard.loadgen.simulation.simulation_pool import SimulationPool
 from offboard.robot_client import policies, predictors
@@ -75,15 +75,16 @@ def test_settings_and_scenarios_take_the_path() -> None:
     settings = Settings(predictor=CONSTANT)
     assert settings.make_memories(BY_SIZE)
     assert settings.make_policy(BY_SIZE)
-    assert (rivals.policy(f"probe:{BY_SIZE}"), rivals.predictor(CONSTANT)) == (f"probe:{BY_SIZE}", CONSTANT)
+    assert RobotPart(policy=f"probe:{BY_SIZE}", predictor=CONSTANT).names() == (f"probe:{BY_SIZE}", CONSTANT)
 
 
 def test_a_rival_and_a_class_of_a_user_play_a_scenario(tmp_path: Path) -> None:
     """In simulation, a scenario is played with short names and with paths."""
+    pytest.importorskip("sklearn", reason="scikit-learn is not installed: `make install`")
     (tmp_path / "small.toml").write_text(SMALL)
     scenario = read_scenario(tmp_path / "small.toml")
     strategies = {
-        "rivals": {"policy": "hedge:linucb", "predictor": "huber"},
+        "rivals": {"policy": "hedge:greedy", "predictor": "k-means"},
         "user's": {"policy": BY_SIZE, "predictor": CONSTANT},
     }
     with SimulationPool(1) as pool:

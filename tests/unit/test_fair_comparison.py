@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from offboard.loadgen.compare.compare_settings import CompareConfig
-from offboard.loadgen.compare.comparison_in_words import MISSING
+from offboard.loadgen.compare.comparison_line import MISSING
 from offboard.loadgen.compare.comparison_table import comparison_table
 from offboard.loadgen.scenario.outcome import Answered, Outcome
 from offboard.loadgen.scenario.scenario import RobotPart, Scenario, Workload

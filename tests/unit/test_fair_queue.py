@@ -105,11 +105,11 @@ def test_taken_requests_are_gone_and_idle_robots_are_forgotten() -> None:
     while (work := queue.next()) is not None:
         queue.done(work, 0.01)
     assert not len(queue)
-    assert queue.robot_count == 0
+    assert len(queue._had_s) == 0
     queue.add(request(b"stays", 0))
     for n in range(2 * ROBOTS_MAX):
         queue.add(request(f"{n}".encode(), n))
         work = queue.next()
         assert work is not None
         queue.done(work, 0.01)
-    assert queue.robot_count <= ROBOTS_MAX + 1
+    assert len(queue._had_s) <= ROBOTS_MAX + 1

@@ -13,7 +13,7 @@ import pytest
 from benchmarks.figures.__main__ import main
 from benchmarks.figures.markdown_tables import joined, notes_of, tables_of
 from benchmarks.figures.measured import OTHER_FILES, Measured, machine_of, measure, read_all, why_old
-from benchmarks.figures.page import doubled_titles, filled, pages, results
+from benchmarks.figures.page import doubled_titles, filled, overview, pages, section_page
 from benchmarks.figures.step import FOLDER, ROOT, STEPS, Section, Step, Unit, read_sections, units_of
 from offboard.common.errors import DataError, OffloadError
 from offboard.loadgen.__main__ import COMMANDS
@@ -61,7 +61,7 @@ def checkout() -> None:
 
 
 def test_every_page_shows_what_the_files_hold() -> None:
-    """The results page, and the blocks of all other pages, equal the files of the steps byte by byte."""
+    """The pages of figures, and the blocks of all other pages, equal the files of the steps byte by byte."""
     wrong = [
         str(path)
         for path, text in pages(ROOT, SECTIONS, FILES).items()
@@ -70,9 +70,21 @@ def test_every_page_shows_what_the_files_hold() -> None:
     assert wrong == [], "run `make figures`, or `python -m benchmarks.figures --write`"
 
 
+def test_the_results_page_stays_short() -> None:
+    """It has the sections that decide, and at most 400 lines; every other page of figures is generated."""
+    lines = (ROOT / "docs/results.md").read_text(encoding="utf-8").splitlines()
+    assert [line for line in lines if line.startswith("## ")] == [
+        *("## Does it pay?", "## Applications", "## Real links", "## A remote call", "## Scale"),
+        "## The design",
+    ]
+    assert len(lines) <= 400
+    there = {path.relative_to(ROOT) for path in (ROOT / FOLDER).glob("*.md")}
+    assert there == {path for path in pages(ROOT, SECTIONS, FILES) if path.parent == FOLDER}
+
+
 @pytest.mark.parametrize("page", pages_of_docs(), ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_no_figure_is_loose(page: Path) -> None:
-    """Outside the blocks, each measured figure names its commit, or links to the results page."""
+    """Outside the blocks, each measured figure names its commit, or links to a page of figures."""
     name = page.relative_to(ROOT).as_posix()
     assert list(loose_figures(page.read_text(encoding="utf-8"), ALLOWED.get(name, ()))) == []
 
@@ -89,10 +101,11 @@ def test_no_figure_is_loose(page: Path) -> None:
     ],
 )
 def test_a_loose_figure_is_found(text: str) -> None:
-    """A sentence and a table of figures are found, unless their commit or the results page is named."""
+    """A sentence and a table of figures are found, unless their commit or a page of figures is named."""
     assert list(loose_figures(f"# Page\n\n{text}\n")) == [text]
     assert list(loose_figures(f"# Page\n\n{text} At 141ddf2.\n")) == []
     assert list(loose_figures(f"# Page\n\n{text} See [results](results.md#speed).\n")) == []
+    assert list(loose_figures(f"# Page\n\n{text} See [figures](figures/speed.md#speed).\n")) == []
 
 
 @pytest.mark.parametrize(
@@ -135,14 +148,15 @@ def test_the_commands_of_a_step_exist(unit: Unit) -> None:
 def test_the_page_says_what_is_of_another_commit_and_what_is_missing() -> None:
     """At its top it names the commit of most figures, the sections of others, and those not measured."""
     parts = step(name="parts", title="In parts", parts=("a", "b"))
-    sections = [Section("S", "", (step(), parts, step(name="third", title="Third")))]
+    sections = [Section("speed", "S", "", (step(), parts, step(name="third", title="Third")))]
     files = {"speed": MEASURED, "parts/a": replace(MEASURED, commit="def5678", date="2026-11-20")}
-    page = results(sections, files)
+    page = overview(sections, files)
     assert "**2 of 4 measurements are done**, and 1 of them are of commit abc1234 (2026-11-26)." in page
-    assert "Of commit def5678:\n\n- [In parts](#in-parts) (a)\n" in page
-    assert "Not measured yet:\n\n- [In parts](#in-parts) (b)\n- [Third](#third)\n" in page
+    assert "Of commit def5678:\n\n- [In parts](speed.md#in-parts) (a)\n" in page
+    assert "Not measured yet:\n\n- [In parts](speed.md#in-parts) (b)\n- [Third](speed.md#third)\n" in page
+    page = section_page(sections[0], files)
     assert "Commit abc1234, 2026-11-26; AMD EPYC, 2 cores, 8 GiB, Linux 6.1, Python 3.11.7." in page
-    assert "### Third\n\nHow fast.\n\n```sh\npython -m speed\n```\n\nNot measured yet.\n" in page
+    assert "## Third\n\nHow fast.\n\n```sh\npython -m speed\n```\n\nNot measured yet.\n" in page
 
 
 def test_the_page_names_tables_of_other_rows_than_those_of_the_checkout() -> None:
@@ -152,8 +166,10 @@ def test_the_page_names_tables_of_other_rows_than_those_of_the_checkout() -> Non
     before = replace(now, reads={"loadgen/datasets/paper.csv": {"sha256": "0", "commit": "def5678"}})
     assert why_old(unit, now, "abc1234") == ""
     assert why_old(unit, before, "abc1234") == OTHER_FILES
-    page = results([Section("S", "", (unit.step,))], {unit.name: before})
+    section = Section("speed", "S", "", (unit.step,))
+    page = overview([section], {unit.name: before})
     assert "Of rows or scenarios that have changed since:\n\n- [Table II on our own datasets]" in page
+    page = section_page(section, {unit.name: before})
     assert "rows of paper.csv of commit def5678" in page
 
 
@@ -167,23 +183,49 @@ def test_the_newest_commit_is_that_of_the_latest_second() -> None:
         "speed": replace(MEASURED, date="2026-11-26T09:00:00Z"),
         table.name: replace(MEASURED, reads={"rows.csv": {"sha256": "0", "commit": "def5678"}}),
     }
-    page = results([Section("S", "", (parts, step(), replace(table.step, parts=("paper",))))], files)
+    page = overview(
+        [Section("speed", "S", "", (parts, step(), replace(table.step, parts=("paper",))))], files
+    )
     assert "**4 of 4 measurements are done**, and 1 of them are of commit abc1234 (2026-11-26)." in page
 
 
 def test_a_block_holds_chosen_rows_and_columns() -> None:
     """It shows rows with the cells that it names, and the commit; an unknown column is an error."""
     text = "A\n\n<!-- figure: speed | case: busy | show: ms -->\nold\n<!-- end -->\nB\n"
-    page = Path("docs/speed.md")
-    text = filled(text, page, {"speed": step()}, {"speed": MEASURED})
+    page, places = Path("docs/speed.md"), {"speed": FOLDER / "speed.md"}
+    text = filled(text, page, {"speed": step()}, {"speed": MEASURED}, places)
     assert "\n| ms |\n| ---: |\n| 4.50 |\n\nCommit abc1234, 2026-11-26; " in text
-    assert text.endswith("[All figures](results.md#speed).\n\n<!-- end -->\nB\n")
-    assert filled(text, page, {"speed": step()}, {"speed": MEASURED}) == text
-    assert "Not measured yet." in filled(text, page, {"speed": step()}, {})
+    assert text.endswith("[All figures](figures/speed.md#speed).\n\n<!-- end -->\nB\n")
+    assert filled(text, page, {"speed": step()}, {"speed": MEASURED}, places) == text
+    assert "Not measured yet. [How" in filled(text, page, {"speed": step()}, {}, places)
+    other = replace(MEASURED, output=["| a |", "| --- |"])
     with pytest.raises(DataError, match=r"docs/speed.md: .* there is no column 'case' in a"):
-        filled(text, page, {"speed": step()}, {"speed": replace(MEASURED, output=["| a |", "| --- |"])})
+        filled(text, page, {"speed": step()}, {"speed": other}, places)
     with pytest.raises(DataError, match="there is no such step"):
-        filled(text, page, {}, {})
+        filled(text, page, {}, {}, {})
+
+
+def test_a_block_holds_a_table_below_a_heading_or_those_of_all_parts() -> None:
+    """The heading is one of the output; a column that is there twice cannot be chosen."""
+    lines = ["## A", "| a | a |", "| --- | --- |", "| 1 | 2 |", "", "## B", "| b |", "| --- |", "| 3 |"]
+    page, parts = Path("README.md"), step(parts=("x", "y"))
+    files = {"speed": replace(MEASURED, output=lines)}
+    files |= {"speed/x": MEASURED, "speed/y": replace(MEASURED, output=lines)}
+
+    def shown(what: str, of: Step) -> str:
+        return filled(f"<!-- figure: {what} -->\n<!-- end -->", page, {"speed": of}, files, places)
+
+    places = {"speed": FOLDER / "speed.md"}
+    assert "\n| b |\n| --- |\n| 3 |\n" in shown("speed | table: B", step())
+    assert "\n| a | a |\n| --- | --- |\n| 1 | 2 |\n" in shown("speed", step())
+    with pytest.raises(DataError, match="more than one column 'a'"):
+        shown("speed | show: a", step())
+    with pytest.raises(DataError, match="no heading 'C'"):
+        shown("speed | table: C", step())
+    with pytest.raises(DataError, match="tables have other columns"):
+        shown("speed", parts)
+    files["speed/y"] = MEASURED
+    assert shown("speed", parts).count("| calm | 1.25 |") == 2
 
 
 def test_tables_of_parts_become_one() -> None:
@@ -249,13 +291,13 @@ def test_a_step_that_plays_scenarios_reads_them(unit: Unit) -> None:
     """No step with `loadgen compare`, `checks` or `dataset` was forgotten."""
     if any(command.split()[1] in ("compare", "checks", "dataset") for command in unit.commands()):
         played = [find_scenario(word) for command in unit.commands() for word in command.split()[2:3]]
-        assert {path.relative_to(ROOT).as_posix() for path in played} <= unit.reads(ROOT).keys()
+        assert {path.resolve().relative_to(ROOT).as_posix() for path in played} <= unit.reads(ROOT).keys()
 
 
 def test_a_step_whose_text_is_a_number_is_one_line(tmp_path: Path) -> None:
     """The file is named."""
     path = tmp_path / "steps.toml"
-    path.write_text('[[section]]\ntitle = "S"\n[[section.step]]\nname = "a"\nabout = 3\n')
+    path.write_text('[[section]]\npage = "s"\ntitle = "S"\n[[section.step]]\nname = "a"\nabout = 3\n')
     with pytest.raises(DataError, match=r"steps.toml: "):
         read_sections(path)
 

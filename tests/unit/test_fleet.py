@@ -11,9 +11,8 @@ import pytest
 from offboard.common.errors import ConfigError
 from offboard.loadgen.__main__ import main
 from offboard.loadgen.fleet.fleet_figures import herding, line_of
-from offboard.loadgen.fleet.fleet_messages import ASK, CANCEL, REPLY, REQUEST, ToServer
 from offboard.loadgen.fleet.fleet_run import Fleet, make_tasks, run_fleet
-from offboard.loadgen.fleet.fleet_servers import Servers
+from offboard.loadgen.fleet.fleet_servers import ASK, CANCEL, REPLY, REQUEST, Servers, ToServer
 from offboard.loadgen.fleet.fleet_settings import FleetConfig, FleetSize
 from offboard.loadgen.progress import progress
 
@@ -32,24 +31,24 @@ def request(at_s: float, number: int, cpu_s: float, limit_s: float = 9.0) -> ToS
 
 
 def test_a_server_runs_requests_in_order_and_drops_those_that_are_late() -> None:
-    """With one worker, each waits for the ones before; one that could not begin in time is not run."""
+    """With one worker, each waits for the ones before; one that did not begin in time is not run."""
     servers = Servers(FleetSize(robots=1, servers=1, workers=1), 1, DELAY_S)
     sent = servers.step([request(1.0, 1, 0.5), request(1.1, 2, 0.5), request(1.2, 3, 0.5, limit_s=1.9)], 9.0)
     assert [(one.number, one.sort) for one in sent] == [(1, REPLY), (2, REPLY)]
     assert [one.arrives_s for one in sent] == pytest.approx([1.51, 2.01])
     assert [one.queue_s for one in sent] == pytest.approx([0.0, 0.4])
-    assert [one.queue for one in sent] == [0, 0]
+    assert [one.queue for one in sent] == [1, 0]
     assert servers.busy_s.tolist() == pytest.approx([1.0])
 
 
 def test_a_cancelled_request_leaves_the_queue() -> None:
-    """Those behind it begin earlier; a request that runs already goes on to its end."""
+    """Those behind it begin earlier; one that runs goes on to its end, and is not answered."""
     servers = Servers(FleetSize(robots=1, servers=1, workers=1), 1, DELAY_S)
     asked = [request(1.0, 1, 0.5), request(1.1, 2, 0.5), request(1.2, 3, 0.5)]
     cancelled = [ToServer(1.3, CANCEL, 0, 0, number) for number in (1, 2)]
     sent = servers.step(asked + cancelled, 9.0)
-    assert [one.number for one in sent] == [1, 3]
-    assert [one.arrives_s for one in sent] == pytest.approx([1.51, 2.01])
+    assert [(one.number, one.arrives_s) for one in sent] == [(3, pytest.approx(2.01))]
+    assert servers.busy_s.tolist() == pytest.approx([1.0])
 
 
 def test_the_oracle_knows_the_queue_of_each_server() -> None:

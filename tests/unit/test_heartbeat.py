@@ -4,14 +4,15 @@ import time
 
 import pytest
 
-from offboard.robot_client.sites.background import LOADED_SLOWER, Background
 from offboard.robot_client.sites.heartbeat import (
     EVERY_S,
     IDLE_S,
     JITTER,
+    LOADED_SLOWER,
     SILENT_S,
     SLACK_S,
     UNANSWERED_MAX,
+    Background,
     Heartbeat,
     ServerReport,
 )

@@ -43,6 +43,15 @@ def test_with_few_errors_a_task_is_late_beyond_its_spread() -> None:
     assert late_after_s(UNKNOWN, 0.1) is None
 
 
+def test_a_worse_second_run_starts_later_if_no_task_was_so_late() -> None:
+    """By what the lost quality is worth; not if past tasks were late by more than the second run is worth."""
+    calm = known(1.0, errors=PredictionErrors((0.0,) * 20, usual_s=1.0))
+    assert late_after_s(calm, 0.6, 0.5) == pytest.approx((late_after_s(calm, 0.6) or 0.0) + 0.5)
+    assert late_after_s(known(1.0), 0.6, 0.5) == pytest.approx((late_after_s(known(1.0), 0.6) or 0.0) + 0.5)
+    late = known(1.0, errors=LATE)
+    assert late_after_s(late, 2.0, 0.5) == late_after_s(late, 2.0)
+
+
 def test_the_time_of_a_hedge_moves_with_the_error_of_the_prediction() -> None:
     """If the prediction itself may be wrong, a task is late later."""
     sure, unsure = (late_after_s(known(1.0, errors=LATE, error_s=error_s), 2.0) for error_s in (0.0, 1.0))

@@ -14,7 +14,7 @@ from offboard.common.errors import BadValue, ProtocolError
 from offboard.common.wire import item_count, values
 from offboard.common.wire import messages as wire
 from offboard.common.wire.item_count import ITEMS_MAX, count_items
-from offboard.robot_client.openpi import numpy_msgpack
+from offboard.robot_client.policy_servers import openpi
 from tests.wire_values import Pose
 
 SAID = f"more than {ITEMS_MAX} items"
@@ -173,7 +173,7 @@ def test_an_answer_of_a_policy_server_has_as_many_items_at_most(
 ) -> None:
     """One with more is malformed, and costs no memory; an observation with more is not sent."""
     largest = [1.5] * (FEW - 1)
-    assert numpy_msgpack.unpack(numpy_msgpack.pack(largest)) == largest
+    assert openpi.unpack(openpi.pack(largest)) == largest
     with pytest.raises(BadValue, match=f"^it has {SAID}"):
-        numpy_msgpack.pack([*largest, []])
-    assert peak_of(lambda: numpy_msgpack.unpack(MANY_LISTS)) < len(MANY_LISTS)
+        openpi.pack([*largest, []])
+    assert peak_of(lambda: openpi.unpack(MANY_LISTS)) < len(MANY_LISTS)

@@ -10,14 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from offboard.common.errors import DataError
-from offboard.loadgen.relay.link.delay_samples import SAMPLES_MAX, quantile, read_samples
-from offboard.loadgen.relay.link.draws import REPLAY_MAX, Draws, replay_from
-from offboard.loadgen.relay.link.jitter import (
+from offboard.loadgen.relay.link.draws import (
     DISTRIBUTIONS,
     PARETO_SD,
     PARETO_SHAPE,
+    REPLAY_MAX,
+    Draws,
     Jitter,
+    quantile,
+    replay_from,
 )
+from offboard.loadgen.relay.link.link import SAMPLES_MAX
+from offboard.loadgen.relay.link.recording_file import read_samples
 
 SEEDS = st.integers(0, 2**32)
 CORRELATION = 0.6

@@ -10,7 +10,7 @@ import pytest
 from benchmarks import left_out
 from benchmarks.ablations import LEFT_OUT
 from benchmarks.left_out import Switched
-from offboard.common.class_path import find_class
+from offboard.common.config import find_class
 from offboard.loadgen.compare.compare_settings import split_strategy
 from offboard.robot_client.policies import Hedge
 from offboard.robot_client.policies.prediction_errors import PredictionErrors
@@ -108,9 +108,12 @@ def test_a_subclass_of_the_model_learns_per_work_as_the_model_does(name: str, pe
 
 
 def test_without_the_stall_a_late_heartbeat_adds_nothing() -> None:
-    """The default leaves a server whose heartbeat is late; without the rule it goes there."""
-    cloud = known(0.3, condition=Condition(wait_s=0.2))
-    sites = {"onboard": known(0.2), "cloud": cloud}
+    """The default leaves a server whose heartbeat is late; without the rule it goes there.
+
+    The outlooks have their costs, as those of a robot do.
+    """
+    cloud = known(0.3, condition=Condition(wait_s=0.2))._replace(cost=0.3)
+    sites = {"onboard": known(0.2)._replace(cost=0.2), "cloud": cloud}
     assert decide("default", sites).site == "onboard"
     assert decide(left_out.Stall(), sites).site == "cloud"
 

@@ -8,7 +8,7 @@ import pytest
 from offboard.common.planning import planner
 from offboard.common.planning.maps import GridMap
 from offboard.common.planning.planner import Pose
-from offboard.loadgen.robot.lidar import cast_scan
+from offboard.loadgen.robot.robot import cast_scan
 
 planner.warm()
 cast_scan(GridMap(np.zeros((4, 4), np.int8), 1.0), Pose(2.0, 2.0))  # compiles before any test's clock

@@ -11,7 +11,7 @@ from offboard.common.errors import ConfigError
 from offboard.loadgen.relay.link.link import Link, LinkConditions
 from offboard.loadgen.relay.link.pipe import Pipe
 from offboard.loadgen.relay.tcp import link_record as module
-from offboard.loadgen.relay.tcp.link_record import Chunk, LinkRecord
+from offboard.loadgen.relay.tcp.link_record import LinkRecord
 
 
 def read(path: Path) -> list[dict[str, Any]]:
@@ -27,17 +27,8 @@ def test_lines_are_written_in_order_with_times_since_the_start(tmp_path: Path) -
     pipe = Pipe(LinkConditions(delay_ms=15), 0, 1, "up")
     due_s = pipe.due(101.5, 10)
     for size, delivered_s in ((10, 101.516), (0, None)):
-        chunk = Chunk(
-            connection=1,
-            direction="up",
-            segment=0,
-            size=size,
-            arrived_s=101.5,
-            due_s=due_s,
-            drawn_ms=pipe.drawn_ms,
-            stall_ms=pipe.stall_ms,
-        )
-        record.delivered(record.chunk(chunk), delivered_s)
+        chunk = record.chunk(1, "up", pipe, segment=0, size=size, arrived_s=101.5, due_s=due_s)
+        record.delivered(chunk, delivered_s)
     record.closed(102.0, 1, "client")
     record.close(103.0)
     lines = read(path)

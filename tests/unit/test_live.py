@@ -1,7 +1,7 @@
 """The page `/live`: what a viewer gets, its files, and how a run's folder is followed. No socket."""
 
 import json
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +10,7 @@ import pytest
 from offboard.cloud_server.metrics import RobotUses
 from offboard.common.errors import MissingExtra
 from offboard.common.live.live_files import PATHS, page_file
-from offboard.common.live.look import KEPT_MAX, VIEWERS_MAX, Look, Viewers, encode
-from offboard.common.live.robot_live import TASKS_MAX, RobotLive
+from offboard.common.live.look import KEPT_MAX, TASKS_MAX, VIEWERS_MAX, Look, RobotLive, Viewers, encode
 from offboard.loadgen.play.run_files import EVENTS, SUMMARY
 from offboard.loadgen.play.watch import GrowingFile, RunLive
 
@@ -33,7 +32,7 @@ def records(live: RobotLive[dict[str, Any]], *numbers: int) -> None:
     """Tasks of a robot that somebody looks at."""
     next(live.looks())
     for i in numbers:
-        task_at(live, i, datetime.now(UTC))
+        task_at(live, i, datetime.now(timezone.utc))
 
 
 def test_a_look_is_json_without_infinity() -> None:
@@ -95,7 +94,7 @@ def test_records_are_read_only_for_viewers() -> None:
 def test_while_nobody_looks_few_records_are_kept() -> None:
     """Then it is one a second, so that tasks cost as much as without a page; a viewer gets all again."""
     live = RobotLive[dict[str, Any]](dict)
-    now, step = datetime.now(UTC), timedelta(seconds=0.1)
+    now, step = datetime.now(timezone.utc), timedelta(seconds=0.1)
     for i in range(30):
         task_at(live, i, now + (i - 30) * step)
     looks = live.looks()

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from offboard.common.host import load
-from offboard.common.host.load import (
+from offboard.common import load
+from offboard.common.load import (
     EVERY_S,
     HURRIED_S,
     LOOKED_UP_EVERY,

@@ -4,8 +4,7 @@ import threading
 from pathlib import Path
 from queue import SimpleQueue
 
-from offboard.common.host.load import EVERY_S, Load
-from offboard.common.host.load_watch import LoadWatch
+from offboard.common.load import EVERY_S, Load, LoadWatch
 
 WAIT_S = 8.0
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from offboard.common.host.logs import TASK, JsonLines
+from offboard.common.logs import TASK, JsonLines
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("common", "robot_client", "cloud_server", "loadgen", "offboard")

@@ -8,7 +8,7 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from offboard.loadgen.relay.link.loss import LOSSES_MAX, Loss, stall_ms
+from offboard.loadgen.relay.link.draws import LOSSES_MAX, Loss, stall_ms
 
 COUNT = 100_000
 SHARE = 0.02

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from offboard.loadgen.play.machine import gpu, machine
-from offboard.loadgen.play.table_one import specifications, table_one
+from offboard.loadgen.play.measure_dataset import specifications, table_one
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.table.table_formats import render
 

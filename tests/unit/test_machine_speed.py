@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from offboard.loadgen.compare.compare_settings import CompareConfig
-from offboard.loadgen.compare.comparison_table import Line, comparison_table
+from offboard.loadgen.compare.comparison_line import Line
+from offboard.loadgen.compare.comparison_table import comparison_table
 from offboard.loadgen.scenario.outcome import Answered, Outcome
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 

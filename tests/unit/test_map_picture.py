@@ -28,8 +28,7 @@ from offboard.loadgen.map_picture import (
     LastPlan,
     draw_plan,
 )
-from offboard.loadgen.robot.lidar import cast_scan
-from offboard.loadgen.robot.robot import Request
+from offboard.loadgen.robot.robot import Request, cast_scan
 
 SIDE, RESOLUTION = 60, 0.1
 ROOT = Path(__file__).parents[2]

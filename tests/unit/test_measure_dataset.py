@@ -13,8 +13,9 @@ from offboard.loadgen.play.play_scenario import play
 from offboard.loadgen.scenario.scenario_file import read_scenario
 from offboard.loadgen.table.measured_rows import read
 from offboard.loadgen.table.measurement_notes import notes
+from offboard.loadgen.table.table_formats import render
 from offboard.loadgen.table.table_settings import TableConfig
-from offboard.loadgen.table.table_two import table_text
+from offboard.loadgen.table.table_two import read_tables
 from offboard.robot_client.policies import Decision
 from offboard.robot_client.records.record import Record
 from offboard.robot_client.records.trace import Trace
@@ -58,11 +59,10 @@ def test_notes_are_printed_with_the_table(tmp_path: Path) -> None:
     """The notes in NAME.json are printed below the caption of every table of NAME.csv."""
     (tmp_path / "d.csv").write_text(CSV)
     (tmp_path / "d.json").write_text(json.dumps({"notes": ["Robot 0.2 CPU.", "Ratio 1.02."]}))
-    lines = table_text(tmp_path / "d.csv", TableConfig(windows=("2",))).splitlines()
+    tables = read_tables(tmp_path / "d.csv", TableConfig(windows=("2",)))
+    lines = render(tables, "md").splitlines()
     assert lines[1:3] == ["- Robot 0.2 CPU.", "- Ratio 1.02."]
-    (table,) = json.loads(table_text(tmp_path / "d.csv", TableConfig(windows=("2",), format="json")))[
-        "tables"
-    ]
+    (table,) = json.loads(render(tables, "json"))["tables"]
     assert table["notes"] == ["Robot 0.2 CPU.", "Ratio 1.02."]
 
 

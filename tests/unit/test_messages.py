@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from offboard.common.errors import BadValue, ProtocolError
-from offboard.common.source.source_hash import HASH_LENGTH
+from offboard.common.source.covers import HASH_LENGTH
+from offboard.common.task_call import TRACEBACK_LENGTH_MAX
 from offboard.common.tasks import KINDS_MAX
-from offboard.common.tracebacks import TRACEBACK_LENGTH_MAX
 from offboard.common.wire import messages as wire
 from offboard.common.wire.messages import Blob, Cancel, Hello, Ping, Pong, Reply, Request
 from tests.wire_values import Pose, mutate

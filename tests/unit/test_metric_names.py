@@ -11,6 +11,7 @@ from offboard.cloud_server.metrics import Metrics as ServerMetrics
 from offboard.robot_client.learning.regret import Regret
 from offboard.robot_client.records.metrics import Metrics as RobotMetrics
 from offboard.robot_client.records.trace import Trace
+from offboard.robot_client.streams.counts import StreamMetrics
 from tests.unit.test_trace import record
 
 ROOT = Path(__file__).parents[2]
@@ -31,6 +32,7 @@ def all_served(folder: Path) -> set[str]:
     registry = CollectorRegistry()
     robot, trace = RobotMetrics(registry), Trace(folder / "trace.jsonl")
     robot.watch(trace)
+    robot.show(StreamMetrics())
     robot(replace(record(0), regret=Regret(0.01, 0.004, 0.02, 9)))
     trace.close()
     return {*served(registry), *served(ServerMetrics().registry)}
@@ -45,6 +47,7 @@ def test_rules_and_the_live_page_use_only_metrics_that_exist(tmp_path: Path) -> 
 
 def test_the_documentation_lists_each_metric_and_no_other(tmp_path: Path) -> None:
     """A histogram is listed without the endings that Prometheus adds."""
-    listed = set(NAME.findall((ROOT / "docs" / "operations.md").read_text()))
+    pages = (ROOT / "docs" / name for name in ("robot.md", "server.md"))
+    listed = {name for page in pages for name in NAME.findall(page.read_text())}
     wanted = {re.sub(r"_(bucket|sum|count)$", "", name) for name in all_served(tmp_path)}
     assert listed == wanted

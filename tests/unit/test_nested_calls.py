@@ -9,9 +9,9 @@ import pytest
 from offboard import Offloader, Settings
 from offboard.common import tasks
 from offboard.common.errors import Overtaken, Unwanted
+from offboard.common.task_call import check_wanted
 from offboard.common.task_states import TaskStates
 from offboard.common.tasks import Task, kind_of, task
-from offboard.common.wanted import check_wanted
 from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.fakes import ScriptedRunner

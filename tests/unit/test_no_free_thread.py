@@ -11,10 +11,9 @@ import pytest
 
 from offboard import Offloader
 from offboard.common.errors import OffloadError
-from offboard.common.host.load import Load
-from offboard.common.host.load_watch import LoadWatch
+from offboard.common.load import Load, LoadWatch
 from offboard.common.tasks import Task, kind_of, task
-from offboard.robot_client.sites.cloud import CloudRunner
+from offboard.robot_client.cloud.cloud_runner import CloudRunner
 from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import ONBOARD
 

@@ -17,8 +17,8 @@ import pytest
 from offboard.common.source import normal_form as module
 from offboard.common.source.normal_form import normal_form
 
-OLDEST = (3, 11)
-DIGEST = "b7fc2c768f7ecfccde8cce70264b90e7856c34faecf697bdd5bfea3727651f73"  # of SAMPLE on every Python
+OLDEST = (3, 10)
+DIGEST = "53b1d1b3dc96a2a62930f77780dbae7e64fee11a7580e9daa65fd96fa5fb6359"  # of SAMPLE on every Python
 
 # Whatever the syntax tree of one version of Python shows in another way than that of the next one.
 SAMPLE = r'''import functools
@@ -67,7 +67,7 @@ class Outer:
                     yield [await y async for y in b if y if x]
             try:
                 del a[1:2, ::3], b.c
-            except* (ValueError, OSError) as error:
+            except (ValueError, OSError) as error:
                 raise error from None
             else:
                 ...
@@ -79,7 +79,7 @@ class Outer:
             case {"a": 1 | None, **rest}:
                 return rest
             case [1, *_, Outer(x=3, y=-1.5)] if thing:
-                return lambda z, *w: z[w, *w]
+                return lambda z, *w: z[(w, *w)]
             case _:
                 while (n := thing) and n != 3 or not n is None:
                     global WIDTH
@@ -137,7 +137,7 @@ def form_of(folder: Path, text: str, name: str = "f") -> str:
 
 
 def pythons() -> list[str]:
-    """Each Python from 3.11 on that is installed here: on PATH, or next to others of the same user."""
+    """Each Python from 3.10 on that is installed here: on PATH, or next to others of the same user."""
     folders = [Path(one) for one in os.get_exec_path()]
     root = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
     folders += [one / "bin" for one in root.glob("versions/*")]

@@ -7,8 +7,10 @@ import pytest
 
 from offboard.common.errors import CloudBroken, CloudTimeout
 from offboard.common.tasks import Task, kind_of, task
-from offboard.robot_client.openpi.numpy_msgpack import pack
-from offboard.robot_client.openpi.observation import TEXT_LENGTH_MAX, Observation, shortened
+from offboard.robot_client.policy_servers.openpi import OpenPi, pack
+from offboard.robot_client.policy_servers.protocol import TEXT_LENGTH_MAX, Observation, shortened
+
+pytest.importorskip("websockets", reason="needs the extra 'openpi': pip install '.[openpi]'")
 
 
 @task("openpi_observed", policy_server=True, size=len)
@@ -16,10 +18,21 @@ def observed(observation: dict[str, Any]) -> dict[str, Any]:
     return observation
 
 
+def published() -> Observation:
+    return Observation(
+        site="gpu",
+        task=Task(kind_of(observed), ({},), 0),
+        protocol=OpenPi("ws://127.0.0.1:8000"),
+        data=b"12345",
+        published_s=10.0,
+        deadline_s=20.0,
+    )
+
+
 def sent() -> Observation:
     """It was published at 10 s, and sent at 11 s."""
-    one = Observation("gpu", Task(kind_of(observed), ({},), 0), b"12345", 10.0, 20.0)
-    one.sent_s = 11.0
+    one = published()
+    one.sent_s, one.bytes_out = 11.0, 5
     return one
 
 
@@ -82,10 +95,9 @@ def test_a_type_that_is_not_an_error_is_part_of_the_action() -> None:
 
 def test_what_is_given_up_before_it_is_sent_never_ran() -> None:
     """It moved no bytes."""
-    one = Observation("gpu", Task(kind_of(observed), ({},), 0), b"12345", 10.0, 20.0)
-    execution = one.gave_up(CloudTimeout("late"), 12.0, censored=True)
+    execution = published().given_up(CloudTimeout("late"), 12.0, censored=True)
     assert (execution.started, execution.bytes_out, execution.seconds) == (False, 0, 2.0)
-    execution = sent().gave_up(CloudTimeout("late"), 12.0, censored=True)
+    execution = sent().given_up(CloudTimeout("late"), 12.0, censored=True)
     assert (execution.started, execution.bytes_out) == (True, 5)
 
 

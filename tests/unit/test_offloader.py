@@ -258,7 +258,7 @@ def test_a_value_that_changes_while_it_is_checked_breaks_no_call(
     def changing(*_: object, **__: object) -> None:
         raise RuntimeError("dictionary changed size during iteration")
 
-    monkeypatch.setattr("offboard.robot_client.execution.crossing_check.encode", changing)
+    monkeypatch.setattr("offboard.robot_client.sites.absence.encode", changing)
     with make(cloud_answers(), OnboardRunner()) as offload:
         assert offload(unique, [1, 2]) == {1, 2}
     assert all("dictionary changed size" in text for text in caplog.messages)

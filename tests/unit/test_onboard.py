@@ -11,11 +11,11 @@ from concurrent.futures import CancelledError, Future
 import pytest
 
 from offboard.common.errors import OffloadError, Overtaken, Unwanted
+from offboard.common.task_call import check_wanted
 from offboard.common.tasks import Task, kind_of, task
-from offboard.common.wanted import check_wanted
 from offboard.robot_client.sites import onboard
-from offboard.robot_client.sites.clock import SystemClock
 from offboard.robot_client.sites.onboard import ABANDONED_MAX, ABANDONED_NICE, OnboardRunner
+from offboard.robot_client.sites.waiting import SystemClock
 
 WAIT_S = 5.0
 

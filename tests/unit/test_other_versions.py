@@ -4,7 +4,7 @@ import logging
 
 import pytest
 
-from offboard.cloud_server.other_versions import NAMES_SHOWN, VERSIONS_MAX, OtherVersions
+from offboard.cloud_server.connections import NAMES_SHOWN, VERSIONS_MAX, OtherVersions
 from offboard.common import VERSION
 from offboard.common.tasks import hashes, task
 from offboard.common.wire.messages import Hello

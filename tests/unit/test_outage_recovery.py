@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from offboard.loadgen.scenario.outage_recovery import median_recovery, read_outage, recovery_tasks
 from offboard.loadgen.scenario.outcome import Answered, Outcome
+from offboard.loadgen.scenario.site_shares import median_recovery, read_outage, recovery_tasks
 
 
 def run(sites: str, outage: tuple[int, int] | None = (20, 30)) -> Outcome:

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from offboard.loadgen.compare.compare import rotated
 from offboard.loadgen.compare.compare_settings import CompareConfig
 from offboard.loadgen.compare.comparison_table import comparison_table
+from offboard.loadgen.compare.runs import rotated
 from offboard.loadgen.scenario.outcome import Answered, Outcome, Reading, Reference
 from offboard.loadgen.scenario.outcome_figures import FIGURES
 from offboard.loadgen.scenario.outcome_files import overhead_s

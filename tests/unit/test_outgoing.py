@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from offboard.cloud_server.executors.task_run import Call, run_task
+from offboard.cloud_server.executors.executor import Call, run_task
 from offboard.common.errors import BadValue
 from offboard.common.task_states import TaskStates
 from offboard.common.tasks import Task, kind_of, task
 from offboard.common.wire import messages as wire
-from offboard.robot_client.sites.blob_uploads import BlobUploads
-from offboard.robot_client.sites.outgoing import Outgoing, Parcel, new_task
+from offboard.robot_client.sites.outgoing import BlobUploads, Outgoing, Parcel, new_task
 
 WHOLE = np.zeros(100_000, np.uint8)
 NOISE = np.frombuffer(np.random.default_rng(1).bytes(100_000), np.uint8)

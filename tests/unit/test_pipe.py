@@ -10,11 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from offboard.loadgen.relay.link.bandwidth import BUCKET_S, CHUNK_BYTES
-from offboard.loadgen.relay.link.jitter import DISTRIBUTIONS, Jitter
+from offboard.loadgen.relay.link.draws import DISTRIBUTIONS, Jitter, Loss, stall_ms
 from offboard.loadgen.relay.link.link import SEGMENT_BYTES, LinkConditions
-from offboard.loadgen.relay.link.loss import Loss, stall_ms
-from offboard.loadgen.relay.link.pipe import Pipe
+from offboard.loadgen.relay.link.pipe import BUCKET_S, CHUNK_BYTES, Pipe
 
 SEEDS = st.integers(0, 2**32)
 CUTS = st.lists(st.integers(1, 5 * SEGMENT_BYTES), min_size=1, max_size=20)

@@ -7,8 +7,8 @@ from random import Random
 
 import pytest
 
+from offboard.robot_client.execution.batch import BUDGET_SHARE
 from offboard.robot_client.execution.placement import (
-    BUDGET_SHARE,
     ONBOARD_IN_FLIGHT,
     SERVER_IN_FLIGHT,
     SERVER_IN_FLIGHT_MAX,

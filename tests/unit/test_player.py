@@ -1,6 +1,5 @@
 """The start of a run: flags that the parts accept, a clean folder, and the files of each robot."""
 
-import tomllib
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from offboard.cloud_server.config import ServerConfig
 from offboard.cloud_server.executors import EXECUTORS
 from offboard.common.command_line import load
 from offboard.common.errors import ConfigError
+from offboard.common.toml_file import read_toml
 from offboard.loadgen.play.part_setups import setups
 from offboard.loadgen.play.run_files import LineCounter, RobotFiles, clear_folder
 from offboard.loadgen.relay.link.link_settings import as_flags
@@ -61,7 +61,7 @@ def test_every_key_of_a_shipped_scenario_is_read() -> None:
     """Every key in a shipped scenario is a field of `Scenario`, so that none is silently ignored."""
     known = {"event", "check", "cloud", *(field.name for field in fields(Scenario))}
     for name in shipped():
-        assert tomllib.loads(find_scenario(name).read_text()).keys() <= known
+        assert read_toml(find_scenario(name)).keys() <= known
 
 
 def test_every_robot_gets_the_planner_of_the_scenario(tmp_path: Path) -> None:

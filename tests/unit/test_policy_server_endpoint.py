@@ -12,7 +12,7 @@ from offboard import Offloader, Settings
 from offboard.common.errors import ConfigError
 from offboard.common.tasks import task
 from offboard.common.variants import QUALITY_OF_POLICY_SERVER
-from offboard.robot_client.openpi.endpoint import check_policy_server, check_site, is_readable
+from offboard.robot_client.sites.endpoint import check_policy_server, check_site, is_readable
 from tests.extras import needs
 
 ROOT = Path(__file__).parents[2]

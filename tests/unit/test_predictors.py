@@ -9,15 +9,14 @@ import pytest
 
 from offboard.common.errors import ConfigError, MissingExtra
 from offboard.loadgen import rivals
-from offboard.robot_client import policies, predictors
+from offboard.robot_client import predictors
 from offboard.robot_client.predictors import Predictor
 from tests import checks
 from tests.models import sized
 from tests.table_loops import section
 
 ROOT = Path(__file__).parents[2]
-BAYES = "river:linear_model.BayesianLinearRegression"
-NAMES = (*rivals.PREDICTORS, BAYES)
+NAMES = rivals.PREDICTORS
 WINDOWED = tuple(name for name in NAMES if name != predictors.PARTS)
 
 # Limits of the error on a straight line, as a share of the error of the mean time.
@@ -30,13 +29,11 @@ EXTRAS = {  # for each predictor, the library that it needs, and the extra that 
     "k-means": ("sklearn", "learned"),
     "random-forest": ("sklearn", "learned"),
     "arima": ("statsmodels", "learned"),
-    "sarima": ("statsmodels", "learned"),
     "lstm": ("torch", "lstm"),
     "lstm-sequence": ("torch", "lstm"),
-    BAYES: ("river", "river"),
 }
 BASE = tuple(name for name in rivals.PREDICTORS if name not in EXTRAS)
-HEAVY = ("sklearn", "statsmodels", "river", "torch", "scipy", "pandas")
+HEAVY = ("sklearn", "statsmodels", "torch", "scipy", "pandas")
 
 
 @pytest.fixture(params=NAMES)
@@ -74,27 +71,25 @@ def test_a_line_is_learnt(name: str, make: checks.Make) -> None:
 
 
 def test_an_unknown_name_is_refused_with_all_names() -> None:
-    """The error lists every name. A robot knows two; the test bench knows the rivals and river too."""
-    more = (*rivals.PREDICTORS, "river:MODULE.CLASS")
+    """The error lists every name. A robot knows two; the test bench knows the rivals too."""
     for refuse, names in (
         (predictors.check_name, predictors.names()),
         (lambda name: predictors.make(name, 50), predictors.names()),
-        (rivals.predictor, more),
-        (lambda name: rivals.make(name, 50), more),
+        (rivals.predictor, rivals.PREDICTORS),
+        (lambda name: rivals.make(name, 50), rivals.PREDICTORS),
     ):
-        with pytest.raises(ConfigError) as refused:
-            refuse("theil-send")
-        for part in ("'theil-send'", *names, "or MODULE.CLASS of your own"):
-            assert part in str(refused.value)
+        for unknown in ("k-mean", "river:linear_model.LinearRegression"):
+            with pytest.raises(ConfigError) as refused:
+                refuse(unknown)
+            for part in (f"{unknown!r} is not one of ", *names, "or MODULE.CLASS of your own"):
+                assert part in str(refused.value)
 
 
 def test_the_evaluation_page_lists_every_name() -> None:
-    """Its table has a line for every predictor, and each rule of a rival is named."""
+    """Its table has a line for every predictor."""
     table = section("Predictors")
     for listed in rivals.PREDICTORS:
         assert f"`{listed}`" in table, listed
-    for rule in set(rivals.RULES) - set(policies.names()):
-        assert f"`{rule}`" in section("Replay"), rule
 
 
 def test_a_robot_knows_a_rival_by_its_path(name: str) -> None:

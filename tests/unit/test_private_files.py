@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from offboard.common.errors import ConfigError
-from offboard.common.security.private_files import read_private, read_token
+from offboard.common.security.plain_files import read_private, read_token
 
 TOKEN = "a-token-of-the-tests"
 

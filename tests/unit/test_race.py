@@ -57,7 +57,7 @@ class Course:
             self.clock,
             TIMEOUT_S,
             begun=lambda site: self.begun.append((site, self.clock.now_s())),
-            allowed=lambda: self.allowed,
+            allowed=lambda _: self.allowed,
             late=lambda site, execution: self.late.append((site, execution)),
         )
         return race.run(plan)

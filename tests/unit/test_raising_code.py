@@ -1,7 +1,9 @@
 """Code of a user may raise anything: the caller gets one error that names the task, and no thread dies."""
 
 import asyncio
+import builtins
 import logging
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -12,10 +14,9 @@ from offboard import Offloader, Settings
 from offboard.common.errors import BadValue, TaskError, TaskFailed, describe
 from offboard.common.tasks import task
 from offboard.common.wire import messages as wire
-from offboard.robot_client.sites.blob_uploads import BlobUploads
+from offboard.robot_client.cloud.wire_request import WireRequest
 from offboard.robot_client.sites.onboard import OnboardRunner
-from offboard.robot_client.sites.outgoing import Outgoing
-from offboard.robot_client.sites.pending_request import PendingRequest
+from offboard.robot_client.sites.outgoing import BlobUploads, Outgoing
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
 from tests.fakes import ScriptedRunner
 
@@ -54,9 +55,12 @@ RAISED: list[BaseException] = [
     RecursionError(),
     Own("text"),
     Unreadable(),
-    ExceptionGroup("group", [Unreadable()]),
-    BaseExceptionGroup("group", [Own(), SystemExit()]),
 ]
+if sys.version_info >= (3, 11):
+    RAISED += [
+        builtins.ExceptionGroup("group", [Unreadable()]),
+        builtins.BaseExceptionGroup("group", [Own(), SystemExit()]),
+    ]
 CALLS = ("call", "map", "asyncio")
 raised: list[BaseException] = []
 
@@ -214,13 +218,19 @@ def test_ctrl_c_is_passed_on() -> None:
 
 def test_an_error_of_the_cloud_names_the_task_once() -> None:
     """The server says what was raised; a setup or a crash may name the task already."""
-    from concurrent.futures import Future
 
     from offboard.common.tasks import Task, kind_of
 
     one = Task(kind_of(sound), (1,), 1.0)
     outgoing = Outgoing(one, BlobUploads().inline_rule("sound", 1000), compresses=False)
-    pending = PendingRequest(CLOUD, one, wire.encode([1], ()), 0.0, 1.0, Future(), outgoing=outgoing)
+    pending = WireRequest(
+        site=CLOUD,
+        task=one,
+        published_s=0.0,
+        deadline_s=1.0,
+        body=wire.encode([1], ()),
+        outgoing=outgoing,
+    )
     for text in ("ValueError: no", "setup of task sound: ValueError: no"):
         reply = wire.Reply(one.id, "failed", queue_s=0.0, run_s=0.0, error=text)
         failure = str(pending.answered(reply, 0.5, 10).failure)

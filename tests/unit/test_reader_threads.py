@@ -7,7 +7,7 @@ from queue import SimpleQueue
 import pytest
 
 from offboard.cloud_server import reader_threads
-from offboard.cloud_server.executors.task_run import Call, Outcome
+from offboard.cloud_server.executors.executor import Call, Outcome
 from offboard.cloud_server.executors.thread_executor import ThreadExecutor
 from offboard.cloud_server.fair_queue import Work
 from offboard.cloud_server.reader_threads import ReaderThreads

@@ -13,16 +13,13 @@ from offboard.loadgen.relay.link.link import Link
 from offboard.loadgen.relay.link.link_settings import LinkFlags
 from offboard.loadgen.scenario.scenario import CloudPart, Scenario
 from offboard.loadgen.scenario.scenario_file import LINKS, find_scenario, read_scenario, shipped
-from offboard.loadgen.simulation.model.simulated_connection import SimulatedConnection
+from offboard.loadgen.simulation.model.simulated_connection import Message, SimulatedConnection
 from offboard.loadgen.simulation.model.simulated_cpu import SimulatedCpu
-from offboard.loadgen.simulation.model.simulated_direction import Message
 from offboard.loadgen.simulation.model.simulated_server import SimulatedServer
-from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks, SimulatedTask
-from offboard.loadgen.simulation.model.task_costs import Cost, Noise
-from offboard.loadgen.simulation.model.true_costs import TrueCosts
-from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
-from offboard.loadgen.simulation.oracle import Oracle
+from offboard.loadgen.simulation.model.task_costs import Cost, Noise, RobotTasks, SimulatedTask
+from offboard.loadgen.simulation.model.true_costs import Oracle, TrueCosts
 from offboard.loadgen.simulation.simulation_pool import SimulationPool
+from offboard.testing.virtual_clock import VirtualClock
 from tests.mazes import warm
 
 warm()  # compiles before the clock of any test runs
@@ -102,14 +99,13 @@ def test_the_oracle_knows_the_rates_to_come() -> None:
     task = SimulatedTask(1.0, {"onboard": 1.0, "cloud": 1.0}, bytes_out=2_000_000, bytes_in=400_000)
     costs = TrueCosts(RobotTasks([task], Cost(0.5, 0.0, sending_s=0.0), reports_work=False), Noise(1, 0.0))
     cpu = SimulatedCpu(clock, 1.0)
-    server = SimulatedServer(clock, CloudPart())
-    oracle = Oracle(clock=clock, connection=line, server=server, robot=cpu, costs=costs, owner="robot")
+    oracle = Oracle(clock, cpu, costs, "robot")
     clock.pass_by(BEGINS_S)
     seconds, mbps = np.loadtxt(TRAM, delimiter=",", skiprows=1).T
     passed = np.concatenate([[0.0], np.cumsum(np.diff(seconds) * mbps[:-1] * 125_000)])
     there = np.interp(2_000_000, passed, seconds) + 0.01 + 0.5
     back = np.interp(np.interp(there, seconds, passed) + 400_000, passed, seconds) + 0.01
-    assert oracle.cloud_s(0, coming=()) == pytest.approx(back, abs=1e-3)
+    assert oracle.cloud_s(0, line) == pytest.approx(back, abs=1e-3)
     assert back > 10
 
 
@@ -137,7 +133,7 @@ def on_another_link(scenario: Scenario) -> Scenario:
 
 def test_every_scenario_of_the_recordings_can_be_read() -> None:
     """They are found by name, and play a shipped recording."""
-    assert shipped(LINKS) == ("link-frames", "link-images", "link-plans")
+    assert shipped(LINKS) == ("link-frames", "link-images", "link-plans", "link-stream")
     for name in shipped(LINKS):
         assert read_scenario(find_scenario(name)).recorded()["cloud"].keys() == {"up", "down"}
 

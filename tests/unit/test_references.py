@@ -12,11 +12,11 @@ import pytest
 from offboard.common.errors import CloudTimeout
 from offboard.common.task_states import TaskStates
 from offboard.common.tasks import Kind, Task, kind_of, task
-from offboard.loadgen.robot import references as references_file
 from offboard.loadgen.robot.calls import Calls
 from offboard.loadgen.robot.config import CallConfig
 from offboard.loadgen.robot.references import References, orders
 from offboard.loadgen.robot.run import OwnRecord, Run
+from offboard.loadgen.scenario.outcome_files import read_lines
 from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution
@@ -62,7 +62,7 @@ def referenced(
         work = Calls(scripted, zip(itertools.count()))
         Run(config, work, offload, own=own, say=lambda _: None, references=references).run()
         references.close()
-    return list(references_file.read(path)), records
+    return read_lines(path), records
 
 
 def test_every_third_task_has_a_reference(tmp_path: Path) -> None:

@@ -1,6 +1,10 @@
 """`loadgen report`: the page, its files, and the errors; tests/browser opens the page in a browser."""
 
+import base64
+import gzip
 import hashlib
+import json
+import random
 import re
 import subprocess
 import sys
@@ -10,13 +14,12 @@ from typing import Any
 import matplotlib
 import pytest
 
-from offboard.common.errors import ConfigError, DataError
+from offboard.common.errors import ConfigError
 from offboard.loadgen.__main__ import main
 from offboard.loadgen.play.run_files import find_source
-from offboard.loadgen.report.inline_svg import inline
 from offboard.loadgen.report.report import ReportConfig, run_report
-from offboard.loadgen.table import published_table_two as paper
 from offboard.loadgen.table.table_formats import render
+from offboard.loadgen.table.table_two_figures import published_table
 from tests.extras import needs
 from tests.reports import CHARTS, write_rows
 from tests.table_loops import PAGE, THOUSAND, csv_of
@@ -29,6 +32,13 @@ def digests(folder: Path) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()}
 
 
+def packed_look(page: str) -> dict[str, Any]:
+    """What the live page in a report shows."""
+    packed = page.partition('id="packed-look">')[2].partition("<")[0]
+    look: dict[str, Any] = json.loads(gzip.decompress(base64.b64decode(packed)))
+    return look
+
+
 def cells_of(markdown: str) -> list[list[str]]:
     lines = (line for line in markdown.splitlines() if line.startswith("|"))
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
@@ -37,7 +47,7 @@ def cells_of(markdown: str) -> list[list[str]]:
 def test_the_table_of_the_paper_matches_the_docs() -> None:
     """Every line is that of docs/evaluation.md, to the five digits that tables have."""
     section = PAGE.split("## The paper's own table")[1].split("\n## ")[0]
-    documented, printed = cells_of(section), cells_of(render([paper.table()], "md"))
+    documented, printed = cells_of(section), cells_of(render([published_table()], "md"))
     assert printed[0] == documented[0]
     assert [[line[0], *map(float, line[1:])] for line in printed[2:]] == [
         [line[0], *(round(float(cell), 5) for cell in line[1:])] for line in documented[2:]
@@ -45,13 +55,13 @@ def test_the_table_of_the_paper_matches_the_docs() -> None:
 
 
 def test_a_report_has_every_chart_and_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The page has five charts, also as PNGs, and four tables; ids are unique; nothing is loaded or run."""
+    """The page has the charts of the paper, also as PNGs, and four tables; nothing is loaded or run."""
     out = tmp_path / "out"
     assert run_report(write_rows(tmp_path, THOUSAND[:100]), ReportConfig(out=out)) == 0
     assert capsys.readouterr().out == f"{out / 'report.html'}\n"
     text = (out / "report.html").read_text(encoding="utf-8")
-    assert re.findall(r'<figure id="(\w+)">', text) == list(CHARTS)
-    assert [text.count(f"<{tag}") for tag in ("svg", "figcaption", "table", "section")] == [5, 5, 4, 4]
+    assert re.findall(r'<figure id="picture-(\w+)">', text) == list(CHARTS)
+    assert [text.count(f"<{tag}") for tag in ("img", "figcaption", "table")] == [3, 3, 4]
     assert sorted(path.name for path in out.iterdir()) == sorted(
         [*(f"{name}.png" for name in CHARTS), "report.html"]
     )
@@ -59,9 +69,10 @@ def test_a_report_has_every_chart_and_table(tmp_path: Path, capsys: pytest.Captu
         assert (out / f"{name}.png").read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
     ids = re.findall(r'\sid="([^"]+)"', text)
     assert len(ids) == len(set(ids))
-    used = re.findall(r'(?:href="#|url\(#|labelledby=")([^")]+)', text)
-    assert set(used) <= set(ids)
-    assert set(re.findall(r'\b(?:href|src)="([^#"][^"]*)"', text)) == {"data:,"}
+    assert set(re.findall(r'labelledby="([^"]+)', text)) <= set(ids)
+    assert {address.partition(":")[0] for address in re.findall(r'\b(?:href|src)="([^"]*)"', text)} == {
+        "data"
+    }
     assert not re.search(r"<script|@import|http:|\son\w+=", text)
     assert text.count("<style>") == 1
 
@@ -74,7 +85,7 @@ def test_names_are_escaped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     Path(name).with_suffix(".json").write_text('{"notes": ["<b>loud</b>"]}')
     run_report(Path(name), ReportConfig(out=tmp_path))
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "<img" not in text
+    assert "<img src=x" not in text
     assert "<b>" not in text
     shown = "&lt;img src=x onerror=alert(1)&gt;&amp;&quot;&#x27;.csv"
     assert text.count(shown) == 5  # title, heading, three tables
@@ -90,7 +101,32 @@ def test_the_same_rows_give_the_same_bytes(tmp_path: Path) -> None:
         run_report(path, ReportConfig(out=tmp_path / "two"))
         assert dict(matplotlib.rcParams) == before
     assert digests(tmp_path / "one") == digests(tmp_path / "two")
-    assert len(digests(tmp_path / "one")) == 6
+    assert len(digests(tmp_path / "one")) == 1 + len(CHARTS)
+
+
+def test_the_same_trace_gives_the_same_bytes(tmp_path: Path) -> None:
+    """The live page in a report depends only on the tasks."""
+    trace_of(tmp_path, *(("paper", "cloud", {"cloud": 0.1 + 0.001 * i}, 0.1) for i in range(9)))
+    for name in ("one", "two"):
+        run_report(tmp_path / "trace.jsonl", ReportConfig(out=tmp_path / name))
+    assert digests(tmp_path / "one") == digests(tmp_path / "two")
+    assert list(digests(tmp_path / "one")) == ["report.html"]
+
+
+def test_a_report_of_many_tasks_is_below_6_mb(tmp_path: Path) -> None:
+    """Of a long trace the page holds the last tasks, and says how many it leaves out."""
+    path = trace_of(tmp_path, ("paper", "cloud", {"cloud": 0.1}, 0.1))
+    line, numbers = json.loads(path.read_text()), random.Random(1)
+    with path.open("w") as file:
+        for i in range(16_000):
+            noise = {f"feature-{n}": numbers.random() for n in range(16)}
+            file.write(json.dumps({**line, "i": i, "id": f"x-{i}", "features": noise}) + "\n")
+    run_report(path, ReportConfig(out=tmp_path))
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert len(text.encode()) < 6_000_000
+    look = packed_look(text)
+    assert look["tasks"][-1]["i"] == 15_999
+    assert 5_000 < len(look["tasks"]) == 16_000 - look["left_out"] < 16_000
 
 
 def test_the_default_folder_is_that_of_the_run_or_out_name(
@@ -111,14 +147,9 @@ def test_a_later_report_replaces_the_whole_earlier_one(tmp_path: Path) -> None:
     """The PNG of a chart that can no longer be drawn is removed."""
     out = tmp_path / "out"
     run_report(write_rows(tmp_path, THOUSAND[:60]), ReportConfig(out=out))
-    assert (out / "ecdf.png").is_file()
-    run_report(write_rows(tmp_path, THOUSAND[:9]), ReportConfig(out=out))
-    assert sorted(path.name for path in out.iterdir()) == [
-        "accuracy.png",
-        "errors.png",
-        "report.html",
-        "times.png",
-    ]
+    assert (out / "accuracy.png").is_file()
+    run_report(write_rows(tmp_path, THOUSAND[:1]), ReportConfig(out=out))
+    assert sorted(path.name for path in out.iterdir()) == ["report.html", "times.png"]
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
@@ -128,27 +159,6 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"rows\.csv/times\.png: cannot be written: "):
         run_report(path, ReportConfig(out=path))
     assert path.read_bytes() == before
-
-
-def test_an_svg_is_made_fit_for_the_page() -> None:
-    """Ids and references get the prefix, global styles and metadata are removed, marks share one style."""
-    svg = b"""<?xml version="1.0"?><!DOCTYPE svg>
-    <svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" viewBox="0 0 4 3">
-      <metadata>made today</metadata>
-      <defs><style>* {fill: red}</style><path id="dot" d="M 0.123456 1"/></defs>
-      <g id="points">
-        <use xlink:href="#dot" x="1.987654" style="fill: blue"/><use xlink:href="#dot" style="fill: blue"/>
-      </g>
-      <g clip-path="url(#box)"><text style="a">1 &lt; 2</text></g>
-    </svg>"""
-    assert inline(svg, "times", "Time & size") == (
-        '<svg viewBox="0 0 4 3" role="img" aria-labelledby="times-title">'
-        '<title id="times-title">Time &amp; size</title>'
-        '<defs><path id="times-dot" d="M 0.12 1" /></defs>'
-        '<g id="times-points" style="fill: blue"><use href="#times-dot" x="1.99" /><use href="#times-dot" />'
-        "</g>"
-        '<g clip-path="url(#times-box)"><text style="a">1 &lt; 2</text></g></svg>'
-    )
 
 
 def test_a_path_that_is_not_a_run_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -169,22 +179,34 @@ def test_a_path_that_is_not_a_run_is_named(tmp_path: Path, capsys: pytest.Captur
     assert find_source(tmp_path / "empty") == tmp_path / "empty" / "trace.jsonl"
 
 
-def test_a_trace_of_several_kinds_needs_the_flag_kind(tmp_path: Path) -> None:
-    """Without --kind the error lists the kinds, as in `loadgen table`; with it one kind is shown."""
+def test_tables_of_several_kinds_need_the_flag_kind(tmp_path: Path) -> None:
+    """Without --kind the page shows all tasks, and says why it has no tables; with it one kind is shown."""
     path = trace_of(tmp_path, *[("pinned", "cloud", {"onboard": 0.2, "cloud": 0.1}, 0.2)] * 4)
     lines = path.read_text().splitlines()
     path.write_text("\n".join([*lines[:2], *(line.replace('"plan"', '"walk"') for line in lines[2:]), ""]))
-    with pytest.raises(DataError, match=r"several kinds: plan .* choose one with --kind"):
-        run_report(path, ReportConfig(out=tmp_path))
-    run_report(path, ReportConfig(out=tmp_path, kind="walk"))
-    assert "2 tasks were measured on both sites" in (tmp_path / "report.html").read_text()
+    run_report(path, ReportConfig(out=tmp_path))
+    text = (tmp_path / "report.html").read_text()
+    assert re.search(r"<p>.* several kinds: plan .* choose one with --kind\.</p>", text)
+    assert {task["kind"] for task in packed_look(text)["tasks"]} == {"plan", "walk"}
+    run_report(path, ReportConfig(out=tmp_path, kind="walk", window=2))
+    text = (tmp_path / "report.html").read_text()
+    assert "2 tasks were measured on both sites" in text
+    assert {task["kind"] for task in packed_look(text)["tasks"]} == {"walk"}
+
+
+def test_sizes_of_several_numbers_are_shown_without_tables(tmp_path: Path) -> None:
+    """The page shows the tasks, and says why it has no tables."""
+    path = trace_of(tmp_path, ("pinned", "cloud", {"onboard": 0.2, "cloud": 0.1}, 0.2))
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"size": [1.0, 2.0]}) + "\n")
+    run_report(path, ReportConfig(out=tmp_path))
+    assert "size: [1.0, 2.0] has several numbers" in (tmp_path / "report.html").read_text()
 
 
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
         ({"predictor": "guess"}, "--predictor: 'guess' is not one of"),
-        ({"predictors": ("huber", "guess")}, "--predictors: 'guess' is not one of"),
+        ({"predictors": ("parts", "guess")}, "--predictors: 'guess' is not one of"),
         ({"policies": ("guess",)}, "--policies: 'guess' is not one of"),
         ({"feedback": "both"}, "--feedback: 'both' is not one of chosen, full"),
         ({"window": 1}, "--window: 1 is below 2"),

@@ -4,15 +4,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from offboard.loadgen import rivals
 from offboard.loadgen.report import chart_data, charts
-from offboard.loadgen.report.captions import all_charts
-from offboard.loadgen.report.chart_styles import LOOKS, policy_look
-from offboard.loadgen.report.findings import Findings
-from offboard.loadgen.report.report import ReportConfig, facts
+from offboard.loadgen.report.chart_styles import COLOURS, LOOKS, NEUTRAL, PRINTED, RUN_LOOKS
+from offboard.loadgen.report.findings import Findings, all_charts
+from offboard.loadgen.report.report import ReportConfig, about, facts
 from tests.reports import CHARTS, write_rows
 from tests.table_loops import THOUSAND, Line
 from tests.unit.test_replay import trace_of
@@ -92,13 +89,8 @@ def test_the_caption_says_where_the_lines_cross(
 
 @pytest.mark.parametrize("feedback", ["chosen", "full"])
 def test_charts_and_tables_agree(found: Callable[..., Findings], feedback: str) -> None:
-    """The replay table and the charts have the same mean time and cloud share of a policy."""
-    findings = found(THOUSAND[:200], window=30, feedback=feedback, policies=("paper", "cloud"))
-    line = findings.replayed.lines[0]
-    assert line.policy == "paper"
-    assert findings.spent_s["paper"].mean() == pytest.approx(line.mean_s, rel=1e-12)
-    assert 100 * findings.decisions.to_cloud.mean() == pytest.approx(line.cloud_percent)
-    assert findings.decisions.number.tolist() == list(range(31, 201))
+    """The charts over N show the lines of Table II that have the feedback of the report."""
+    findings = found(THOUSAND[:200], window=30, feedback=feedback)
     assert (len(findings.scores), findings.scores[0].window) == (8 + 1 + 3, "5")
     assert [table.about["feedback"] for table in findings.evaluated] == ["chosen", "full"]
     wanted = findings.evaluated[("chosen", "full").index(feedback)].lines
@@ -109,7 +101,7 @@ def test_charts_and_tables_agree(found: Callable[..., Findings], feedback: str) 
     ("rows", "expected"),
     [
         ([(1, 1, 2)], ["times"]),
-        ([(1, 1, 2), (2, 2, 2), (3, 3, 2)], ["times", "errors", "accuracy"]),
+        ([(1, 1, 2), (2, 2, 2), (3, 3, 2)], list(CHARTS)),
         ([(2.0, 0.1 + 0.01 * (i % 7), 0.12) for i in range(60)], list(CHARTS)),
         ([(1.0 + i % 5, 0.1, 0.05 + 0.03 * (i % 5)) for i in range(60)], list(CHARTS)),
         ([(1.0 + i % 5, 0.0, 0.0) for i in range(60)], list(CHARTS)),
@@ -133,50 +125,59 @@ def test_odd_data_is_drawn_or_the_caption_says_why_not(
 
 
 def test_the_caption_says_how_many_points_are_drawn(found: Callable[..., Findings]) -> None:
-    """Of 1,500 rows and 1,450 decisions 1,000 are drawn; the lines fit all rows."""
+    """Of 1,500 rows 1,000 are drawn; the lines fit all rows."""
     findings = found((THOUSAND * 2)[:1500])
     said = captions(findings)
     assert said["times"].startswith("The same 1,500 tasks on both sites.")
     assert said["times"].endswith("1,000 of 1,500 points are drawn.")
-    assert said["decisions"].endswith("1,000 of 1,450 points are drawn.")
     svg = charts.draw("times", findings.times).svg.decode()
     marks = svg[svg.index('id="points-cloud"') : svg.index('id="line-onboard"')]
     assert marks.count("<use") == chart_data.POINTS_MAX
     assert findings.times.cloud == chart_data.fit(findings.rows.size, findings.rows.cloud_s)
 
 
-def test_a_trace_with_one_run_per_task_shows_its_decisions(
-    found: Callable[..., Findings], tmp_path: Path
-) -> None:
-    """Decisions and times are drawn as recorded; the other charts say that no task ran on both sites."""
+def test_a_trace_without_rows_for_the_paper_says_so(found: Callable[..., Findings], tmp_path: Path) -> None:
+    """The figures are those of the decisions, and the page says what the charts of the paper would need."""
     sites = ["onboard", "cloud", "cloud"] * 4
     findings = found(trace_of(tmp_path, *(("paper", site, {site: 0.1}, 0.2) for site in sites)))
-    assert drawn(findings) == ["decisions", "ecdf"]
-    assert findings.decisions.policy == "as recorded"
-    assert findings.decisions.to_cloud.tolist() == [site == "cloud" for site in sites]
-    assert list(findings.spent_s) == ["as recorded"]
-    said = captions(findings)
-    assert said["times"] == "Not drawn: no task ran on both sites."
-    assert "12 tasks as recorded, with the robot's own predictor and N; feedback chosen." in said["decisions"]
-    assert findings.evaluated == []
-    assert facts(findings) == {}
+    assert drawn(findings) == []
+    assert not findings.for_paper
+    assert about(findings) == (
+        "12 tasks were decided live. 0 tasks were measured on both sites. "
+        "The charts and tables of the paper need more than N = 50 of these (--window)."
+    )
+    assert facts(findings) == {
+        "Mean time as recorded": "200.0 ms",
+        "P95 as recorded": "200.0 ms",
+        "P99 as recorded": "200.0 ms",
+        "Sent to the cloud": "67 % of tasks",
+    }
 
 
 def test_captions_say_how_the_figures_were_computed(found: Callable[..., Findings]) -> None:
     """Predictor, N, feedback and rows are in the caption of every chart that depends on them."""
-    findings = found(THOUSAND[:60], window=20, feedback="full", predictors=("theil-sen",))
+    findings = found(THOUSAND[:60], window=20, feedback="full", predictors=("parts",))
     said = captions(findings)
-    replayed = "Replay of 40 of 60 rows, after a warm-up of N = 20; predictor least-squares, feedback full."
-    assert said["decisions"].endswith(replayed)
-    assert said["ecdf"].endswith(replayed)
     for name in ("errors", "accuracy"):
-        assert said[name].endswith("60 rows for every N; predictors least-squares, theil-sen; feedback full.")
+        assert said[name].endswith("60 rows for every N; predictors least-squares, parts; feedback full.")
 
 
-def test_every_policy_has_its_own_look(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each policy has its own colour and line style, also policies that are added later."""
-    later = tuple(f"later-{number}" for number in range(6))
-    monkeypatch.setattr(rivals, "RULES", ("paper", "onboard", "cloud", *later))
-    looks = [*LOOKS.values(), *map(policy_look, later)]
-    assert len({look.colour for look in looks}) == len({str(look.line) for look in looks}) == len(looks)
-    assert charts.draw("ecdf", {name: np.array([0.1, 0.2]) for name in ("paper", *later)}).png
+def test_sites_and_runs_can_be_told_apart() -> None:
+    """Each site, and each run of a comparison, has its own colour and its own line style."""
+    for looks in (tuple(LOOKS.values()), RUN_LOOKS):
+        assert len({look.colour for look in looks}) == len({str(look.line) for look in looks}) == len(looks)
+
+
+def test_all_charts_have_the_palette_of_the_page() -> None:
+    """Onboard is blue and the cloud orange, as in `live.css`; on white each colour has a contrast of 3:1."""
+    assert (LOOKS["onboard"].colour, LOOKS["cloud"].colour) == ("#0072b2", "#d55e00")
+    used = {look.colour for look in (*LOOKS.values(), *RUN_LOOKS, PRINTED, NEUTRAL)}
+    assert used <= set(COLOURS.values())
+    assert min(1.05 / (luminance(colour) + 0.05) for colour in used) > 3
+
+
+def luminance(colour: str) -> float:
+    """The relative luminance of WCAG 2.2."""
+    parts = [int(colour[at : at + 2], 16) / 255 for at in (1, 3, 5)]
+    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+    return sum(share * part for share, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))

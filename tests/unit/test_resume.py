@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from offboard.loadgen.compare.resume import played_before
+from offboard.loadgen.compare.runs import played_before
 from offboard.loadgen.play.play_scenario import judge, write_summary
 from offboard.loadgen.play.run_digest import digests, of_scenario, of_software
 from offboard.loadgen.play.run_files import SUMMARY
@@ -80,7 +80,7 @@ def test_a_run_that_the_host_disturbed_is_played_again(finished: Path) -> None:
         (replace(SCENARIO, seed=2), "local"),
         (SCENARIO.changed(tasks=TASKS - 1), "local"),
         (SCENARIO.changed(policy="cloud"), "local"),
-        (SCENARIO.changed(predictor="huber"), "local"),
+        (SCENARIO.changed(predictor="least-squares"), "local"),
         (SCENARIO.changed(reference=1), "local"),
         (replace(SCENARIO, robot=RobotPart(cpus=0.3)), "local"),
         (replace(SCENARIO, link={"delay_ms": 16}), "local"),

@@ -3,36 +3,29 @@
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from dataclasses import replace
 from queue import Queue
+from typing import Any
 
 import numpy as np
 import pytest
 
-from offboard.common.errors import Overtaken, Unwanted
+from offboard.common.errors import Overtaken
 from offboard.common.planning.maps import GridMap
 from offboard.common.planning.planner import Point, Pose, plan_path
-from offboard.common.tasks import Task, task
-from offboard.common.wanted import check_wanted
+from offboard.common.tasks import Task
 from offboard.robot_client import policies
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.settings import Settings
 from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import CLOUD, Execution
-from offboard.ros2.diagnostics import WARN, Diagnostics
-from offboard.ros2.planner_server import Goal, Limits, Outcome, PlannerServer, seen_from
-from offboard.ros2.stop import Stop, StoppableClock, StoppableRunner, connect
+from offboard.ros2.parameters import Parameters
+from offboard.ros2.planner_server import Goal, Outcome, PlannerServer, seen_from
+from offboard.ros2.topics import WARN, Diagnostics
 from offboard.ros2.world import View, World
 from tests.fakes import ScriptedRunner
 
 WAIT_S = 50.0
-begun = threading.Event()
-
-
-@task("waits_for_stop", size=lambda: 1.0)
-def waits_for_stop() -> None:
-    begun.set()
-    while True:
-        check_wanted()
 
 
 class DeafRunner(ScriptedRunner):
@@ -42,6 +35,7 @@ class DeafRunner(ScriptedRunner):
         super().__init__(CLOUD, lambda _: Execution(CLOUD, 0.0))
         self.futures: dict[int, Future[Execution]] = {}
         self.asked = threading.Semaphore(0)  # once for each task
+        self.stopped = threading.Semaphore(0)  # once for each cancel
 
     def submit(self, task: Task, budget_s: float) -> "Future[Execution]":  # noqa: ARG002 - never in time
         self.tasks.append(task)
@@ -52,6 +46,7 @@ class DeafRunner(ScriptedRunner):
     def cancel(self, task: Task) -> None:
         super().cancel(task)
         self.futures[task.id].set_result(Execution(CLOUD, 0.1, failure=Overtaken("cancelled"), censored=True))
+        self.stopped.release()
 
 
 @pytest.fixture
@@ -63,10 +58,9 @@ def cloud() -> DeafRunner:
 def stoppable(cloud: DeafRunner) -> Iterator[Offloader]:
     """An offloader whose cloud is deaf, pinned there by the policy of always using it."""
     made = Offloader(
-        [StoppableRunner(OnboardRunner()), StoppableRunner(cloud)],
+        [OnboardRunner(), cloud],
         policy=policies.make("cloud"),
         memories=Settings(window=5).make_memories("cloud"),
-        clock=StoppableClock(),
         timeout_s=10 * WAIT_S,  # only a stop ends a goal
     )
     with made:
@@ -75,9 +69,7 @@ def stoppable(cloud: DeafRunner) -> Iterator[Offloader]:
 
 @pytest.fixture
 def onboard() -> Iterator[Offloader]:
-    with connect(
-        None, policy="paper", timeout_s=1.0, keys=None, settings=Settings(window=5), observers=[]
-    ) as offload:
+    with Offloader.connect(policy="paper", timeout_s=1.0, settings=Settings(window=5)) as offload:
         yield offload
 
 
@@ -86,9 +78,10 @@ def served() -> Iterator[Callable[..., tuple[PlannerServer, World]]]:
     """Factory: a planner server with its world."""
     made: list[PlannerServer] = []
 
-    def factory(offload: Offloader, **limits: object) -> tuple[PlannerServer, World]:
+    def factory(offload: Offloader, **given: Any) -> tuple[PlannerServer, World]:
         world = World(allow_unknown=True)
-        made.append(PlannerServer(offload, world, Limits(**limits)))  # type: ignore[arg-type]
+        parameters = replace(Parameters.read(lambda _, default: default), **given)
+        made.append(PlannerServer(offload, world, parameters))
         return made[-1], world
 
     yield factory
@@ -189,6 +182,7 @@ def test_a_new_goal_replaces_the_one_before(stoppable: Offloader, served: Served
     for outcomes in (first, second):
         outcome = outcomes.get(timeout=WAIT_S)
         assert (outcome.ending, outcome.message) == ("aborted", "a newer goal replaced this one")
+    assert cloud.stopped.acquire(timeout=WAIT_S)
     assert cloud.cancelled[0] is cloud.tasks[0]
     assert cloud.asked.acquire(timeout=WAIT_S)
     server.cancel(last)
@@ -206,25 +200,6 @@ def test_a_closed_server_ends_its_goal(stoppable: Offloader, served: Served, clo
     assert cloud.asked.acquire(timeout=WAIT_S)
     server.close()
     assert outcomes.get(timeout=WAIT_S).message == "the planner server ends"
-
-
-def test_a_stopped_onboard_run_ends(stoppable: Offloader) -> None:
-    """A stop ends a call that runs onboard; calls of other threads go on."""
-    stop, ended = Stop(), Queue[BaseException]()
-
-    def call() -> None:
-        try:
-            with stop.within():
-                stoppable(waits_for_stop, where="onboard")
-        except Unwanted as error:
-            ended.put(error)
-
-    threading.Thread(target=call, daemon=True).start()
-    assert begun.wait(WAIT_S)
-    stop.stop()
-    assert str(ended.get(timeout=WAIT_S)) == "the goal was stopped"
-    stop.stop()
-    assert stop.stopped
 
 
 def test_a_scan_from_elsewhere_is_left_out() -> None:

@@ -15,11 +15,9 @@ from offboard.common.planning.planner import Pose, Scan
 from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.settings import Settings
 from offboard.ros2 import converters as ros
-from offboard.ros2.diagnostics import Diagnostics
 from offboard.ros2.parameters import Parameters, read_arguments
 from offboard.ros2.planner_server import Outcome
-from offboard.ros2.stop import connect
-from offboard.ros2.topics import SameFrames, Topics
+from offboard.ros2.topics import Diagnostics, SameFrames, Topics
 
 WAIT_S = 50.0
 PLAIN = ros.Library(lambda name: SimpleNamespace, lambda values: values)  # noqa: ARG005 - one class for all
@@ -42,8 +40,8 @@ def facts() -> Diagnostics:
 
 @pytest.fixture
 def offload(facts: Diagnostics) -> Iterator[Offloader]:
-    with connect(
-        None, policy="paper", timeout_s=1.0, keys=None, settings=Settings(window=5), observers=[facts]
+    with Offloader.connect(
+        policy="paper", timeout_s=1.0, settings=Settings(window=5), observers=[facts]
     ) as made:
         yield made
 
@@ -158,10 +156,10 @@ def test_parameters_are_read_from_the_command_line() -> None:
     read = read_arguments(
         ["--ros-args", "-p", "planner_plugins:=[A,B]", "-p", "A.tolerance:=0.25", "--param", "costmap:=true"]
     )
-    assert read.limits.planners == ("A", "B")
-    assert read.limits.tolerance_m == 0.25
+    assert read.planners == ("A", "B")
+    assert read.tolerance_m == 0.25
     assert read.costmap
-    assert read_arguments([]).limits.radius_m == 0.1
+    assert read_arguments([]).radius_m == 0.1
 
 
 @pytest.mark.parametrize(

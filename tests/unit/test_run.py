@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from offboard.common.errors import TaskFailed
-from offboard.common.text.wording import duration
+from offboard.common.wording import duration
 from offboard.loadgen.robot import answers as answers_file
 from offboard.loadgen.robot import run as run_module
 from offboard.loadgen.robot.answers import Answers

@@ -1,5 +1,6 @@
 """`loadgen report A B`: one page about several runs."""
 
+import base64
 import json
 import re
 from pathlib import Path
@@ -47,9 +48,10 @@ def test_runs_are_compared_on_one_page(tmp_path: Path, capsys: pytest.CaptureFix
         ["a", "paper", "4", "200.0", "1.000", "200.0", "200.0", "75.0", "0", "12.5", "–"],  # noqa: RUF001
         ["b", "default", "4", "100.0", "0.500", "100.0", "100.0", "75.0", "0", "12.5", "–"],  # noqa: RUF001
     ]
-    assert page.count('id="runs-run-1"') + page.count('id="runs-run-2"') == 2
-    assert re.findall(r'<figure id="([\w-]+)">', page) == ["runs", "plan-1"]
-    assert '<img src="data:image/png;base64,' in page
+    (chart,) = re.findall(r'<img src="data:image/svg\+xml;base64,([^"]+)"', page)
+    assert re.findall(rb'<g id="(run-\d)">', base64.b64decode(chart)) == [b"run-1", b"run-2"]
+    assert re.findall(r'<figure id="picture-([\w-]+)">', page) == ["runs", "plan-1"]
+    assert page.count('<img src="data:image/png;base64,') == 1
     assert "A plan on the map, b" in page
 
 
@@ -68,7 +70,7 @@ def test_a_report_on_one_run_shows_its_plan(tmp_path: Path) -> None:
     last.write()
     assert main(["report", str(run)]) == 0
     page = (run / "report.html").read_text()
-    assert re.findall(r'<figure id="([\w-]+)">', page)[-1] == "plan"
+    assert re.findall(r'<figure id="picture-([\w-]+)">', page) == ["plan"]
     assert page.count("data:image/png;base64,") == 1
 
 

@@ -2,17 +2,18 @@
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
 from offboard.common.errors import DataError
 from offboard.loadgen.replay.recorded_tasks import RecordedTask, read_tasks
-from offboard.loadgen.replay.replay import ReplayConfig, tables
-from offboard.loadgen.replay.same_decisions import compare, same
-from offboard.loadgen.replay.virtual_robot import VirtualRobot
+from offboard.loadgen.replay.replay import tables
+from offboard.loadgen.replay.replay_settings import ReplayConfig
+from offboard.loadgen.replay.virtual_robot import VirtualRobot, compare, same
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
-from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks, find_tasks
+from offboard.loadgen.simulation.model.task_costs import RobotTasks, find_tasks
 from offboard.loadgen.simulation.simulated_run import simulate
 from offboard.robot_client import policies
 from offboard.robot_client.policies import Decision, Hedge, Probe
@@ -44,7 +45,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
         trace = Trace(path)
         simulate(scenario, known[name, seed], trace=trace)
         trace.close()
-        path.with_name("summary.json").write_text(json.dumps({"decided_by": scenario.decided_by()}))
+        path.with_name("summary.json").write_text(json.dumps({"decided_by": asdict(scenario.decided_by)}))
         return path
 
     return factory

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from offboard.loadgen.claims.claims_settings import ClaimsConfig
-from offboard.loadgen.claims.prediction_claims import right
-from offboard.loadgen.claims.sample_order import CLAIM, _sampled, sample_order
+from offboard.loadgen.claims.claim import ClaimsConfig
+from offboard.loadgen.claims.correlation_claims import IN_SEQUENCE, _sampled, sample_order
 from offboard.loadgen.table.measured_rows import Rows
-from offboard.loadgen.table.predictor_evaluation import Evaluation
 from offboard.loadgen.table.table_settings import FULL, TableConfig
+from offboard.loadgen.table.table_two import Evaluation
 
 COUNT = 400
 CONFIG = ClaimsConfig(predictors=("least-squares",), seed=3)
@@ -33,7 +32,7 @@ def test_neighbours_that_share_a_load_favour_sequential_samples() -> None:
         for other in ("shuffled", "random")
         for figure in ("r cloud", "r onboard", "accuracy")
     ]
-    assert {(one.number, one.agrees) for one in found} == {(CLAIM, "yes")}
+    assert {(one.number, one.agrees) for one in found} == {(IN_SEQUENCE, "yes")}
 
 
 def test_independent_rows_favour_none() -> None:
@@ -50,12 +49,12 @@ def test_sequential_samples_predict_as_loadgen_table_does() -> None:
     sampled = _sampled(
         rows, 20, lambda at, _: at[:, np.newaxis] - np.arange(20, 0, -1), np.random.default_rng(0)
     )
-    assert sampled.right.tolist() == right(table).tolist()
+    assert sampled.right.tolist() == table.right.tolist()
 
 
 def test_samples_never_hold_the_row_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither a shuffled table nor random samples show a row its own time, and no row is drawn twice."""
-    from offboard.loadgen.claims import sample_order as module
+    from offboard.loadgen.claims import correlation_claims as module
 
     at, random = np.arange(20, 60), np.random.default_rng(0)
     monkeypatch.setattr(module, "DRAWS", 1)

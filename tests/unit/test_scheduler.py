@@ -2,7 +2,7 @@
 
 import pytest
 
-from offboard.cloud_server.executors.task_run import Outcome
+from offboard.cloud_server.executors.executor import Outcome
 from offboard.cloud_server.scheduler import CRASHED_KEPT, CRASHES_MAX, FAILURES_KEPT, CrashCount, FailureLog
 
 
@@ -27,7 +27,7 @@ def test_the_memory_of_crashes_is_limited() -> None:
         crashes.note(b"robot", id)
     crashes.note(b"robot", 1)
     crashes.note(b"robot", 0)
-    assert len(crashes) == CRASHED_KEPT
+    assert len(crashes._counts) == CRASHED_KEPT
     assert [crashes.too_many(b"robot", id) for id in (1, 2)] == [True, False]
 
 

@@ -13,7 +13,7 @@ from offboard.common.planning import maps, planner, search, workspaces
 from offboard.common.planning.dijkstra import DISTANCE_MAX, PAUSE_CELLS, STRAIGHT
 from offboard.common.planning.map_files import read_map
 from offboard.common.planning.search import Field, Hits
-from offboard.common.wanted import call_while
+from offboard.common.task_call import call_while
 from tests.mazes import BENCHMARKS, benchmark, check, oracle, random_cells, random_maze, serpentine
 
 ROOT = Path(__file__).parents[2]
@@ -182,10 +182,10 @@ def test_idle_workspaces_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len({id(one.__enter__()) for one in borrowed}) == 5
     for one in borrowed:
         one.__exit__(None, None, None)
-    assert len(pool) == 2
+    assert len(pool._idle) == 2
     with pytest.raises(KeyError), pool.borrow():
         raise KeyError
-    assert len(pool) == 1
+    assert len(pool._idle) == 1
 
 
 def test_a_search_stops_if_nobody_waits_for_it() -> None:

@@ -13,7 +13,7 @@ from offboard.loadgen.scenario.outcome_figures import FIGURES, site_percent
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import read_scenario
 from offboard.loadgen.scenario.site_shares import share_lines, site_shares
-from offboard.loadgen.simulation.model.simulated_tasks import find_tasks
+from offboard.loadgen.simulation.model.task_costs import find_tasks
 from offboard.loadgen.simulation.simulated_run import simulate
 from offboard.loadgen.testbed.container_part import addresses
 from offboard.loadgen.testbed.local_testbed import LocalTestbed

@@ -1,15 +1,16 @@
 """Who reads the socket: a caller that waits alone, otherwise the thread; no answer is left unread."""
 
 import threading
+import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent import futures
 from concurrent.futures import CancelledError
 
 import pytest
 
-from offboard.robot_client.sites import shared_reader
-from offboard.robot_client.sites.clock import SystemClock
-from offboard.robot_client.sites.shared_reader import Answer, SharedReader
+from offboard.robot_client.sites import waiting
+from offboard.robot_client.sites.waiting import Answer, SharedReader, SystemClock
 
 LONG_S = 30.0  # a test that loses an answer fails after this time
 
@@ -73,7 +74,7 @@ class Line:
 @pytest.fixture
 def line(monkeypatch: pytest.MonkeyPatch) -> Iterator[Line]:
     """A line whose thread stays away once callers read, unless a test calls it back."""
-    monkeypatch.setattr(shared_reader, "LINGER_S", LONG_S)
+    monkeypatch.setattr(waiting, "LINGER_S", LONG_S)
     line = Line()
     line.thread.start()
     yield line
@@ -130,7 +131,7 @@ def test_the_thread_reads_what_a_caller_no_longer_waits_for(line: Line) -> None:
     """An answer that comes after its caller gave up is read."""
     line.answered(0), line.answered(1)
     late = line.ask(2)
-    with pytest.raises(TimeoutError):
+    with pytest.raises(futures.TimeoutError):
         late.result(0.01)
     taken = threading.Event()
     late.add_done_callback(lambda _: taken.set())
@@ -143,16 +144,28 @@ def test_an_interrupt_reaches_a_caller_that_reads(line: Line) -> None:
     """The caller wakes up, does what is due, and reads on."""
     line.answered(0), line.answered(1)
     answer, before = line.ask(2), line.tended
-    threading.Timer(0.02, line.reader.interrupt).start()
-    threading.Timer(0.1, line.arrive, (2,)).start()
+
+    def interrupt() -> None:
+        wait_until(lambda: line.tended > before)
+        line.reader.interrupt()
+        wait_until(lambda: line.tended > before + 1)
+        line.arrive(2)
+
+    threading.Thread(target=interrupt, daemon=True).start()
     assert answer.result(LONG_S) == 2
     assert line.tended >= before + 2
+
+
+def wait_until(holds: Callable[[], bool]) -> None:
+    end_s = time.monotonic() + LONG_S
+    while not holds() and time.monotonic() < end_s:
+        time.sleep(0.001)
 
 
 def test_the_thread_comes_back_when_no_caller_reads(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
     """After LINGER_S the thread reads what no caller asked for, for example that the connection is lost."""
     line.answered(0), line.answered(1)
-    monkeypatch.setattr(shared_reader, "LINGER_S", 0.01)
+    monkeypatch.setattr(waiting, "LINGER_S", 0.01)
     line.reader.interrupt()
     line.waiting[2] = unasked = Answer[int](line.reader)
     line.arrive(2)

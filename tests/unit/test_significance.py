@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from offboard.loadgen.claims.claims_settings import ClaimsConfig
-from offboard.loadgen.claims.significance import P_MAX, p_value, significance, smallest_significant_r
+from offboard.loadgen.claims.claim import ClaimsConfig
+from offboard.loadgen.claims.correlation_claims import P_MAX, p_value, significance, smallest_significant_r
 from offboard.loadgen.table.measured_rows import Rows
 
 

@@ -12,13 +12,12 @@ from offboard.loadgen.scenario.outcome import Outcome
 from offboard.loadgen.scenario.outcome_figures import FIGURES
 from offboard.loadgen.scenario.scenario import Scenario
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
-from offboard.loadgen.simulation.model.simulated_tasks import RobotTasks, find_tasks
-from offboard.loadgen.simulation.model.task_costs import DECIDING_CPU_S, HASH, START_S
+from offboard.loadgen.simulation.model.task_costs import DECIDING_CPU_S, HASH, START_S, RobotTasks, find_tasks
 from offboard.loadgen.simulation.simulated_run import simulate
 from offboard.loadgen.simulation.simulated_testbed import check_simulated
 from offboard.loadgen.simulation.simulation_pool import SimulationPool
 from offboard.loadgen.testbed.testbed import ROBOT
-from offboard.robot_client.sites.cloud_socket import RECONNECT_MAX_MS
+from offboard.robot_client.cloud.cloud_socket import RECONNECT_MAX_MS
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.mazes import warm
 
@@ -30,6 +29,7 @@ sizes = ["{sizes}"]
 tasks = 60
 {workload}
 [robot]
+{robot}
 cpus = 0.2
 window = 5
 timeout = 0.5
@@ -43,9 +43,11 @@ bandwidth_mbps = 8
 def read(tmp_path: Path) -> Callable[..., Scenario]:
     """Reads a scenario that consists of HEAD and the given text."""
 
-    def factory(text: str = "", workload: str = "", sizes: str = "uniform:1000:30000") -> Scenario:
+    def factory(
+        text: str = "", workload: str = "", sizes: str = "uniform:1000:30000", robot: str = ""
+    ) -> Scenario:
         path = tmp_path / "small.toml"
-        path.write_text(HEAD.format(workload=workload, sizes=sizes) + text)
+        path.write_text(HEAD.format(workload=workload, sizes=sizes, robot=robot) + text)
         return read_scenario(path)
 
     return factory
@@ -141,6 +143,16 @@ def test_heartbeats_can_be_switched_on_and_off(read: Callable[..., Scenario]) ->
     assert paper != beating
     assert played(scenario.changed(heartbeats=True), "paper") == beating
     assert played(scenario.changed(heartbeats=False), "paper-with-heartbeats") == paper
+
+
+def test_limits_of_the_robot_hold(read: Callable[..., Scenario]) -> None:
+    """Without second runs none is probed or hedged. A cap of no bytes keeps known tasks off the server."""
+    default = played(read(), "default")
+    assert max(len(one.sites) for one in default.answered[30:]) == 2
+    none = played(read(robot="duplicates = 0.0"), "default")
+    assert max(len(one.sites) for one in none.answered[30:]) == 1
+    capped = played(read(robot="bytes_a_minute = 0.0"), "default")
+    assert {one.sites for one in capped.answered[30:]} == {("onboard",)}
 
 
 def test_a_dead_server_is_not_used_until_it_is_back(read: Callable[..., Scenario]) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from offboard.loadgen.__main__ import main
-from offboard.loadgen.compare.simulated_tables import summary_table
+from offboard.loadgen.compare.compare import summary_table
 from offboard.loadgen.table.table_formats import FORMATS, Table, render
 
 TABLES = (
@@ -100,7 +100,7 @@ def test_a_scenario_without_an_oracle_is_left_out_of_the_mean() -> None:
             "--testbed: docker cannot be combined with --simulate",
         ),
         (["soak", "--simulate"], "scenario soak cannot be simulated: link condition truncate_bytes"),
-        (["clam", "--simulate"], "scenario 'clam' is neither a file nor one of"),
+        (["clam", "--simulate"], "unknown scenario 'clam'; did you mean 'calm'?"),
         (["calm", "--simulate", "--from-task", "500"], "--from-task: 500 is not among the 120 tasks"),
     ],
 )

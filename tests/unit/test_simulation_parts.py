@@ -1,22 +1,21 @@
 """The parts of a simulation: CPU, server, link and onboard times, and races that can be computed by hand."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from offboard.common.errors import Overtaken
-from offboard.common.host.load import SERVER_EVERY_S
+from offboard.common.load import SERVER_EVERY_S
 from offboard.loadgen.relay.link.link import LinkConditions
 from offboard.loadgen.scenario.event_timeline import Event
 from offboard.loadgen.scenario.scenario import CloudPart
 from offboard.loadgen.scenario.scenario_file import read_scenario
+from offboard.loadgen.simulation.model.simulated_connection import Message, SimulatedDirection
 from offboard.loadgen.simulation.model.simulated_cpu import Run, SimulatedCpu
-from offboard.loadgen.simulation.model.simulated_direction import Message, SimulatedDirection
 from offboard.loadgen.simulation.model.simulated_server import SimulatedServer
-from offboard.loadgen.simulation.model.simulated_tasks import find_tasks
-from offboard.loadgen.simulation.model.task_costs import HASH
-from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
+from offboard.loadgen.simulation.model.task_costs import HASH, find_tasks
 from offboard.loadgen.simulation.simulated_testbed import SimulatedTestbed
 from offboard.loadgen.testbed.testbed import ROBOT
 from offboard.robot_client import predictors
@@ -25,6 +24,7 @@ from offboard.robot_client.offloader import Offloader
 from offboard.robot_client.policies import Decision, Forecast, Hedge, Probe
 from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.heartbeat import ServerReport
+from offboard.testing.virtual_clock import VirtualClock
 
 SMALL = """name = "small"
 [workload]
@@ -120,7 +120,7 @@ def test_an_outage_holds_messages_and_a_hang_loses_them() -> None:
     assert seen == [pytest.approx(0.2)]  # 0.1 s at the bandwidth, 0.1 s of delay
     direction.change(LinkConditions(outage=True))
     clock.pass_by(1.0)
-    assert direction.due_s(Message(1, "m", 9), clock.now_s()) is None
+    assert direction.due_s(Message(1, "m", 9), clock.now_s()) == math.inf
     assert direction.change(plain)
     assert seen == [pytest.approx(0.2), pytest.approx(1.25)]
     direction.change(LinkConditions(hang=True))

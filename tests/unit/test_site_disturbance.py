@@ -9,7 +9,7 @@ import pytest
 from offboard.common.errors import CloudTimeout, DataError
 from offboard.loadgen.play.run_files import TRACE
 from offboard.loadgen.robot_files import alone_path
-from offboard.loadgen.table.site_disturbance import ALONE, Change, Disturbance, measure
+from offboard.loadgen.table.measurement_notes import ALONE, Change, Disturbance, measure
 from offboard.robot_client.policies import Decision
 from offboard.robot_client.records.record import Record, as_dict
 from offboard.robot_client.records.trace import Trace

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from offboard.loadgen.play.stolen_cpu_time import STAT, StolenCpuTime
+from offboard.loadgen.play.machine import STAT, StolenCpuTime
 
 
 def stat(user: int, idle: int, steal: int) -> str:

@@ -92,7 +92,7 @@ def test_a_missing_library_is_named(print_table: Print, monkeypatch: pytest.Monk
 
 def test_several_predictors_share_one_table(print_table: Print) -> None:
     """With several predictors a column names them, and the constant rules come once, at the end."""
-    names = ("least-squares", "theil-sen")
+    names = ("least-squares", "parts")
     lines = lines_of(print_table(TWELVE, windows=("3", "full"), predictors=names))
     assert [tuple(line[:2]) for line in lines] == [
         *((name, window) for name in names for window in ("3", "full")),

@@ -5,7 +5,7 @@ import pytest
 from offboard.common.empty_task import EMPTY
 from offboard.common.errors import ConfigError
 from offboard.common.tasks import Kind
-from offboard.robot_client.check.outcome import StepFailed
+from offboard.robot_client.check.network import StepFailed
 from offboard.robot_client.check.task_comparison import PLANNER, compare, load_kinds
 
 

@@ -12,15 +12,15 @@ from offboard.loadgen.compare.compare_settings import CompareConfig
 from offboard.loadgen.compare.comparison_table import comparison_table
 from offboard.loadgen.play.part_setups import setups
 from offboard.loadgen.robot_files import late_executions
-from offboard.loadgen.scenario.outcome import Answered, Outcome
+from offboard.loadgen.scenario.outcome import Answered, Costing, Outcome, Spent
 from offboard.loadgen.scenario.outcome_figures import FIGURES
+from offboard.loadgen.scenario.outcome_files import spent_of
 from offboard.loadgen.scenario.scenario import RobotPart, Scenario, Workload
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
-from offboard.loadgen.scenario.task_cost import Costing, Spent, spent_of
-from offboard.robot_client.policies.objectives import Deadline, Energy, Mean, Tail, TimeAndSpending
+from offboard.robot_client.policies.objectives import Deadline, Mean, Tail, TimeAndSpending
 
 WORKLOAD = Workload(task="m:f", sizes=("constant:1",), deadline_ms=200)
-ENERGY = Energy(compute_w=5.0, idle_w=1.0, radio_j_byte=1e-6)
+ENERGY = {"compute_w": 5.0, "idle_w": 1.0, "radio_j_byte": 1e-6}
 
 
 def execution(site: str, seconds: float, **more: Any) -> dict[str, Any]:
@@ -65,11 +65,11 @@ def test_a_run_onboard_takes_no_cpu_while_it_waits(run: dict[str, Any], cpu_s: f
     ("costing", "expected"),
     [
         (Costing(), 0.3),
-        (Costing("p95"), 0.3),
-        (Costing("deadline", 0.25), 1.0),
-        (Costing("deadline", 0.35), 0.0),
-        (Costing("energy", s_per_joule=2.0, energy=ENERGY), 0.3 + 2.0 * (5.0 * 0.1 + 0.2 + 0.05)),
-        (Costing("metered", s_per_megabyte=4.0, energy=ENERGY), 0.3 + 4.0 * 0.05),
+        (Costing(objective="p95"), 0.3),
+        (Costing(objective="deadline", deadline_s=0.25), 1.0),
+        (Costing(objective="deadline", deadline_s=0.35), 0.0),
+        (Costing(objective="energy", s_per_joule=2.0, **ENERGY), 0.3 + 2.0 * (5.0 * 0.1 + 0.2 + 0.05)),
+        (Costing(objective="metered", s_per_megabyte=4.0, **ENERGY), 0.3 + 4.0 * 0.05),
     ],
 )
 def test_a_task_costs_what_its_objective_weighs(costing: Costing, expected: float) -> None:
@@ -78,15 +78,16 @@ def test_a_task_costs_what_its_objective_weighs(costing: Costing, expected: floa
 
 
 def test_lost_quality_costs_too() -> None:
-    """The whole quality is worth a second; for `deadline`, it is the share that was lost."""
+    """The whole quality is worth a second, or what the robot says. For `deadline` it is the lost share."""
     assert Costing().of_task(0.3, 0.9, Spent()) == pytest.approx(0.4)
-    assert Costing("deadline", 1.0).of_task(0.3, 0.9, Spent()) == pytest.approx(0.1)
+    assert Costing(s_per_quality=3.0).of_task(0.3, 0.9, Spent()) == pytest.approx(0.6)
+    assert Costing(objective="deadline", deadline_s=1.0).of_task(0.3, 0.9, Spent()) == pytest.approx(0.1)
 
 
 def test_a_task_that_failed_has_missed_its_deadline() -> None:
     """However soon its error came; an objective without a deadline counts its time."""
     (failed, *_) = outcome(0.1, Spent(), error="TaskFailed").answered
-    assert failed.cost(Costing("deadline", 1.0)) == 1.0
+    assert failed.cost(Costing(objective="deadline", deadline_s=1.0)) == 1.0
     assert failed.cost(Costing()) == pytest.approx(0.1)
 
 
@@ -131,7 +132,7 @@ def test_a_comparison_judges_all_policies_by_the_objective_of_the_scenario(
     played = {"onboard": [cheap], "cloud": [dear], "default": [cheap], "default+mean": [dear]}
     lines = {line.policy: line for line in comparison_table(scenario, config, played).lines if not line.bound}
     assert lines["default"].cost == pytest.approx(expected)
-    judged = replace(cheap, costing=scenario.costing())
+    judged = replace(cheap, costing=scenario.costing)
     assert FIGURES["cost"].compute(judged) == pytest.approx(expected)
     assert lines["default+mean"].cost_over_constant == pytest.approx(lines["cloud"].cost / expected)
 
@@ -157,9 +158,9 @@ def test_a_cost_is_compared_on_the_tasks_that_both_policies_answered(objective: 
         ({"objective": "deadline", "policy": "default+mean"}, Mean(), {}),
         ({"objective": "deadline", "policy": "paper"}, Mean(), {}),
         (
-            {"objective": "energy", "s_per_joule": 2.0, "compute_watts": 5.0},
+            {"objective": "energy", "s_per_joule": 2.0, "compute_w": 5.0},
             TimeAndSpending(2.0),
-            {"objective": "energy", "s_per_joule": 2.0, "compute_watts": 5.0},
+            {"objective": "energy", "s_per_joule": 2.0, "compute_w": 5.0},
         ),
         (
             {"objective": "metered", "s_per_megabyte": 3.0, "s_per_joule": 2.0},
@@ -173,11 +174,11 @@ def test_a_robot_decides_by_the_objective(
 ) -> None:
     """The simulation gets the objective, a robot process its flags; a policy without costs gets neither."""
     scenario = Scenario("small", 1, WORKLOAD, robot=RobotPart(**robot))
-    found = scenario.objective()
+    found = scenario.settings(1).objective
     assert type(found) is type(objective)
     assert vars(found) == vars(objective)
     given = setups(scenario, tmp_path)["robot"].flags
-    names = ("objective", "deadline", "s_per_joule", "s_per_megabyte", "compute_watts")
+    names = ("objective", "deadline", "s_per_joule", "s_per_megabyte", "compute_w")
     assert {name: given[name] for name in names if name in given}.items() >= flags.items()
     assert ("objective" in given) == bool(flags)
 

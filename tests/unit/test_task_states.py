@@ -11,16 +11,15 @@ import pytest
 
 from offboard.common import task_states
 from offboard.common.errors import ConfigError, Overtaken, TaskFailed
+from offboard.common.task_call import check_wanted
 from offboard.common.task_states import SETUP_AGAIN_S, TaskStates
 from offboard.common.tasks import Task, kind_of, task
-from offboard.common.wanted import check_wanted
-from offboard.robot_client.execution.batch import arguments
 from offboard.robot_client.execution.race import Plan, Race
 from offboard.robot_client.sites import onboard
 from offboard.robot_client.sites.absence import Absent, wait_for_sites
-from offboard.robot_client.sites.clock import SystemClock
 from offboard.robot_client.sites.onboard import OnboardRunner
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Execution, Lasting
+from offboard.robot_client.sites.waiting import SystemClock
 from tests.fakes import ScriptedRunner
 
 WAIT_S = 5.0
@@ -89,7 +88,7 @@ def test_callers_do_not_give_the_state() -> None:
     assert kind.positional == 2
     assert kind.size_of((3, 2)) == 6
     assert list(kind.signature().parameters) == ["number", "scale"]
-    assert arguments(kind, [(3, 2), 4]) == [(3, 2), (4, 1)]
+    assert [kind.bind(kind.arguments_in(item), {}) for item in [(3, 2), 4]] == [(3, 2), (4, 1)]
     with pytest.raises(TypeError, match="missing a required argument: 'number'"):
         kind.bind((), {})
 
@@ -205,7 +204,7 @@ def test_a_site_that_wins_during_a_setup_leaves_no_time_of_it(runner: OnboardRun
         clock,
         WAIT_S,
         begun=lambda _: None,
-        allowed=lambda: True,
+        allowed=lambda _: True,
         late=lambda _, execution: late.append(execution),
     )
     executions = race.run(Plan((ONBOARD, CLOUD)))

@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 
 from offboard.common.errors import BadValue, ConfigError, UnknownTask
-from offboard.common.tasks import kind_named, kind_of, load_modules, task
+from offboard.common.source.task_modules import load_modules
+from offboard.common.tasks import kind_named, kind_of, task
 
 ROOT = Path(__file__).parents[2]
 
@@ -156,8 +157,10 @@ def test_the_source_hash_covers_pack_and_unpack(tmp_path: Path, monkeypatch: pyt
     for module, (to, back) in sources.items():
         text = PACKED.format(name="packed_twice", to=to, back=back)
         (tmp_path / f"{module}.py").write_text(text)
-        code = "import sys; from offboard.common import tasks; tasks.load_modules(sys.argv[1:]); "
-        code += "print(tasks.kind_named('packed_twice').source_hash)"
+        code = (
+            "import sys; from offboard.common import tasks; from offboard.common.source import task_modules; "
+        )
+        code += "task_modules.load_modules(sys.argv[1:]); print(tasks.kind_named('packed_twice').source_hash)"
         done = subprocess.run(
             [sys.executable, "-c", code, module],
             capture_output=True, text=True, check=True, env={"PYTHONPATH": f"{ROOT}:{tmp_path}"},

@@ -1,18 +1,15 @@
-"""Three sites, each failing in turn: which of them the default policy uses, with scripted sites."""
+"""Three sites, each failing in turn: which of them the default policy uses, in virtual time."""
 
+from collections.abc import Callable
 from random import Random
 
 import pytest
 
-from offboard.common.errors import CloudTimeout
-from offboard.common.tasks import Task, task
-from offboard.robot_client import policies
-from offboard.robot_client.offloader import Offloader
+from offboard.common.tasks import task
 from offboard.robot_client.policies.probe import PROBE_EVERY
-from offboard.robot_client.records.record import Record
 from offboard.robot_client.settings import Settings
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD, Condition, Execution
-from tests.fakes import ScriptedRunner
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
+from offboard.testing import Bench
 from tests.phases import EDGE, PHASES, TASKS, WITHIN, check, switch_point
 
 TIMEOUT_S = 0.5
@@ -36,36 +33,31 @@ def test_the_best_living_site_is_used_soon_after_each_change(
     A failing server is a timeout, a failing onboard is slow. One probe of a site that is back does not
     outweigh the timeouts that were learnt of it; a second one does.
     """
-    random, failing = Random(seed), set[str]()
+    random = Random(seed)
 
-    def execution(site: str, one: Task) -> Execution:
+    def seconds(site: str, slowed: float = 1.0) -> Callable[[float], float]:
         trip_s, work_s = SITES[site]
-        if site in failing and site != ONBOARD:
-            return Execution(site, TIMEOUT_S, failure=CloudTimeout("late"), censored=True)
-        slowed = (SLOWED if site in failing else 1.0) * random.uniform(1 - NOISE, 1 + NOISE)
-        run_s = slowed * work_s * one.size
-        seconds = slowed * trip_s + run_s
-        return Execution(site, seconds, one.args[0], queue_s=0.0, run_s=run_s)
+        return lambda size: slowed * random.uniform(1 - NOISE, 1 + NOISE) * (trip_s + work_s * size)
 
-    def runner(site: str) -> ScriptedRunner:
-        return ScriptedRunner(site, lambda one: execution(site, one))
-
-    records: list[Record] = []
-    servers = [runner(EDGE), runner(CLOUD)]
-    with Offloader(
-        [*servers, runner(ONBOARD)],
-        policy=policies.make(policies.DEFAULT),
-        memories=Settings().make_memories(policies.DEFAULT),
-        observers=[records.append],
-    ) as offload:
-        for fail, _ in PHASES:
-            failing = set(fail)
-            for one in servers:
-                silent = heartbeats and one.site in failing
-                one.measured = Condition(SITES[one.site][0], silent=silent, wait_s=float(silent))
+    with Bench(
+        onboard_s=seconds(ONBOARD),
+        cloud_s=seconds(CLOUD),
+        sites={EDGE: seconds(EDGE)},
+        timeout_s=TIMEOUT_S,
+        settings=Settings(heartbeats=heartbeats),
+    ) as bench:
+        for site, server in bench.sites.items():
+            server.round_trip_s = SITES[site][0]
+        for failing, _ in PHASES:
+            for site, server in bench.sites.items():
+                server.dead() if site in failing else server.back()
+            if ONBOARD in failing:
+                bench.onboard.slow(seconds(ONBOARD, SLOWED))
+            else:
+                bench.onboard.back()
             for _ in range(TASKS):
-                offload(sized, random.uniform(0.8, 1.2))
-    check(records, within)
+                bench.offload(sized, random.uniform(0.8, 1.2))
+    check(bench.records, within)
 
 
 def test_a_switch_point_is_the_first_task_after_which_most_are_right() -> None:

@@ -8,10 +8,12 @@ from hypothesis import strategies as st
 
 from offboard.common.errors import ConfigError
 from offboard.loadgen.relay.link.link import Link, LinkConditions
+from offboard.loadgen.relay.tcp.relay import Refusal, RelaySettings
 from offboard.loadgen.relay.toxiproxy.toxics import (
     ATTRIBUTES,
     Refused,
     Toxic,
+    ToxicRelay,
     attributes,
     closes_after_s,
     link_of,
@@ -137,3 +139,10 @@ def test_toxicity_is_the_share_of_connections() -> None:
     struck = [(down.strikes(1, number), up.strikes(1, number)) for number in range(4000)]
     assert sum(hit for hit, _ in struck) / 4000 == pytest.approx(0.3, abs=0.029)
     assert sum(hit and other for hit, other in struck) / 4000 == pytest.approx(0.09, abs=0.018)
+
+
+def test_a_connection_after_the_close_is_refused() -> None:
+    """A connection that the kernel accepted just before the proxy was disabled is closed."""
+    relay = ToxicRelay(("127.0.0.1", 1), RelaySettings(seed=0, connections_max=1, buffer_bytes=1 << 20))
+    assert isinstance(relay.accept(), Refusal)
+    assert not relay.connections

@@ -8,7 +8,7 @@ import resource
 import subprocess
 import sys
 import time
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +53,7 @@ def record(i: int = 0) -> Record:
                 packed=(Packed(1, "zstd", 2000, bytes=400, seconds=0.2),),
                 held_up=True,
             ),
-            Execution(ONBOARD, 0.1, queue_s=0.0, run_s=0.1, network_s=0.0, cpu_s=0.02),
+            Execution(ONBOARD, 0.1, queue_s=0.0, run_s=0.1, network_s=0.0, cpu_s=0.02, after_s=2.0),
         ),
         used=ONBOARD,
         waited_s=2.1,
@@ -63,7 +63,7 @@ def record(i: int = 0) -> Record:
         timeout_s=3.0,
         late=(Late("s-7", Execution(CLOUD, 0.4, run_s=0.3)),),
         regret=Regret(0.01, 0.0, 0.02, 9),
-        started_at=datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC),
+        started_at=datetime(2026, 1, 2, 3, 4, 5, tzinfo=timezone.utc),
         deadline_s=2.0,
         savings=Savings(0.03, 0.02, 0.04, tasks=50, sent=0.5, probes=8, quality_s=0.2),
     )
@@ -72,7 +72,7 @@ def record(i: int = 0) -> Record:
 def ran(site: str, seconds: float, **more: Any) -> dict[str, Any]:
     """An execution as a line holds it."""
     unknown = dict.fromkeys(("error", "queue_s", "run_s", "network_s", "cpu_s"))
-    plain = {"ok": True, "censored": False, "started": True, "held_up": False, "packed": []}
+    plain = {"ok": True, "censored": False, "started": True, "held_up": False, "packed": [], "after_s": 0.0}
     return {"site": site, "seconds": seconds, "bytes_out": 0, "bytes_in": 0} | unknown | plain | more
 
 
@@ -149,9 +149,15 @@ def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
                 packed=[{"argument": 1, "how": "zstd", "raw_bytes": 2000, "bytes": 400, "seconds": 0.2}],
                 held_up=True,
             ),
-            ran("onboard", 0.1, queue_s=0.0, run_s=0.1, network_s=0.0, cpu_s=0.02),
+            ran("onboard", 0.1, queue_s=0.0, run_s=0.1, network_s=0.0, cpu_s=0.02, after_s=2.0),
         ],
         "used": "onboard",
+        "happened": "cloud failed after 2 s (CloudTimeout: late); "
+        "onboard started after 2 s instead; "
+        "onboard answered after 2.1 s; the deadline of 2 s was missed",
+        "cancelled": False,
+        "refused": None,
+        "chunk": None,
         "waited_s": 2.1,
         "deadline_s": 2.0,
         "late": [{"id": "s-7", **ran("cloud", 0.4, run_s=0.3)}],

@@ -1,7 +1,7 @@
 """The types that a user's type checker sees."""
 
 import os
-import shutil
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -9,28 +9,49 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("common", "robot_client")
+PROGRAM = re.compile(r"```python\n# (\w+\.py)\n(.*?)```", re.DOTALL)
+
+pytestmark = pytest.mark.timeout(240)  # mypy reads numpy and the library, once; later runs use its cache
 
 
-@pytest.mark.timeout(240)  # mypy reads numpy and the library, once; later runs use its cache
-def test_a_call_has_the_type_of_its_task(tmp_path: Path) -> None:
-    """A call, a batch and a coroutine return what the function returns, also for a task with a setup."""
-    (tmp_path / "offboard").mkdir()
-    for file in ("__init__.py", "py.typed"):
-        shutil.copy(ROOT / "offboard" / file, tmp_path / "offboard")
-    for package in PACKAGES:  # as in the wheel
-        (tmp_path / "offboard" / package).symlink_to(ROOT / package)
-    done = subprocess.run(
+def check(*files: Path, folder: Path) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run(
         [
             sys.executable,
             *("-m", "mypy", "--strict", "--follow-imports=silent"),
             *("--config-file", ROOT / "pyproject.toml", "--cache-dir", ROOT / ".cache/mypy-calls"),
-            ROOT / "tests/typed_calls.py",
+            *files,
         ],
         capture_output=True,
         text=True,
         timeout=200,
-        cwd=tmp_path,
-        env=os.environ | {"MYPYPATH": str(tmp_path)},
+        cwd=folder,
+        env=os.environ | {"MYPYPATH": f"{ROOT}:{folder}"},
     )
+
+
+def test_a_call_has_the_type_of_its_task(tmp_path: Path) -> None:
+    """A call, a batch and a coroutine return what the function returns, also for a task with a setup."""
+    done = check(ROOT / "tests/typed_calls.py", folder=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_wrong_arguments_are_found(tmp_path: Path) -> None:
+    """Each of ten calls with wrong arguments is one error."""
+    done = check(ROOT / "tests/wrong_calls.py", folder=tmp_path)
+    lines = (ROOT / "tests/wrong_calls.py").read_text().splitlines()
+    wrong = [number for number, line in enumerate(lines, 1) if line.startswith("    ")]
+    found = [int(number) for number in re.findall(r"wrong_calls\.py:(\d+): error", done.stdout)]
+    assert found == wrong, done.stdout + done.stderr
+    assert len(wrong) == 10
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/own_task.md", "docs/offload.md"])
+def test_the_programs_of_a_page_are_typed(tmp_path: Path, page: str) -> None:
+    """`mypy --strict` finds nothing in the programs that users copy."""
+    programs = PROGRAM.findall((ROOT / page).read_text())
+    assert programs
+    for name, text in programs:
+        (tmp_path / name).write_text(text)
+    done = check(*sorted(tmp_path.glob("*.py")), folder=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr

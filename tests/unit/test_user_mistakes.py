@@ -186,7 +186,7 @@ at_most = 1
         (["loadgen", "run", "no-map.toml"], "no-map.toml: workload.map: "),
         (["cloud_server", "--tasks", "json"], "--tasks: json registers no task"),
         (["cloud_server", "--config", "."], ".: Is a directory"),
-        (["loadgen", "run", "none"], "scenario 'none' is neither a file nor one of apriltags, "),
+        (["loadgen", "run", "none"], "unknown scenario 'none'; did you mean 'nonlinear'?"),
         (["loadgen", "run", "text-link.toml"], "text-link.toml: link.delay_ms: 'slow' is not a number"),
         (["loadgen", "run", "open.toml", "--out", "words.txt"], "--out: words.txt cannot be written to"),
         (["loadgen", "wan", "--delay-ms", "-1"], "--delay-ms: -1"),

@@ -13,7 +13,7 @@ from offboard.common.source.comparison import difference
 from offboard.common.task_states import TaskStates
 from offboard.common.tasks import Kind, hashes, kind_named, kind_of, task
 from offboard.common.variants import SITE_LENGTH_MAX
-from offboard.robot_client.check.outcome import StepFailed
+from offboard.robot_client.check.network import StepFailed
 from offboard.robot_client.check.task_comparison import compare
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 from tests.variant_tasks import grade, grade_roughly, only_there, sort_on_the_edge, sort_onboard, sort_out

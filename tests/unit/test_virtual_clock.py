@@ -4,8 +4,8 @@ from concurrent.futures import Future
 
 import pytest
 
-from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
-from offboard.loadgen.simulation.model.walker import Walk, Walker
+from offboard.loadgen.simulation.model.stepped_offloader import Walk, Walker
+from offboard.testing.virtual_clock import VirtualClock
 
 
 def test_a_wait_ends_with_the_first_future_or_the_timeout() -> None:

@@ -9,7 +9,8 @@ import pytest
 from offboard.common.errors import Overtaken
 from offboard.loadgen.replay.dataset_file import write_dataset
 from offboard.loadgen.replay.recorded_tasks import RecordedTask
-from offboard.loadgen.replay.replay import ReplayConfig, replay, tables
+from offboard.loadgen.replay.replay import replay, tables
+from offboard.loadgen.replay.replay_settings import ReplayConfig
 from offboard.loadgen.replay.virtual_robot import Played, VirtualRobot
 from offboard.loadgen.table.measured_rows import Rows
 from offboard.robot_client.policies import Decision, Forecast, Hedge, Probe

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from offboard.common.text.wording import duration, rounded, with_bounds, with_interval
+from offboard.common.wording import duration, rounded, with_bounds, with_interval
 
 
 @pytest.mark.parametrize(

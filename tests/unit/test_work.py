@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from offboard.common.errors import ConfigError, DataError
+from offboard.common.planning import PLANNERS
 from offboard.common.planning.planner import Plan, plan_path, size_of_plan
-from offboard.common.planning.planner_names import PLANNERS
 from offboard.loadgen.robot.answers import cells_of
 from offboard.loadgen.robot.config import CallConfig, DriveConfig
 from offboard.loadgen.robot.work import Work, make_work

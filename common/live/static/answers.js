@@ -1,6 +1,6 @@
 // Answers the questions at the top of the page, from what `memory.js` remembers: [verdict, figures behind it].
 
-import { judged, ms, others, parts, percent, sinceStart, sum, total } from "./memory.js";
+import { constants, judged, ms, others, parts, percent, sinceStart, sum, total } from "./memory.js";
 
 const BAND_MIN = 20; // answers, before the share inside the band is judged
 const INSIDE_LEAST = 0.8, INSIDE_MOST = 0.97; // around the 90 % that a band promises
@@ -77,6 +77,14 @@ export function moreBudget(tasks, budget) {
 
 const caps = budget => ["bytes", "joules"].filter(name => budget[`${name}_left`] != null)
   .map(name => `, ${Math.round(budget[`${name}_left`])} ${name}`).join("");
+
+export function onePlace(tasks, sites) {
+  const found = constants(tasks, sites).sort((a, b) => a.alone / a.took - b.alone / b.took);
+  if (found.length < 2) return ["Unknown: only one site has predictions.", ""];
+  const times = ({ alone, took }) => `${ms(alone)} in place of ${ms(took)}`;
+  return [`${found.map(one => `Always ${one.site}: ${(one.alone / one.took).toFixed(2)} times as long`).join(". ")}.`,
+    `By the robot's own predictions, per task: ${found.map(one => `${one.site} ${times(one)} (${one.count} tasks)`).join(", ")}.`];
+}
 
 export function serverBusy(samples) {
   const { from, to, seconds, robots } = sinceStart(samples), now = to.server;

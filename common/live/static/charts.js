@@ -1,11 +1,13 @@
 // Draws the charts with plotly. What they show is computed in `memory.js`.
 
-import { amount, answered } from "./memory.js";
+import { amount, answered, incidents, queue } from "./memory.js";
 
 /* global Plotly */
 
 const SYMBOLS = ["circle", "diamond", "square", "triangle-up"];
+const RINGS = { hedge: "circle-open", fallback: "square-open", late: "triangle-up-open" };
 const BINS = 30;
+const PARTS = 200; // remote answers whose parts are drawn
 const AXIS_STEPS = 16; // at least, from one end of a time axis to the other
 const OPTIONS = { displayModeBar: false, responsive: true };
 
@@ -72,8 +74,9 @@ const lines = events => events.map(event => ({
   line: { dash: "dot", width: 1, color: colour("--faint") },
 }));
 
-// Size or work against seconds: what was measured, and each site's prediction with its 90 % band.
-export function drawTimes(tasks, sites) {
+// Size or work against seconds: what was measured, and each site's prediction with its 90 % band. `which`: says which
+// tasks these are.
+export function drawTimes(tasks, sites, which) {
   const traces = [];
   for (const site of sites) {
     const own = siteColour(sites, site), done = tasks.filter(task => answered(task, site));
@@ -102,11 +105,11 @@ export function drawTimes(tasks, sites) {
   const cut = Math.max(0, ...highs) > top ? " Longer predictions are cut off." : "";
   draw("times", `Time by ${what}: measured, and predicted with the 90 % band`, traces,
     { xaxis: { title: { text: what } }, yaxis: { title: { text: "seconds" }, ...(top ? { range: [0, top] } : {}) } },
-    `The last ${tasks.length} tasks. Dashes with bars: each site's prediction and its 90 % band.${cut}`);
+    `${which} Dashes with bars: each site's prediction and its 90 % band.${cut}`);
 }
 
-// When each task began, how long its caller waited, and whose answer was used.
-export function drawHistory(tasks, sites, spans, events) {
+// When each task began, how long its caller waited, whose answer was used, and what went wrong.
+export function drawHistory(tasks, sites, spans, events, which) {
   const traces = [...sites, null].map(site => {
     const own = tasks.filter(task => task.used === site);
     return {
@@ -117,11 +120,32 @@ export function drawHistory(tasks, sites, spans, events) {
         color: site ? siteColour(sites, site) : colour("--bad"),
       },
     };
-  }).filter(trace => trace.x.length);
+  });
+  for (const [what, symbol] of Object.entries(RINGS)) {
+    const own = tasks.flatMap(task => incidents(task).filter(one => one[0] === what).map(one => [task, one[1]]));
+    traces.push({
+      x: own.map(([task]) => task.at), y: own.map(([task]) => task.waited_s), text: own.map(([, why]) => why), mode: "markers",
+      name: what, marker: { symbol, size: 13, color: colour("--text"), line: { width: 1.5 } },
+    });
+  }
   const out = spans.length ? ` Red: ${[...new Set(spans.map(span => span[2]))].join(", ")} silent or absent.` : "";
-  draw("history", "How long each task took, by the site that answered", traces,
+  draw("history", "How long each task took, by the site that answered", traces.filter(trace => trace.x.length),
     { xaxis: timeAxis([...tasks.map(task => task.at), ...spans.flatMap(span => span.slice(0, 2))]), yaxis: { title: { text: "seconds" } }, shapes: [...bands(spans), ...lines(events)] },
-    `The last ${tasks.length} tasks.${out}`);
+    `${which}${out}`);
+}
+
+// The queue of a stream, and the chunks that did not get into it.
+export function drawQueue(tasks, spans) {
+  const { at, seconds, others } = queue(tasks);
+  if (!at.length) { remove("queue"); return; }
+  const traces = [
+    { x: at, y: seconds, mode: "lines", name: "queue", line: { color: colour("--site-0"), width: 1.5 } },
+    { x: others.map(one => one.at), y: others.map(one => one.seconds), mode: "markers", name: "not played",
+      text: others.map(one => `${one.outcome}: ${one.site}`), marker: { symbol: "x", color: colour("--bad") } },
+  ];
+  const empty = seconds.filter((left, i) => i > 0 && left === 0).length;
+  draw("queue", "Queue of actions", traces.filter(one => one.x.length), { shapes: bands(spans), xaxis: timeAxis(at), yaxis: { title: { text: "seconds left" } } },
+    `The queue was empty ${empty === 1 ? "once" : `${empty} times`}; ${others.length} ${others.length === 1 ? "chunk was" : "chunks were"} not played.`);
 }
 
 // Where tasks were sent over time.
@@ -147,9 +171,9 @@ export function drawPlaces(tasks, sites) {
 export function drawParts(tasks) {
   const done = tasks.flatMap(task => task.executions
     .filter(one => one.ok && one.site !== "onboard" && one.run_s !== null && one.network_s !== null)
-    .map(one => ({ at: task.at, ...one })));
+    .map(one => ({ at: task.at, ...one }))).slice(-PARTS);
   if (!done.length) { remove("parts"); return; }
-  const names = [["network_s", "link", "--site-0"], ["queue_s", "queue", "--site-3"], ["run_s", "run", "--site-1"]];
+  const names = [["network_s", "link", "--site-2"], ["queue_s", "queue", "--site-3"], ["run_s", "run", "--site-1"]];
   const traces = names.map(([field, name, own]) => ({
     x: done.map((_, i) => i + 1 - done.length), y: done.map(one => one[field] || 0), type: "bar", name,
     marker: { color: colour(own) },
@@ -189,8 +213,8 @@ export function drawServer(samples) {
   const x = samples.map(one => one.at);
   const line = (name, values, own, dash, shape = "hv") => ({ x, y: values, mode: "lines", name, line: { color: colour(own), dash, shape } });
   draw("queue", "Queue and workers", [
-    line("waiting", samples.map(one => one.server.queue_depth), "--site-1"),
-    line("running", samples.map(one => one.server.running), "--site-0"),
+    line("waiting", samples.map(one => one.server.queue_depth), "--site-3"),
+    line("running", samples.map(one => one.server.running), "--site-1"),
     line("workers", samples.map(one => one.server.workers), "--faint", "dot"),
   ], { xaxis: timeAxis(x), yaxis: { title: { text: "tasks" } } }, "Since this page is open, one sample a second.");
   const statuses = [...new Set(samples.flatMap(one => Object.keys(one.server.statuses)))];

@@ -1,13 +1,14 @@
 // The page: asks for looks, remembers them, and shows how things are now, or were at the time of the slider.
 
-import { moreBudget, predictionsGood, serverBusy, serverOrLink, whichRobot, whyThere } from "./answers.js";
-import { drawHistory, drawLink, drawParts, drawPlaces, drawServer, drawTimes, siteNumber } from "./charts.js";
-import { amount, Memory, ms, outages, percent, sinceStart, sum, total } from "./memory.js";
-import { follow } from "./stream.js";
+import { moreBudget, onePlace, predictionsGood, serverBusy, serverOrLink, whichRobot, whyThere } from "./answers.js";
+import { drawHistory, drawLink, drawParts, drawPlaces, drawQueue, drawServer, drawTimes, siteNumber } from "./charts.js";
+import { amount, incidents, judged, Memory, ms, outages, percent, sinceStart, sum, thinned, total } from "./memory.js";
+import { follow, run, unpacked } from "./stream.js";
 
 const STEPS = 1000; // of the slider
 const ROWS = 30; // decisions in the table
-const NAMES = { robot: "robot", server: "server", run: "run" };
+const ROWS_OF_INCIDENTS = 500;
+const NAMES = { robot: "robot", server: "server", run: "run", report: "" };
 
 const memory = new Memory();
 const by = id => document.getElementById(id);
@@ -88,9 +89,33 @@ function showDecisions(tasks) {
     const outlook = task.sites[task.decision.site];
     return [clock(task.at), task.i, shortly(amount(task)), placeOf(task), task.decision.reason, outlook ? ms(outlook.predicted_s) : "unknown", ms(task.waited_s), task.used || "none"];
   }), 4);
-  const few = memory.leftOut ? ` (the robot is busy: ${memory.leftOut} tasks were left out)` : "";
+  const why = memory.source === "report" ? "the file holds the last tasks" : "the robot is busy";
+  const few = memory.leftOut ? ` (${why}: ${memory.leftOut} tasks were left out)` : "";
   say("decisions-title", `Decisions, the latest first${few}`);
   by("decisions").hidden = false;
+}
+
+function showIncidents(tasks, spans) {
+  const rows = tasks.flatMap(task => incidents(task).map(([what, why]) => [task.at, what, task.i, why]));
+  rows.push(...spans.map(([from, to, site]) => [from, "outage", "", `${site} was silent or absent, until ${clock(to)}`]));
+  rows.sort((a, b) => b[0] - a[0]);
+  fill(by("incident-rows"), rows.slice(0, ROWS_OF_INCIDENTS).map(([at, ...row]) => [clock(at), ...row]), 3);
+  const counts = [...new Set(rows.map(row => row[1]))].map(what => `${what} ${rows.filter(row => row[1] === what).length}`);
+  say("incidents-title", `What went wrong, the latest first: ${counts.join(", ") || "nothing"}`);
+  by("incidents").hidden = false;
+}
+
+// How well each site was predicted, how many of its runs failed, and how good its answers were.
+function showCalibration(tasks, sites) {
+  const tested = judged(tasks).sites, some = number => number ?? "unknown";
+  fill(by("calibration-rows"), sites.map(site => {
+    const runs = tasks.flatMap(task => task.executions.filter(one => one.site === site)), { count, inside, below, above, error } = tested[site] || {};
+    const good = runs.filter(one => one.ok), used = tasks.filter(task => task.used === site).map(task => task.sites[site]?.quality);
+    const share = part => count ? percent(part / count) : "unknown";
+    return [site, runs.length, good.length, good.length ? ms(sum(good.map(one => one.seconds)) / good.length) : "unknown", share(below), share(inside), share(above),
+      count ? percent(error) : "unknown", used.some(one => one != null) ? (sum(used) / used.length).toFixed(3) : "no variants"];
+  }));
+  by("calibration").hidden = !tasks.length;
 }
 
 function showTasks() {
@@ -105,12 +130,17 @@ function showTasks() {
   answer("part", serverOrLink(tasks));
   answer("predictions", predictionsGood(tasks));
   answer("budget", moreBudget(tasks, followed && sample ? sample.budget : null));
+  answer("place", onePlace(tasks, sites));
   showDecisions(tasks);
-  drawTimes(tasks, sites);
-  drawHistory(tasks, sites, spans, events.filter(one => one.at_s * 1000 >= from));
+  showIncidents(tasks, spans);
+  showCalibration(tasks, sites);
+  const drawn = thinned(tasks), which = drawn.length < tasks.length ? `${drawn.length} of ${tasks.length} tasks.` : `The last ${tasks.length} tasks.`;
+  drawTimes(drawn, sites, which);
+  drawHistory(drawn, sites, spans, events.filter(one => one.at_s * 1000 >= from), which);
+  drawQueue(tasks, spans);
   drawPlaces(tasks, sites);
   drawParts(tasks);
-  drawLink(recent, tasks, sites, spans);
+  drawLink(recent, drawn, sites, spans);
 }
 
 const placeOf = task => task.decision.both ? "all sites" : task.decision.site;
@@ -124,7 +154,7 @@ function showServer() {
     mean(one, "queue_s"), mean(one, "run_s"), one.refused]));
   say("robots-title", `Robots, in the last ${Math.round(seconds)} s`);
   by("robots").hidden = by("answer-load-box").hidden = false;
-  for (const id of ["answer-why", "answer-predictions", "answer-budget"]) by(id).parentElement.hidden = true;
+  for (const id of ["answer-why", "answer-predictions", "answer-budget", "answer-place"]) by(id).parentElement.hidden = true;
   answer("load", whichRobot(samples));
   answer("part", serverBusy(samples));
   const state = server.draining ? "stopping" : server.ready ? "ready" : "warming up";
@@ -161,7 +191,7 @@ function showControls() {
 function show() {
   due = false;
   if (document.hidden || memory.source === null) return;
-  say("source", `${NAMES[memory.source]}${memory.over ? ", ended" : ""}`);
+  if (by("source")) say("source", `${NAMES[memory.source]}${memory.over ? ", ended" : ""}`);
   showControls();
   by("answers").hidden = false;
   if (memory.source === "server") showServer();
@@ -183,7 +213,17 @@ by("until").oninput = () => {
 document.onvisibilitychange = showSoon;
 matchMedia("(prefers-color-scheme: dark)").onchange = showSoon;
 
-follow("live/looks", look => { memory.add(look); showSoon(); }, (state, text) => {
-  by("state").dataset.state = state;
-  say("state", text);
-});
+const inFile = await unpacked("packed-look");
+if (inFile === null) {
+  follow("live/looks", look => { memory.add(look); showSoon(); }, (state, text) => {
+    by("state").dataset.state = state;
+    say("state", text);
+  });
+} else {
+  await run(await unpacked("packed-plotly"));
+  memory.add(JSON.parse(inFile));
+  const [from, to] = memory.span() ?? [0, 0];
+  say("state", `${new Date(from).toLocaleString([], { hourCycle: "h23" })} to ${clock(to)}`);
+  by("follow").hidden = true;
+  showSoon();
+}

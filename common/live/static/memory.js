@@ -1,7 +1,8 @@
 // What the page remembers of the looks, within limits, and how things were at a time.
 
-const SHOWN = 200; // tasks of a kind in the charts
-const KEPT_OF_A_KIND = { robot: SHOWN, run: 20000 }; // the time slider of a run reaches back to its start
+const SHOWN = 200; // tasks of a kind that are judged and drawn; a report shows all
+const KEPT_OF_A_KIND = { run: 20000, report: 20000 }; // the time slider of a run reaches back to its start
+const DRAWN = 1000; // tasks of each sort in a chart; more make it slow and show nothing new
 const SAMPLES = 900; // looks: a quarter of an hour
 const EVENTS = 500;
 
@@ -46,17 +47,17 @@ export class Memory {
   span() {
     const all = [...this.kinds.values()].filter(tasks => tasks.length);
     const firsts = all.map(tasks => tasks[0].at), lasts = all.map(tasks => tasks[tasks.length - 1].ended);
-    if (this.source !== "run" && this.samples.length) {
+    if (!KEPT_OF_A_KIND[this.source] && this.samples.length) {
       firsts.push(this.samples[0].at);
       lasts.push(this.samples[this.samples.length - 1].at);
     }
     return firsts.length ? [Math.min(...firsts), Math.max(...lasts)] : null;
   }
 
-  // The last tasks of a kind that had ended by then.
+  // The last tasks of a kind that had ended by then; of a report all.
   tasks(key, until) {
     const all = (this.kinds.get(key) || []).filter(task => task.ended <= until);
-    return all.slice(-SHOWN);
+    return this.source === "report" ? all : all.slice(-SHOWN);
   }
 
   samplesUntil(until) {
@@ -83,14 +84,55 @@ export const answered = (task, site) => task.executions.find(one => one.site ===
 export const others = (task, site) => Object.entries(task.sites)
   .filter(([name]) => name !== site && !task.features[`${name}.silent`]);
 
-// How many answers were inside the 90 % band of their prediction, and the median of the relative errors:
-// {count, inside, error, sites}; `sites` has the same for each site.
+// As many tasks as a chart can show, evenly: first those in which something went wrong, then others.
+export function thinned(tasks) {
+  const some = all => all.filter((_, i) => i % Math.ceil(all.length / DRAWN) === 0);
+  const kept = new Set([...some(tasks.filter(task => incidents(task).length)), ...some(tasks)]);
+  return tasks.filter(task => kept.has(task));
+}
+
+// What did not go as the decision hoped, and why: [[what, why], ...]. A run that another answer overtook did not fail.
+export function incidents(task) {
+  const { site, both, second, second_after_s } = task.decision, found = [];
+  const failed = task.executions.filter(one => !one.ok && !(one.error || "").startsWith("Overtaken"));
+  const errors = failed.map(one => `${one.site}: ${one.error}`).join("; ");
+  if (task.cancelled) found.push(["cancelled", task.happened]);
+  else if (!task.used) found.push(["no answer", errors]);
+  else if (!both && failed.some(one => one.site === site)) found.push(["fallback", `${errors}; answered by ${task.used}`]);
+  if (!both && second_after_s > 0 && task.executions.some(one => one.site === second)) {
+    found.push(["hedge", `${site} had not answered after ${ms(second_after_s)}, so ${second} started too; answered by ${task.used}`]);
+  }
+  const limit = task.deadline_s ?? (both ? null : task.sites[site]?.high_s);
+  if (task.used && limit != null && task.waited_s > limit) {
+    const { queue_s, run_s, network_s } = task.executions.find(one => one.site === task.used && one.ok) || {};
+    const parts = [["link", network_s], ["queue", queue_s], ["run", run_s]].filter(([, seconds]) => seconds);
+    found.push(["late", `${ms(task.waited_s)}, ${task.deadline_s == null ? "above the 90 % band, which ended at" : "after the deadline of"} ${ms(limit)}`
+      + (parts.length ? `; ${task.used}: ${parts.map(([name, seconds]) => `${name} ${ms(seconds)}`).join(", ")}` : "")]);
+  }
+  return found;
+}
+
+// By the robot's own predictions: what each site alone would have taken per task, and what the same tasks took:
+// [{site, count, alone, took}, ...]. Where a remote site is too slow, the robot gives it up and runs onboard.
+export function constants(tasks, sites) {
+  return sites.map(site => {
+    const known = tasks.filter(task => !task.decision.both && task.sites[site]?.predicted_s != null);
+    const alone = ({ sites, timeout_s }) => site === "onboard" ? sites.onboard.predicted_s
+      : Math.min(sites[site].predicted_s, timeout_s + (sites.onboard?.predicted_s ?? Infinity));
+    return { site, count: known.length, alone: sum(known.map(alone)) / known.length, took: sum(known.map(task => task.waited_s)) / known.length };
+  }).filter(one => one.count);
+}
+
+// How many answers were inside the 90 % band of their prediction, how many below and above it, and the median of the
+// relative errors: {count, inside, below, above, error, sites}; `sites` has the same for each site.
 export function judged(tasks) {
   const tested = tasks.flatMap(task => task.executions.map(one => [one, task.sites[one.site]]))
     .filter(([one, outlook]) => one.ok && outlook && outlook.low_s !== null && outlook.high_s !== null);
   const judge = some => ({
     count: some.length,
     inside: some.filter(([one, { low_s, high_s }]) => low_s <= one.seconds && one.seconds <= high_s).length,
+    below: some.filter(([one, { low_s }]) => one.seconds < low_s).length,
+    above: some.filter(([one, { high_s }]) => one.seconds > high_s).length,
     error: median(some.map(([one, outlook]) => Math.abs(one.seconds - outlook.predicted_s) / one.seconds)),
   });
   const names = [...new Set(tested.map(([one]) => one.site))];
@@ -132,6 +174,22 @@ export function parts(tasks) {
     one => one.ok && one.site !== "onboard" && one.run_s !== null && one.network_s !== null);
   const total = name => sum(remote.map(one => one[name] || 0));
   return { count: remote.length, link: total("network_s"), queue: total("queue_s"), run: total("run_s") };
+}
+
+// For how many seconds the queue of a stream lasts, over time: {at, seconds}, the corners of a line; and the chunks
+// that were not played: [{at, seconds, outcome, site}, ...]. `tasks`: in the order in which they ended.
+export function queue(tasks) {
+  const at = [], seconds = [], others = [];
+  let empty = null; // when the queue ends, in ms
+  for (const { chunk, ended, decision } of tasks.filter(task => task.chunk)) {
+    const { outcome, hz, left, actions, dropped } = chunk;
+    if (outcome !== "played") { others.push({ at: ended, seconds: left / hz, outcome, site: decision.site }); continue; }
+    if (empty !== null && empty < ended) { at.push(empty); seconds.push(0); }
+    at.push(ended, ended);
+    seconds.push(left / hz, (actions - dropped) / hz);
+    empty = ended + 1000 * (actions - dropped) / hz;
+  }
+  return { at, seconds, others };
 }
 
 // Spans of time, in ms, in which a site was silent or absent: [[from, to, site], ...].

@@ -68,3 +68,18 @@ export async function follow(url, onLook, onState) {
     await pause(RETRY_MS);
   }
 }
+
+// A report has in its own file what the page loads elsewhere: text, packed with gzip and base64; null if it is not there.
+export async function unpacked(id) {
+  const packed = document.getElementById(id);
+  if (packed === null) return null;
+  const bytes = Uint8Array.from(atob(packed.textContent), one => one.charCodeAt(0));
+  return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
+}
+
+// Runs a script. The page's policy allows no other way to run a text.
+export function run(text) {
+  return new Promise((done, failed) => document.head.append(Object.assign(document.createElement("script"), {
+    src: URL.createObjectURL(new Blob([text], { type: "text/javascript" })), onload: done, onerror: failed,
+  })));
+}

@@ -1,6 +1,14 @@
 """The conditions of a network link, in both directions, as values that are checked when they are made.
 
-What they do to bytes is computed in `pipe.py`.
+What they do to bytes is computed in `pipe.py`. What an outage and a hang stop:
+
+              outage (the link is silent)           hang (the receiving side is frozen)
+    read      no: bytes wait in the sender          yes: bytes are read and lost
+    deliver   no: bytes come after the outage       no
+    connect   waits for the end of the outage       waits while the cloud hangs
+    reset     waits for the end of the outage       at once
+
+An outage goes first: while it lasts, a hang reads nothing.
 """
 
 from collections.abc import Mapping
@@ -8,12 +16,12 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from offboard.common.errors import ConfigError
-from offboard.loadgen.relay.link.delay_samples import DELAY_MS_MAX, SAMPLES, SAMPLES_MAX, Samples
-from offboard.loadgen.relay.link.jitter import DISTRIBUTIONS
-from offboard.loadgen.relay.link.loss import LOSS_BURST_MAX
+from offboard.loadgen.relay.link.draws import DISTRIBUTIONS, LOSS_BURST_MAX, SAMPLES
 from offboard.loadgen.relay.link.recorded_link import Playback
 
 SEGMENT_BYTES = 1448  # payload of one TCP segment on Ethernet: 1500 - 20 (IP) - 32 (TCP with timestamps)
+DELAY_MS_MAX = 60_000.0
+SAMPLES_MAX = 20_000
 BANDWIDTH_MBPS_MAX = 100_000.0
 RESET_MS_MAX = 86_400_000.0
 TRUNCATE_BYTES_MAX = 1 << 50
@@ -32,6 +40,12 @@ BOUNDS: Mapping[str, tuple[float, float]] = {
     "truncate_bytes": (0, TRUNCATE_BYTES_MAX),
     "slow_close_ms": (0, DELAY_MS_MAX),
 }
+
+
+class Samples(tuple[float, ...]):
+    """Measured delays in ms, checked and sorted."""
+
+    __slots__ = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +101,20 @@ class LinkConditions:
             _check_number("samples", value, 0, DELAY_MS_MAX)
         object.__setattr__(self, "samples", Samples(sorted(self.samples)))
 
+    @property
+    def swallows(self) -> bool:
+        """Whether bytes of this direction are read and lost."""
+        return self.hang and not self.outage
+
+    @property
+    def varies(self) -> bool:
+        """Whether segments have different delays."""
+        return self.jitter_ms > 0 or self.distribution == SAMPLES
+
+    def delay_at_ms(self, enters_s: float) -> float:
+        """The delay of bytes that enter then, without jitter."""
+        return self.delay_ms + (self.recording.delay_ms(enters_s) if self.recording else 0.0)
+
     def shown(self) -> dict[str, Any]:
         """All conditions by name, for people and files; of the samples only their number."""
         played = None if self.recording is None else self.recording.shown()
@@ -120,6 +148,16 @@ class Link:
             up=_changed("up", self.up, both | dict(changes.get("up") or {})),
             down=_changed("down", self.down, both | dict(changes.get("down") or {})),
         )
+
+    @property
+    def connects(self) -> bool:
+        """Whether a new connection gets through to the cloud."""
+        return self.resets and not self.up.hang
+
+    @property
+    def resets(self) -> bool:
+        """Whether a reset gets through: it is a message too."""
+        return not (self.up.outage or self.down.outage)
 
     @property
     def recorded(self) -> bool:

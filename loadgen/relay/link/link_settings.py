@@ -9,17 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from offboard.common.config import check, setting
-from offboard.loadgen.relay.link.delay_samples import SAMPLES, read_samples
+from offboard.loadgen.relay.link.draws import SAMPLES
 from offboard.loadgen.relay.link.link import BOUNDS, CONDITIONS, NAMES, Link, LinkConditions
 from offboard.loadgen.relay.link.recorded_link import Playback
-from offboard.loadgen.relay.link.recording_file import T_S_MAX, read_recording
+from offboard.loadgen.relay.link.recording_file import T_S_MAX, read_recording, read_samples
 
 LINK, FAULTS, UP, DOWN = "link", "faults", "from robot to cloud only", "from cloud to robot only"
 RECORDED = "recorded link"
 
 
 def _both(name: str, default: Any, help: str, *, group: str = LINK, rare: bool = False) -> Any:
-    """A condition of both directions."""
     least, most = BOUNDS.get(name, (None, None))
     choices = NAMES if name == "distribution" else None
     return setting(default, help, group=group, rare=rare, minimum=least, maximum=most, choices=choices)
@@ -168,7 +167,6 @@ class LinkFlags:
 
 
 def as_flags(settings: Mapping[str, Any]) -> list[str]:
-    """Settings by name, as flags of a command line."""
     flags = []
     for name, value in settings.items():
         name = name.replace("_", "-")

@@ -5,10 +5,11 @@ Pure: time is an argument, and randomness comes from a seed. The sockets are in 
 
 import math
 
-from offboard.loadgen.relay.link.bandwidth import Bandwidth
-from offboard.loadgen.relay.link.delay import Delay, varies
+from offboard.loadgen.relay.link.draws import DISTRIBUTIONS, SAMPLES, Jitter, Loss, quantile, stall_ms
 from offboard.loadgen.relay.link.link import SEGMENT_BYTES, LinkConditions
-from offboard.loadgen.relay.link.loss import Loss, stall_ms
+
+CHUNK_BYTES = 8 * SEGMENT_BYTES  # largest bucket, so that the first bytes of a long read leave early
+BUCKET_S = 0.001  # time that a full bucket takes at the bandwidth; the smallest bucket is one segment
 
 
 class Pipe:
@@ -22,14 +23,17 @@ class Pipe:
     chunks, on earlier conditions, or on other effects. Messages that are smaller than a segment can therefore
     share a draw. A lost segment stalls once, together with all of its bytes that arrived without a gap.
 
+    The bandwidth limit is a token bucket. An idle link saves up nothing: after a pause, a chunk takes its
+    full sending time.
+
     New `conditions` apply to later chunks.
     """
 
     def __init__(self, conditions: LinkConditions, seed: int, connection: int, direction: str) -> None:
         origin = f"{seed}/{connection}/{direction}"
-        self._delay = Delay(origin)
+        self._jitter = Jitter(origin)
         self._loss = Loss(origin)
-        self._busy_until_s = -math.inf
+        self.busy_until_s = -math.inf  # when the last byte so far is sent, before its delay
         self._last_due_s = -math.inf
         self._segment_stall_ms = 0.0
         self.taken = 0  # bytes
@@ -44,21 +48,16 @@ class Pipe:
     @conditions.setter
     def conditions(self, conditions: LinkConditions) -> None:
         self._conditions = conditions
-        self._bandwidth = Bandwidth(conditions.bandwidth_mbps)
-        played = self._recording = conditions.recording
-        draws = varies(conditions) or conditions.loss > 0
+        mbps, played = conditions.bandwidth_mbps, conditions.recording
+        self._s_per_byte = 8e-6 / mbps if mbps else 0.0
+        draws = conditions.varies or conditions.loss > 0
         single = draws or (played is not None and played.rate is not None)
-        self.bucket_bytes = SEGMENT_BYTES if single else self._bandwidth.bucket_bytes
+        self.bucket_bytes = SEGMENT_BYTES if single else _bucket_bytes(self._s_per_byte)
         self._in_parts = draws or (played is not None and played.delays)  # which have delays of their own
 
     @property
-    def busy_until_s(self) -> float:
-        """When the last byte so far is sent, before its delay."""
-        return self._busy_until_s
-
-    @property
     def segment(self) -> int:
-        """Number of the segment that the next byte belongs to."""
+        """The number of the segment that the next byte belongs to."""
         return self.taken // SEGMENT_BYTES
 
     def chunk_bytes(self, size: int) -> int:
@@ -82,9 +81,9 @@ class Pipe:
 
         A size of 0 is the end of the stream.
         """
-        if arrived_s > self._busy_until_s:  # bytes after a gap were not lost with the start of the segment
+        if arrived_s > self.busy_until_s:  # bytes after a gap were not lost with the start of the segment
             self._segment_stall_ms = 0.0
-        sent_s = max(arrived_s, self._busy_until_s)
+        sent_s = max(arrived_s, self.busy_until_s)
         self.stall_ms = 0.0
         if size == 0:
             return self._end_due(sent_s)
@@ -97,7 +96,7 @@ class Pipe:
             due_s = max(due_s, sent_s + self._late_s(began_s))
             self.taken += part
             left -= part
-        self._busy_until_s, self._last_due_s = sent_s, due_s
+        self.busy_until_s, self._last_due_s = sent_s, due_s
         return due_s
 
     def _end_due(self, sent_s: float) -> float:
@@ -108,14 +107,20 @@ class Pipe:
 
     def _sent_s(self, began_s: float, size: int) -> float:
         """When the next `size` bytes are sent, if the first one begins then."""
-        if self._recording is not None and self._recording.rate is not None:
-            return self._recording.sent_s(began_s, size)
-        return began_s + self._bandwidth.sending_s(size)
+        played = self._conditions.recording
+        if played is not None and played.rate is not None:
+            return played.sent_s(began_s, size)
+        return began_s + size * self._s_per_byte
 
     def _delay_ms(self, segment: int, began_s: float) -> float:
-        """Delay and jitter of a segment that began to be sent then."""
-        recorded_ms = 0.0 if self._recording is None else self._recording.delay_ms(began_s)
-        return self._delay.at_ms(segment, self._conditions, recorded_ms)
+        """Delay and jitter of a segment that began to be sent then; never less than 0."""
+        now, fixed_ms = self._conditions, self._conditions.delay_at_ms(began_s)
+        if not now.varies:
+            return fixed_ms
+        draw = self._jitter.at(segment, now.correlation)
+        if now.distribution == SAMPLES:
+            return fixed_ms + quantile(now.samples, draw)
+        return max(0.0, fixed_ms + now.jitter_ms * DISTRIBUTIONS[now.distribution](draw))
 
     def _late_s(self, began_s: float) -> float:
         """Delay, jitter and stall of the next part of a segment."""
@@ -126,3 +131,11 @@ class Pipe:
             self._segment_stall_ms = stall_ms(times, now.stall_ms)
         self.stall_ms = max(self.stall_ms, self._segment_stall_ms)
         return (self.drawn_ms + self._segment_stall_ms) / 1e3
+
+
+def _bucket_bytes(s_per_byte: float) -> int | None:
+    """The number of bytes that are sent together; None where the bandwidth is unlimited."""
+    if not s_per_byte:
+        return None
+    segments = int(BUCKET_S / (s_per_byte * SEGMENT_BYTES))
+    return max(1, min(CHUNK_BYTES // SEGMENT_BYTES, segments)) * SEGMENT_BYTES

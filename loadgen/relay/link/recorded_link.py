@@ -24,15 +24,13 @@ ROUNDING_BYTES = 1e-3  # so that a rounding error does not hold a message until 
 class Recording:
     """Rows in order of time: row n holds from `times[n]` to `times[n + 1]`, where the last time is the end.
 
-    `columns` has one value for each row. `cut_s` is the time of `gaps` without rows that was cut out.
+    `columns` has one value for each row.
     """
 
     file: str
     sha256: str
     times: Sequence[float] = field(compare=False, repr=False)
     columns: Mapping[str, Sequence[float]] = field(compare=False, repr=False)
-    gaps: int = 0
-    cut_s: float = 0.0
 
     @property
     def length_s(self) -> float:
@@ -89,13 +87,8 @@ class Playback:
     def shown(self) -> dict[str, Any]:
         """What is played, for people and files."""
         recorded = self.recording
-        return {
-            "file": recorded.file,
-            "sha256": recorded.sha256,
-            "columns": list(recorded.columns),
-            "from_s": self.from_s,
-            "repeats": self.repeats,
-        }
+        about = {"file": recorded.file, "sha256": recorded.sha256, "columns": list(recorded.columns)}
+        return about | {"from_s": self.from_s, "repeats": self.repeats}
 
     def delay_ms(self, enters_s: float) -> float:
         """The delay of a message that enters now; 0 if it is not recorded."""

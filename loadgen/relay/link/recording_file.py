@@ -1,6 +1,7 @@
-"""Reads recorded links: CSV with a header, or the packet times of mahimahi; errors name file and line.
+"""Reads what was measured of links: recordings over time, and delays; errors name file and line.
 
-What a recording does to messages is in `recorded_link.py`.
+A recording is CSV with a header, or the packet times of mahimahi. What it does to messages is in
+`recorded_link.py`.
 """
 
 import functools
@@ -16,7 +17,7 @@ from pathlib import Path
 from statistics import median
 
 from offboard.common.errors import DataError
-from offboard.loadgen.relay.link.delay_samples import DELAY_MS_MAX
+from offboard.loadgen.relay.link.link import DELAY_MS_MAX, SAMPLES_MAX, Samples
 from offboard.loadgen.relay.link.recorded_link import DOWN_MBPS, MBPS, RTT, UP_MBPS, Recording
 
 ROWS_MAX = 1_000_000
@@ -44,6 +45,25 @@ def read_recording(path: Path) -> Recording:
         return _read(path, about.st_mtime_ns, about.st_size)
     except OSError as error:
         raise DataError(f"{path}: {error.strerror or error}") from error
+
+
+def read_samples(path: Path) -> Samples:
+    """The delays of a file, one in each line, in ms; DataError names file, line and value."""
+    try:
+        lines = path.read_text().split("\n")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+    samples: list[float] = []
+    for number, text in enumerate(map(str.strip, lines), 1):
+        if text and len(samples) == SAMPLES_MAX:
+            raise DataError(
+                f"{path}:{number}: {text!r} is one delay too many; at most {SAMPLES_MAX} are allowed"
+            )
+        if text:
+            samples.append(_value(f"{path}:{number}", text, DELAY_MS_MAX, "a delay in ms"))
+    if not samples:
+        raise DataError(f"{path}: the file holds no delays")
+    return Samples(sorted(samples))
 
 
 @functools.lru_cache(KEPT_MAX)
@@ -83,11 +103,10 @@ def _table(path: Path, lines: Sequence[str], file: str, sha256: str) -> Recordin
             "%s: gaps of more than %g s that were cut out: %d, of %.1f s; remedy: add rows if it was silent",
             *(path, GAP_S, gaps, cut_s),
         )
-    return Recording(file, sha256, times, columns, gaps=gaps, cut_s=cut_s)
+    return Recording(file, sha256, times, columns)
 
 
 def _columns(path: Path, header: str) -> list[str]:
-    """The names in the header."""
     names = [name.strip() for name in header.split(",")]
     others = set(names) - {TIME}
     if len(set(names)) < len(names) or TIME not in names or not others or not others <= set(MOST):
@@ -111,13 +130,13 @@ def _rows(path: Path, lines: Sequence[str], *, header: int) -> Iterator[tuple[in
         raise DataError(f"{path}:1: no rows follow the header")
 
 
-def _value(place: str, text: str, most: float) -> float:
+def _value(place: str, text: str, most: float, what: str = "a number") -> float:
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not 0 <= value <= most:
-        raise DataError(f"{place}: {text.strip()[:40]!r} is not a number from 0 to {most:g}")
+        raise DataError(f"{place}: {text.strip()[:40]!r} is not {what} from 0 to {most:g}")
     return value
 
 

@@ -10,10 +10,8 @@ import struct
 from typing import Protocol
 
 from offboard.loadgen.relay.link.link import Link
-from offboard.loadgen.relay.link.outage import connects, resets
 from offboard.loadgen.relay.link.pipe import Pipe
-from offboard.loadgen.relay.tcp.forwarder import Forwarder, ReadBuffer
-from offboard.loadgen.relay.tcp.link_record import LinkRecord
+from offboard.loadgen.relay.tcp.forwarder import Forwarder, Shared
 
 CONNECT_S = 5.0
 RST_AT_CLOSE = struct.pack("ii", 1, 0)  # SO_LINGER: on, 0 seconds
@@ -25,11 +23,8 @@ class RelayOfConnections(Protocol):
     target: tuple[str, int]
     link: Link
     seed: int
-    buffer: ReadBuffer
-    buffer_bytes: int
-    record: LinkRecord | None
+    shared: Shared
     connections: "set[Connection]"
-    bytes: dict[str, int]
 
     def target_up(self) -> None:
         """The cloud accepted a connection."""
@@ -50,14 +45,12 @@ class Connection:
     def __init__(self, relay: RelayOfConnections, number: int) -> None:
         self._relay = relay
         self.number = number
-        self.buffer = relay.buffer
-        self.buffer_bytes = relay.buffer_bytes
-        self.record = relay.record
+        self.shared = relay.shared
         self._loop = asyncio.get_running_loop()
         self._how = ""
         self._aborted = self._by_rst = self._over = False
-        if self.record is not None:
-            self.record.opened(self._loop.time(), number)
+        if self.shared.record is not None:
+            self.shared.record.opened(self._loop.time(), number)
         self._up = Forwarder(self, "up", Pipe(relay.link.up, relay.seed, number, "up"))
         self._down = Forwarder(self, "down", Pipe(relay.link.down, relay.seed, number, "down"))
         self._passable = asyncio.Event()
@@ -71,7 +64,7 @@ class Connection:
 
     def set_link(self, link: Link) -> None:
         before, self._link = self._link, link
-        if connects(link):
+        if link.connects:
             self._passable.set()
         else:
             self._passable.clear()
@@ -131,9 +124,6 @@ class Connection:
         elif self._up.source_ended and (self._up.swallowed or over):
             self.reset("hang")
 
-    def count(self, direction: str, size: int) -> None:
-        self._relay.bytes[direction] += size
-
     def made(self, side: "Side") -> None:
         """A socket of the connection is open."""
         self._open_sides.add(side)
@@ -163,7 +153,7 @@ class Connection:
             for direction in ("up", "down")
             if getattr(self._link, direction).reset_after_ms
         ]
-        if not times_s or not resets(self._link):
+        if not times_s or not self._link.resets:
             return
         if min(times_s) <= self._loop.time():
             self.reset()
@@ -174,10 +164,10 @@ class Connection:
         await self._passable.wait()
         cloud = Side(self, self._down, self._up)
         try:
-            async with asyncio.timeout(CONNECT_S):
-                await self._loop.create_connection(lambda: cloud, *self._relay.target)
+            opening = self._loop.create_connection(lambda: cloud, *self._relay.target)
+            await asyncio.wait_for(opening, CONNECT_S)
             self._relay.target_up()
-        except OSError as error:  # TimeoutError is one
+        except (OSError, asyncio.TimeoutError) as error:  # in Python 3.10, the second is no OSError
             self._relay.target_down(error)
             self.abort("refused")
 
@@ -186,10 +176,10 @@ class Connection:
         self._relay.connections.discard(self)
         if self._reset_timer is not None:
             self._reset_timer.cancel()
-        if self.record is not None:
+        if self.shared.record is not None:
             self._up.drop()
             self._down.drop()
-            self.record.closed(self._loop.time(), self.number, self._how)
+            self.shared.record.closed(self._loop.time(), self.number, self._how)
 
 
 class Side(asyncio.BufferedProtocol):

@@ -9,18 +9,24 @@ from collections import deque
 from typing import Protocol
 
 from offboard.loadgen.relay.link.link import LinkConditions
-from offboard.loadgen.relay.link.outage import delivers, swallows
 from offboard.loadgen.relay.link.pipe import Pipe
-from offboard.loadgen.relay.tcp.link_record import Chunk, LinkRecord
+from offboard.loadgen.relay.tcp.link_record import LinkRecord
 
 READ_BYTES = 256 << 10  # per read and per write; the fastest of 64 KiB to 1 MiB
 CHUNKS_MAX = 65_536  # under way in one direction: a chunk of one byte takes the memory of a hundred
 
 
-class ReadBuffer:
-    """Memory that all sockets of a relay read into, one read after the other."""
+class Shared:
+    """What all connections of a relay share: their limit, record and counts, and memory to read into.
 
-    def __init__(self) -> None:
+    - `buffer_bytes`: bytes under way in one direction of one connection.
+    - `view`: the memory that all sockets read into, one read after the other.
+    """
+
+    def __init__(self, buffer_bytes: int, record: LinkRecord | None) -> None:
+        self.buffer_bytes = buffer_bytes
+        self.record = record
+        self.bytes = {"up": 0, "down": 0}  # delivered
         self.renew()
 
     def renew(self) -> None:
@@ -32,9 +38,7 @@ class Owner(Protocol):
     """The connection that a forwarder belongs to."""
 
     number: int
-    buffer: ReadBuffer
-    buffer_bytes: int
-    record: LinkRecord | None
+    shared: Shared
 
     def because(self, how: str) -> None:
         """The connection ends for this reason, unless it already has one."""
@@ -44,9 +48,6 @@ class Owner(Protocol):
 
     def settle(self) -> None:
         """The source has ended, or nothing more can be delivered to the target."""
-
-    def count(self, direction: str, size: int) -> None:
-        """`size` bytes were delivered."""
 
 
 class Forwarder:
@@ -59,6 +60,7 @@ class Forwarder:
 
     def __init__(self, owner: Owner, direction: str, pipe: Pipe) -> None:
         self._owner = owner
+        self._shared = owner.shared
         self._direction = direction
         self._pipe = pipe
         self._loop = asyncio.get_running_loop()
@@ -77,14 +79,14 @@ class Forwarder:
 
     def room(self) -> memoryview:
         """The memory to read into, as long as the bytes that may still be under way."""
-        return self._owner.buffer.view[: max(1, self._owner.buffer_bytes - self._under_way_bytes)]
+        return self._shared.view[: max(1, self._shared.buffer_bytes - self._under_way_bytes)]
 
     def take(self, size: int) -> None:
         """`size` bytes arrived from the source, in `room`."""
         if self._ended:  # by truncation
             return
         arrived_s = self._loop.time()
-        data = self._owner.buffer.view[: self._pipe.left(size)]
+        data = self._shared.view[: self._pipe.left(size)]
         start = 0
         while start < len(data):
             end = start + self._pipe.chunk_bytes(len(data) - start)
@@ -111,7 +113,7 @@ class Forwarder:
 
     def set_conditions(self, conditions: LinkConditions) -> None:
         self._pipe.conditions = conditions
-        if swallows(conditions):
+        if conditions.swallows:
             self.drop()
         self._truncate()
         self.refresh()
@@ -122,11 +124,11 @@ class Forwarder:
             self._timer.cancel()
             self._timer = None
         now = self._pipe.conditions
-        if self.target is not None and delivers(now):
+        if self.target is not None and not now.outage:
             self._deliver(self.target)
         if self.source is not None and not self.source.is_closing():
-            accepts = delivers(now) and self._has_room() and self.target is not None
-            if accepts or swallows(now):
+            accepts = not now.outage and self._has_room() and self.target is not None
+            if accepts or now.swallows:
                 self.source.resume_reading()
             else:
                 self.source.pause_reading()
@@ -142,24 +144,21 @@ class Forwarder:
         self._under_way_bytes = 0
 
     def _has_room(self) -> bool:
-        return self._under_way_bytes < self._owner.buffer_bytes and len(self._under_way) < CHUNKS_MAX
+        return self._under_way_bytes < self._shared.buffer_bytes and len(self._under_way) < CHUNKS_MAX
 
     def _send(self, arrived_s: float, chunk: memoryview | bytes) -> None:
         segment, size = self._pipe.segment, len(chunk)
         due_s = self._pipe.due(arrived_s, size)
         line = ""
-        if self._owner.record is not None:
-            line = self._owner.record.chunk(
-                Chunk(
-                    connection=self._owner.number,
-                    direction=self._direction,
-                    segment=segment,
-                    size=size,
-                    arrived_s=arrived_s,
-                    due_s=due_s,
-                    drawn_ms=self._pipe.drawn_ms,
-                    stall_ms=self._pipe.stall_ms,
-                )
+        if self._shared.record is not None:
+            line = self._shared.record.chunk(
+                self._owner.number,
+                self._direction,
+                self._pipe,
+                segment=segment,
+                size=size,
+                arrived_s=arrived_s,
+                due_s=due_s,
             )
         now = self._pipe.conditions
         clear = self.writable and not (self._under_way or now.outage or now.hang)
@@ -169,7 +168,7 @@ class Forwarder:
             return
         self._under_way.append((due_s, bytes(chunk), line))
         self._under_way_bytes += size
-        if swallows(now):
+        if now.swallows:
             self.drop()
 
     def _truncate(self) -> None:
@@ -199,11 +198,11 @@ class Forwarder:
     def _write(self, target: asyncio.Transport, data: memoryview | bytes) -> None:
         if not data or target.is_closing():
             return
-        self._owner.count(self._direction, len(data))
+        self._shared.bytes[self._direction] += len(data)
         target.write(data)
         # asyncio keeps the bytes that the socket did not take; since Python 3.12 it does not copy them.
         if isinstance(data, memoryview) and target.get_write_buffer_size():
-            self._owner.buffer.renew()
+            self._shared.renew()
 
     def _finish(self, target: asyncio.Transport) -> None:
         self.done = True
@@ -215,5 +214,5 @@ class Forwarder:
             self._owner.settle()
 
     def _note(self, line: str, delivered_s: float | None) -> None:
-        if self._owner.record is not None:
-            self._owner.record.delivered(line, delivered_s)
+        if self._shared.record is not None:
+            self._shared.record.delivered(line, delivered_s)

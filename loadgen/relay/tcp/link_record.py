@@ -6,32 +6,18 @@ A thread writes the lines, so that a slow disk does not delay the bytes on the l
 import json
 import logging
 import threading
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from offboard.common.errors import ConfigError
 from offboard.loadgen.relay.link.link import Link
+from offboard.loadgen.relay.link.pipe import Pipe
 
 WAITING_BYTES_MAX = 16 << 20  # text that waits to be written; lines beyond it are dropped and counted
 WRITE_S = 0.1  # between two writes
 CLOSE_S = 5.0  # time for the last write
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class Chunk:
-    """Bytes that went through the link together, and what the link drew for them."""
-
-    connection: int
-    direction: str
-    segment: int
-    size: int
-    arrived_s: float
-    due_s: float
-    drawn_ms: float
-    stall_ms: float
 
 
 class LinkRecord:
@@ -66,14 +52,19 @@ class LinkRecord:
     def closed(self, now_s: float, connection: int, how: str) -> None:
         self._add(self._event("closed", now_s, connection=connection, how=how))
 
-    def chunk(self, chunk: Chunk) -> str:
-        """The start of a chunk's line; pass it to `delivered` when the chunk was delivered or lost."""
+    def chunk(
+        self, number: int, way: str, pipe: Pipe, *, segment: int, size: int, arrived_s: float, due_s: float
+    ) -> str:
+        """The start of the line of a chunk, which `pipe` has just taken for connection `number`.
+
+        Pass it to `delivered` when the chunk was delivered or lost.
+        """
         return (
-            f'{{"what": "chunk", "connection": {chunk.connection}, "direction": "{chunk.direction}", '
-            f'"segment": {chunk.segment}, "bytes": {chunk.size}, '
-            f'"arrived_s": {chunk.arrived_s - self._start_s:.6f}, '
-            f'"drawn_ms": {chunk.drawn_ms:.6f}, "stall_ms": {chunk.stall_ms:.6f}, '
-            f'"due_s": {chunk.due_s - self._start_s:.6f}, "delivered_s": '
+            f'{{"what": "chunk", "connection": {number}, "direction": "{way}", '
+            f'"segment": {segment}, "bytes": {size}, '
+            f'"arrived_s": {arrived_s - self._start_s:.6f}, '
+            f'"drawn_ms": {pipe.drawn_ms:.6f}, "stall_ms": {pipe.stall_ms:.6f}, '
+            f'"due_s": {due_s - self._start_s:.6f}, "delivered_s": '
         )
 
     def delivered(self, chunk: str, now_s: float | None) -> None:

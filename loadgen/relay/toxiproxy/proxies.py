@@ -1,6 +1,6 @@
 """Toxiproxy's proxies: each is a relay with its own port and its own toxics.
 
-The relay is in `toxic_relay.py`, the HTTP API in `toxiproxy_api.py`.
+The relay is in `toxics.py`, the HTTP API in `toxiproxy_api.py`.
 """
 
 import asyncio
@@ -11,22 +11,12 @@ from typing import Any
 
 from offboard.common.errors import ConfigError
 from offboard.common.security.address import address
-from offboard.loadgen.relay.tcp.tcp_address import BACKLOG, bind, name_of
-from offboard.loadgen.relay.toxiproxy.toxic_relay import ToxicRelay
-from offboard.loadgen.relay.toxiproxy.toxics import Refused, Toxic, link_of
+from offboard.loadgen.relay.tcp.relay import BACKLOG, RelaySettings, bind, name_of
+from offboard.loadgen.relay.toxiproxy.toxics import Refused, Toxic, ToxicRelay, link_of
 
 PROXIES_MAX = 64
 TOXICS_MAX = 32  # of one proxy
 LISTEN = "127.0.0.1:0"  # default address of a proxy
-
-
-@dataclass(frozen=True, slots=True)
-class RelaySettings:
-    """Settings that the relays of all proxies share; see `Relay`."""
-
-    seed: int
-    connections_max: int
-    buffer_bytes: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +114,7 @@ class Proxy:
 
     def __init__(self, asked: ProxySettings, settings: RelaySettings) -> None:
         seed = random.Random(f"{settings.seed}/{asked.name}").getrandbits(64)
-        self._relay = ToxicRelay(address("upstream", asked.upstream), **(asdict(settings) | {"seed": seed}))
+        self._relay = ToxicRelay(address("upstream", asked.upstream), replace(settings, seed=seed))
         self._server: asyncio.Server | None = None
         self._asked_listen = asked.listen
         self.settings = replace(asked, enabled=False)

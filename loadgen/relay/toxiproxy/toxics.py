@@ -1,23 +1,25 @@
-"""Toxiproxy's toxics, and the link conditions that they make together.
+"""Toxiproxy's toxics, the link conditions that they make together, and the relay that applies them.
 
-Pure. The relay that applies them is in `toxic_relay.py`. Names and meanings are those of
-https://github.com/Shopify/toxiproxy#toxics
+Names and meanings are those of https://github.com/Shopify/toxiproxy#toxics
 """
 
+import asyncio
 import random
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from offboard.common.errors import OffloadError
-from offboard.loadgen.relay.link.delay_samples import DELAY_MS_MAX
 from offboard.loadgen.relay.link.link import (
     BANDWIDTH_MBPS_MAX,
+    DELAY_MS_MAX,
     RESET_MS_MAX,
     TRUNCATE_BYTES_MAX,
     Link,
     LinkConditions,
 )
+from offboard.loadgen.relay.tcp.connection import Connection
+from offboard.loadgen.relay.tcp.relay import Refusal, Relay, RelaySettings
 
 DIRECTIONS = {"upstream": "up", "downstream": "down"}
 KB_PER_S_MAX = BANDWIDTH_MBPS_MAX * 1e6 / 8 / 1e3
@@ -61,8 +63,7 @@ class Toxic:
 
     def shown(self) -> dict[str, Any]:
         """The toxic as the API shows it."""
-        names = ("name", "type", "stream", "toxicity", "attributes")
-        return {name: getattr(self, name) for name in names}
+        return asdict(self)
 
     def strikes(self, seed: int, connection: int) -> bool:
         """Whether this connection gets the toxic.
@@ -91,7 +92,6 @@ def attributes(
 
 
 def link_of(toxics: Iterable[Toxic]) -> Link:
-    """The link that these toxics make together."""
     toxics = tuple(toxics)
     return Link(
         **{
@@ -126,3 +126,79 @@ def _conditions(toxics: Iterable[Toxic]) -> LinkConditions:
         reset_after_ms=float(min((max(ms, RESET_MS_MIN) for ms in resets), default=0)),
         truncate_bytes=min(given["limit_data", "bytes"], default=0),
     )
+
+
+class ToxicRelay(Relay):
+    """Accepts connections while `taking`, and applies `toxics` to new connections and after each change.
+
+    Each connection has the toxics that its own random draws gave it.
+    """
+
+    def __init__(self, target: tuple[str, int], settings: RelaySettings) -> None:
+        super().__init__(target, Link(), settings)
+        self.taking = False
+        self.toxics: tuple[Toxic, ...] = ()
+        self._toxic_connections: list[ToxicConnection] = []  # bounded by connections_max
+
+    def accept(self) -> asyncio.BaseProtocol:
+        if not self.taking:  # the kernel had accepted the connection before the listener was closed
+            return Refusal()
+        protocol = super().accept()
+        for known in [one for one in self._toxic_connections if one.connection not in self.connections]:
+            known.forget()
+            self._toxic_connections.remove(known)
+        for connection in self.connections:
+            if connection.client is protocol:
+                self._toxic_connections.append(ToxicConnection(connection, self.seed))
+                self._toxic_connections[-1].take(self.toxics)
+        return protocol
+
+    def set_toxics(self, toxics: Sequence[Toxic]) -> None:
+        """Apply these toxics to every connection, open or new, as the draws of the connection decide."""
+        self.toxics = tuple(toxics)
+        for known in self._toxic_connections:
+            known.take(self.toxics)
+
+    def close(self) -> None:
+        """Accept no further connections, and end the open ones."""
+        self.taking = False
+        self.abort()
+
+
+@dataclass(slots=True, eq=False)
+class ToxicConnection:
+    """One connection, the toxics that it has now, and the timer of a timeout toxic that closes it."""
+
+    connection: Connection
+    seed: int
+    toxics: tuple[Toxic, ...] = ()
+    end: asyncio.TimerHandle | None = None
+
+    def take(self, toxics: Sequence[Toxic]) -> None:
+        """Replace the toxics.
+
+        As in Toxiproxy, removing a timeout toxic closes the connection, because its bytes were lost.
+        """
+        before, number = self.toxics, self.connection.number
+        self.toxics = tuple(toxic for toxic in toxics if toxic.strikes(self.seed, number))
+        if _timeouts(before) - _timeouts(self.toxics):
+            self.connection.abort()
+        elif before != self.toxics:
+            self.connection.set_link(link_of(self.toxics))
+        if closes_after_s(before) != closes_after_s(self.toxics):
+            self._set_end(closes_after_s(self.toxics))
+
+    def forget(self) -> None:
+        """Cancel the timer: the connection has ended, or no timeout closes it any more."""
+        if self.end is not None:
+            self.end.cancel()
+            self.end = None
+
+    def _set_end(self, after_s: float | None) -> None:
+        self.forget()
+        if after_s is not None:
+            self.end = asyncio.get_running_loop().call_later(after_s, self.connection.abort)
+
+
+def _timeouts(toxics: Sequence[Toxic]) -> set[str]:
+    return {toxic.name for toxic in toxics if toxic.type == "timeout"}

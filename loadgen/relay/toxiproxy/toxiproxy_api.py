@@ -1,6 +1,6 @@
 """Toxiproxy's HTTP API (https://github.com/Shopify/toxiproxy#http-api), for its clients in any language.
 
-docs/operations.md lists the differences. Proxies and toxics are implemented in `proxies.py` and `toxics.py`.
+docs/test_bench.md lists the differences. Proxies and toxics are implemented in `proxies.py` and `toxics.py`.
 """
 
 from dataclasses import replace
@@ -27,7 +27,6 @@ T = TypeVar("T")
 
 
 def toxiproxy_app(proxies: Proxies) -> FastAPI:
-    """The API of these proxies."""
     app = FastAPI(title="Toxiproxy's API", dependencies=[Depends(_no_browser)], openapi_url=None)
     app.add_exception_handler(Refused, _refused)
     app.add_exception_handler(HTTPException, _not_here)

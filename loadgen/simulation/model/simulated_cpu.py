@@ -1,4 +1,4 @@
-"""A simulated CPU quota: a queue of work, busy programs that share the quota, and the wait for new work."""
+"""A simulated computer: its CPU quota, work that waits for it, busy programs that share it, and its load."""
 
 import heapq
 import math
@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 
-from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
+from offboard.common.load import FREE_MIN
+from offboard.testing.virtual_clock import VirtualClock
 
 QUEUE_MAX = 100_000  # work that waits; a simulation with more has gone wrong
 
@@ -49,6 +50,11 @@ class SimulatedCpu:
     @property
     def waiting(self) -> int:
         return len(self._queue)
+
+    @property
+    def count(self) -> int:
+        """How much work waits or runs."""
+        return len(self._queue) + len(self._running)
 
     def add(
         self, cpu_s: float, ended: Callable[[Run], object], *, owner: str = "", until_s: float = math.inf
@@ -97,7 +103,6 @@ class SimulatedCpu:
 
     @property
     def share_of_one_more(self) -> float:
-        """The CPUs that one more program would get now."""
         return self.share(len(self._running) + 1)
 
     def begins_s(self, arrives_s: float, coming: Iterable[tuple[float, float]], *, without: str) -> float:
@@ -149,3 +154,29 @@ class SimulatedCpu:
             self._running.remove(run)
             self._plan()
             run.ended(run)
+
+
+class SimulatedLoad:
+    """What `offboard.common.load` would measure: the CPU quota, and the share that other programs take.
+
+    `latest` is that share of the CPU time that our own work leaves; `capacity` is the quota, at most 1 CPU.
+    """
+
+    def __init__(self, clock: VirtualClock, cpu: SimulatedCpu) -> None:
+        self._clock = clock
+        self._cpu = cpu
+        self._read_at_s = self._own_s = self._others_s = self.latest = 0.0
+        self.capacity = min(1.0, cpu.cpus)
+
+    def share(self, every_s: float) -> float:
+        """The share of other programs, measured again if the last measurement is `every_s` old."""
+        since_s = self._clock.now_s() - self._read_at_s
+        if since_s >= every_s:
+            self._cpu.settle()
+            self.capacity = min(1.0, self._cpu.cpus)
+            own_s, others_s = self._cpu.own_s, self._cpu.others_s
+            took_s, left_s = others_s - self._others_s, self._cpu.cpus * since_s - (own_s - self._own_s)
+            self._own_s, self._others_s, self._read_at_s = own_s, others_s, self._clock.now_s()
+            if left_s >= FREE_MIN * self._cpu.cpus * since_s:
+                self.latest = min(1.0, max(0.0, took_s / left_s))
+        return self.latest

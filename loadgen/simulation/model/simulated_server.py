@@ -5,13 +5,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
-from offboard.common.host.load import HURRIED_S, SERVER_EVERY_S
+from offboard.common.load import HURRIED_S, SERVER_EVERY_S
 from offboard.loadgen.scenario.scenario import CloudPart
-from offboard.loadgen.simulation.model.simulated_cpu import Run, SimulatedCpu
-from offboard.loadgen.simulation.model.simulated_load import SimulatedLoad
+from offboard.loadgen.simulation.model.simulated_cpu import Run, SimulatedCpu, SimulatedLoad
 from offboard.loadgen.simulation.model.task_costs import START_S
-from offboard.loadgen.simulation.model.virtual_clock import VirtualClock
 from offboard.robot_client.sites.heartbeat import ServerReport
+from offboard.testing.virtual_clock import VirtualClock
 
 QUEUE_MAX = 64  # requests that wait, as in `cloud-server`; further requests are refused as busy
 UNREAD_MAX = 100_000  # messages that a paused server has not read
@@ -51,13 +50,9 @@ class SimulatedServer:
         self._life = 0
 
     @property
-    def queue(self) -> int:
-        return self.cpu.waiting
-
-    @property
     def told(self) -> ServerReport:
         """The state that the server reports with every reply: its queue, its load, its capacity."""
-        return ServerReport(self.queue, self._load.latest, self._load.capacity)
+        return ServerReport(self.cpu.waiting, self._load.latest, self._load.capacity)
 
     def _measure_load(self) -> None:
         self._load.share(SERVER_EVERY_S)
@@ -77,7 +72,7 @@ class SimulatedServer:
         """
         if not self._has_blob:
             answer(Reply(NEED_BLOB, self.told))
-        elif self.queue >= QUEUE_MAX:
+        elif self.cpu.waiting >= QUEUE_MAX:
             answer(Reply(BUSY, self.told))
         else:
             self._wanted[key] = self.cpu.add(

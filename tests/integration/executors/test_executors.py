@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from offboard.cloud_server.executors import EXECUTORS, Executor
-from offboard.cloud_server.executors.task_run import Call, Outcome
+from offboard.cloud_server.executors.executor import Call, Outcome
 from offboard.common.wire.values import encode
 from tests.executor_tasks import ON_THIS_COMPUTER, WAIT_S, call, run, value
 from tests.wire_values import Pose

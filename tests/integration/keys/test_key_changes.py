@@ -16,8 +16,8 @@ import zmq
 from benchmarks.keyring import Keys
 from offboard.common.security.keys import robot_keys
 from offboard.common.wire import messages as wire
+from offboard.robot_client.cloud.connection import UNKNOWN_ROBOT
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.sites.connection import UNKNOWN_ROBOT
 from tests.curves import WAIT_S, Dealer, until
 from tests.integration.keys.servers import Robot, Serve, metric, stays_onboard, why_not
 from tests.probes import echo

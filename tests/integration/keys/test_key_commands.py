@@ -115,7 +115,7 @@ def test_insecure_is_said(serve: Serve, robot: Robot, caplog: pytest.LogCaptureF
         lambda: served.logged("--insecure: --listen: tcp://0.0.0.0:0 is beyond loopback and without --keys;")
     )
     assert httpx.get(f"{served.http}/health").json()["insecure"] is True
-    with caplog.at_level(logging.WARNING, "offboard.robot_client.sites.cloud_socket"):
+    with caplog.at_level(logging.WARNING, "offboard.robot_client.cloud.cloud_socket"):
         for _ in range(2):
             offload = robot(served.endpoint.replace("127.0.0.1", "0.0.0.0"), None)
             assert offload.wait_for_sites(echo, WAIT_S) == {}

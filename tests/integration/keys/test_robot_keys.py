@@ -7,8 +7,8 @@ import zmq
 
 from benchmarks.keyring import Keys
 from offboard.common.security.keys import PRIVATE, make_keys, robot_keys
+from offboard.robot_client.cloud.connection import NO_HANDSHAKE, ONE_WITH_KEYS, UNKNOWN_ROBOT
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.sites.connection import NO_HANDSHAKE, ONE_WITH_KEYS, UNKNOWN_ROBOT
 from tests.curves import WAIT_S, Dealer, recorded, says_until_closed, until
 from tests.integration.keys.servers import Robot, Serve, metric, run, stays_onboard, why_not
 from tests.probes import echo, mark_once, nap

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
-from offboard.robot_client.openpi.numpy_msgpack import pack
+from offboard.robot_client.policy_servers.openpi import pack
 
 METADATA = pack({"name": "test"})
 Talk = Callable[[ServerConnection], None]

@@ -9,6 +9,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[3]
 FOLDER = ROOT / ".cache" / "openpi"
 LOCK = ROOT / "requirements" / "openpi.txt"
+PYTHON_MIN = (3, 11)  # that of the lock
 PYTHON_MAX = (3, 12)  # numpy < 2 has no wheels for later versions
 BUILD_S = 300.0
 
@@ -30,7 +31,7 @@ def python() -> Path:
 
 
 def _suitable() -> str:
-    if sys.version_info[:2] <= PYTHON_MAX:
+    if PYTHON_MIN <= sys.version_info[:2] <= PYTHON_MAX:
         return sys.executable
     found = shutil.which("python3.12") or shutil.which("python3.11")
     if found is None:

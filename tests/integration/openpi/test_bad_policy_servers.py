@@ -12,8 +12,9 @@ from websockets.sync.server import ServerConnection
 
 from offboard.common.errors import CloudBroken, CloudTimeout, OffloadError
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.openpi import policy_server
-from offboard.robot_client.openpi.numpy_msgpack import ANSWER_BYTES_MAX, pack
+from offboard.robot_client.policy_servers import openpi
+from offboard.robot_client.policy_servers.openpi import pack
+from offboard.robot_client.policy_servers.protocol import ANSWER_BYTES_MAX
 from offboard.robot_client.sites.runner import ONBOARD
 from tests.integration.openpi.bad_servers import METADATA, Talk, says, serving, stays
 from tests.integration.openpi.robot import (
@@ -76,7 +77,7 @@ def test_a_server_without_metadata_gets_no_task(
     greeting: bytes | str | None, reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The reason of the site says what came instead."""
-    monkeypatch.setattr(policy_server, "OPEN_S", 0.2)
+    monkeypatch.setattr(openpi, "OPEN_S", 0.2)
     with serving(stays, greeting) as endpoint, Offloader.connect(sites={"gpu": endpoint}) as offload:
         until(lambda: reason in why_absent(offload))
         assert offload(act, observation(), where="gpu")["by"] == ONBOARD

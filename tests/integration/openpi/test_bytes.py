@@ -10,8 +10,8 @@ import pytest
 from websockets.sync.server import ServerConnection
 
 from offboard.common.tasks import Task, kind_of
-from offboard.robot_client.openpi.numpy_msgpack import pack
-from offboard.robot_client.openpi.policy_server import PolicyServerRunner
+from offboard.robot_client.policy_servers.openpi import pack
+from offboard.robot_client.policy_servers.policy_server import PolicyServerRunner
 from tests.integration.openpi.bad_servers import serving, stays
 from tests.integration.openpi.observations import observations
 from tests.integration.openpi.robot import START_S, act, observation, until

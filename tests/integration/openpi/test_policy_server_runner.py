@@ -17,10 +17,10 @@ from websockets.sync.server import ServerConnection
 from offboard.common.errors import CloudBroken, CloudBusy, CloudTimeout, Overtaken
 from offboard.common.tasks import Task, kind_of, task
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.openpi import policy_server
-from offboard.robot_client.openpi.numpy_msgpack import pack, unpack
-from offboard.robot_client.openpi.observation_queue import QUEUE_MAX
-from offboard.robot_client.openpi.policy_server import PolicyServerRunner
+from offboard.robot_client.policy_servers.openpi import pack, unpack
+from offboard.robot_client.policy_servers.policy_server import PolicyServerRunner
+from offboard.robot_client.sites import conversation
+from offboard.robot_client.sites.conversation import IN_TURN_MAX
 from offboard.robot_client.sites.runner import Execution
 from tests.integration.openpi.bad_servers import says, serving, stays
 from tests.integration.openpi.robot import START_S, act, until
@@ -97,9 +97,9 @@ def test_one_observation_is_under_way_at_a_time() -> None:
 
 
 def test_a_full_queue_is_busy() -> None:
-    """Beyond QUEUE_MAX observations nothing is kept."""
+    """Beyond IN_TURN_MAX observations nothing is kept."""
     with held() as (runner, _):
-        kept = [submitted(runner, number) for number in range(QUEUE_MAX)]
+        kept = [submitted(runner, number) for number in range(IN_TURN_MAX)]
         refused = submitted(runner, 99).result(START_S)
         assert isinstance(refused.failure, CloudBusy)
         assert not refused.started
@@ -145,8 +145,8 @@ def test_a_task_that_waits_can_be_cancelled_and_expire() -> None:
 
 
 def test_an_answer_that_never_comes_does_not_keep_the_connection(monkeypatch: pytest.MonkeyPatch) -> None:
-    """After ABANDONED_MAX_S the robot connects again, and the server is used again."""
-    monkeypatch.setattr(policy_server, "ABANDONED_MAX_S", SHORT_S)
+    """After OWED_MAX_S the robot connects again, and the server is used again."""
+    monkeypatch.setattr(conversation, "OWED_MAX_S", SHORT_S)
     with held() as (runner, server):
         one = submitted(runner, 1, SHORT_S).result(START_S)
         assert isinstance(one.failure, CloudTimeout)

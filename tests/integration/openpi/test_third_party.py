@@ -1,9 +1,6 @@
 """A robot with a server of `policy-websocket`: 200 calls, a killed server, a late answer, a frozen server."""
 
-import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections import Counter
@@ -18,10 +15,11 @@ from offboard.common.errors import CloudBroken, CloudTimeout
 from offboard.common.tasks import Task, kind_of
 from offboard.loadgen.robot_files import read_trace
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.openpi.policy_server import PolicyServerRunner
+from offboard.robot_client.policy_servers.policy_server import PolicyServerRunner
 from offboard.robot_client.sites.runner import ONBOARD
 from tests.integration.openpi.conftest import PolicyServer
 from tests.integration.openpi.robot import START_S, act, observation, of_gpu, right, until, used, why_absent
+from tests.programs import output_of
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(400)]
 
@@ -30,7 +28,7 @@ PAGE, ENDPOINT = ROOT / "docs" / "policy_servers.md", "ws://127.0.0.1:8000"
 CALLS, KILL_AT, RESTART_AT, LATE_AT = 200, 80, 110, 160
 TIMEOUT_S = 0.25
 LARGE = 32 * 2**20  # bytes, more than the kernel keeps for a connection
-RUN_S = 60.0
+PACKING_S = 2.0  # enough to pack those on a busy machine
 SLACK_S = 1.0  # of a busy machine
 USED_MIN = 0.7  # of the calls while the server is there; the default policy also probes
 
@@ -142,16 +140,16 @@ def test_a_frozen_server_is_silent_and_a_busy_one_is_not(policy_server: Callable
 def test_a_frozen_server_that_does_not_take_an_observation(
     policy_server: Callable[[], PolicyServer], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its task ends in time. After ABANDONED_MAX_S more the robot connects again."""
-    monkeypatch.setattr("offboard.robot_client.openpi.policy_server.ABANDONED_MAX_S", TIMEOUT_S)
+    """Its task ends in time. After OWED_MAX_S more the robot connects again."""
+    monkeypatch.setattr("offboard.robot_client.sites.conversation.OWED_MAX_S", TIMEOUT_S)
     server, kind = policy_server(), kind_of(act)
     with closing(PolicyServerRunner(server.endpoint, site="gpu")) as runner:
         until(lambda: runner.unavailable(kind) is None)
         server.signal(signal.SIGSTOP)
         large = observation(more=np.zeros(LARGE, np.uint8))
-        late = runner.submit(Task(kind, (large,), 2), TIMEOUT_S).result(START_S)
+        late = runner.submit(Task(kind, (large,), 2), PACKING_S).result(START_S)
         assert isinstance(late.failure, CloudTimeout)
-        until(lambda: "it does not take the observation" in str(runner.unavailable(kind)))
+        until(lambda: "it has not answered" in str(runner.unavailable(kind)))
         server.signal(signal.SIGCONT)
         until(lambda: runner.unavailable(kind) is None)
 
@@ -161,17 +159,28 @@ def test_the_example_of_the_page_runs(policy_server: Callable[[], PolicyServer],
     program = PAGE.read_text().split("```python\n")[1].split("```")[0]
     assert ENDPOINT in program
     (tmp_path / "robot.py").write_text(program.replace(ENDPOINT, policy_server().endpoint))
-    done = subprocess.run(
-        [sys.executable, "robot.py"],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=RUN_S,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    first, *steps = done.stdout.splitlines()
+    first, *steps = output_of(tmp_path / "robot.py").splitlines()
     assert first == "all sites can take this task"
     assert [line.split()[0] for line in steps] == [str(step) for step in range(20)]
     assert [line.split()[1] for line in steps].count("gpu") > len(steps) / 2, steps
+
+
+def test_a_policy_server_is_a_site_of_a_stream(policy_server: Callable[[], PolicyServer]) -> None:
+    """Its chunks are played in time: each action is for its step, and no step is empty after the first."""
+    hz, horizon = 50.0, 25
+    with Offloader.connect(sites={"gpu": policy_server().endpoint}) as offload:
+        assert not offload.wait_for_sites(act, START_S)
+        with offload.stream(act, hz=hz, horizon=horizon, blend=0) as actions:
+            held = []
+            for step in range(100):
+                half = (step + np.arange(horizon, dtype=np.float64)) / 2  # the policies double it
+                actions.see({"state": half.reshape(-1, 1)})
+                found = actions.next()
+                held.append(found.held)
+                if not found.held:
+                    assert found.action is not None
+                    assert float(found.action[0]) == step
+                time.sleep(1 / hz)
+    print(actions.counts)
+    assert sum(held[50:]) <= 5
+    assert actions.counts.played["gpu"] > 0

@@ -58,7 +58,7 @@ def test_metric_names_follow_the_conventions(bed: Any, robot: Working, promtool:
     """`promtool check metrics` finds nothing to complain about in the metrics of robot and server."""
     wanted = {
         robot.address: ("offboard_robot_predicted_seconds{", 'usable{kind="echo",site="cloud"} 1.0'),
-        bed.cloud_http: ("offboard_server_run_seconds_count{",),
+        bed.parts["cloud"].http: ("offboard_server_run_seconds_count{",),
     }
     for address, lines in wanted.items():
         until(lambda at=address, found=lines: all(one in metrics(at) for one in found), str(lines))
@@ -68,7 +68,7 @@ def test_metric_names_follow_the_conventions(bed: Any, robot: Working, promtool:
 
 def test_cloud_silent_fires_in_an_outage_and_ends_after_it(bed: Any, robot: Working, prometheus: Any) -> None:
     """Prometheus scrapes both sides and computes the rules; the only alert is that of the outage."""
-    seen = prometheus(offboard_robot=robot.address, offboard_server=bed.cloud_http)
+    seen = prometheus(offboard_robot=robot.address, offboard_server=bed.parts["cloud"].http)
     until(lambda: seen.values("sum(up)") == [2.0], "both targets are scraped")
     for rule in ("instance_kind:offboard_robot_wait_seconds:p95_5m", "offboard_server_requests:rate5m"):
         recorded = f'{{__name__=~".*{rule}"}}'

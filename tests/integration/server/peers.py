@@ -24,7 +24,7 @@ MODULE = '''
 import os, signal, sys, threading, time
 from offboard.common.errors import Unwanted
 from offboard.common.tasks import task
-from offboard.common.wanted import check_wanted
+from offboard.common.task_call import check_wanted
 
 started = []
 

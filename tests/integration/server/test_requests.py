@@ -14,7 +14,7 @@ import pytest
 from offboard import Offloader
 from offboard.common import VERSION
 from offboard.common.errors import TaskFailed
-from offboard.common.host.load import LOADED
+from offboard.common.load import LOADED
 from offboard.common.tasks import kind_named
 from offboard.common.wire import messages as wire
 from offboard.common.wire.messages import Cancel, Hello, Ping, Pong

@@ -39,7 +39,7 @@ def test_jitter_makes_latency_longer_and_shorter(client: Any, upstream: Any) -> 
     proxy.add_toxic(type="latency", attributes={"latency": 20, "jitter": 10})
     times_ms = []
     with contextlib.ExitStack() as stack:
-        for _ in range(20):
+        for _ in range(60):  # a loaded machine adds some milliseconds to most of them
             connection = stack.enter_context(connect(proxy))
             times_ms.append(1e3 * round_trip_s(connection))
     print([round(ms, 1) for ms in times_ms])

@@ -1,1 +1,0 @@
-"""What a computer reports about itself: CPU time, load, capacity."""

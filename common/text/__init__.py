@@ -1,1 +1,0 @@
-"""What people read: numbers and durations in words."""

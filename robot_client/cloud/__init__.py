@@ -1,0 +1,1 @@
+"""Servers of Offboard: what is said to them over ZMQ."""
