@@ -273,14 +273,16 @@ def test_a_group_without_a_usage_file_is_summed_over_its_processes(machine: Mach
     machine.process("cpu", "/offboard")
     group = machine.write(limited / "offboard", cpu_cfs_quota_us="50000\n")
     (group / "cpu.cfs_period_us").write_text("100000\n")
-    (group / "cgroup.procs").write_text(f"{os.getpid()}\n41\n42\n")  # 42 has just ended
+    own = os.getpid()  # in a container it is as small as any number written here
+    busy, ended = own + 1, own + 2
+    (group / "cgroup.procs").write_text(f"{own}\n{busy}\n{ended}\n")
     root = machine.proc.parent / "all"
-    (root / "41").mkdir(parents=True)
+    (root / str(busy)).mkdir(parents=True)
 
     def other(seconds: float) -> None:
         ticks = round(seconds / 2 / TICK_S)
-        (root / "41" / "stat").write_text(
-            f"41 (a busy (one)) R 1 1 1 0 -1 4 0 0 0 0 {ticks} {ticks} 0 0 20\n"
+        (root / str(busy) / "stat").write_text(
+            f"{busy} (a busy (one)) R 1 1 1 0 -1 4 0 0 0 0 {ticks} {ticks} 0 0 20\n"
         )
 
     other(1.0)
