@@ -45,12 +45,12 @@ type: $(DEV_READY) ## check types with mypy, strict
 
 # tests/conftest.py says which tests are `long`, and which are `alone`.
 test: $(DEV_READY) ## run what guards the core, in minutes: unit tests, and a real server, relay and robot
-	$(BIN)/pytest --numprocesses 2 -m "not long and not alone" tests/unit tests/integration
+	$(BIN)/python -m tests.twice --numprocesses 2 -m "not long and not alone" tests/unit tests/integration
 	@echo "left out: tests that take long, measure times, or need containers, a browser, Ray or ROS 2: make test-all"
 
 test-all: test ## run every other test that this machine can run, too; skipped tests say why
-	$(BIN)/pytest --numprocesses 3 -m "long and not alone" --ignore tests/ros2
-	$(BIN)/pytest -m alone --ignore tests/ros2
+	$(BIN)/python -m tests.twice --numprocesses 3 -m "long and not alone" --ignore tests/ros2
+	$(BIN)/python -m tests.twice -m alone --ignore tests/ros2
 	$(MAKE) --jobs 2 --output-sync=target ray ros2  # they mostly wait
 
 unit: $(DEV_READY) ## run the tests without sockets

@@ -56,10 +56,11 @@ LONG = (
     ),
     *("unit/test_simulation_checks.py", "unit/test_simulation_compare.py", "unit/test_simulated_sets.py"),
 )
-# What measures times that a busy machine would change: no other test runs next to it.
+# What measures times that a busy machine would change, or uses all CPUs: no other test runs next to it.
 ALONE = (
     "browser",
     "chaos/test_scenarios.py",
+    "compose/test_image.py",
     *(
         f"integration/test_{name}.py"
         for name in ("testbed", "three_sites", "variants", "wan", "wan_effects", "wan_speed")

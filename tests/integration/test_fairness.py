@@ -77,7 +77,7 @@ def flood(endpoint: str, rate: float) -> None:
 
 
 def test_a_flood_takes_its_share_and_no_more() -> None:
-    """At 50 times its share it gets `busy`, and as few answers as each other robot; those are served in turn."""
+    """At 50 times its share it gets `busy` and no more answers than others, who are served in turn."""
     with cloud_server("tests.probes", CLOUD_WORKERS="1") as server:
         rate = TIMES / NAP_S / (ROBOTS + 1)  # one worker serves 1 / NAP_S at most
         command = f"from tests.integration.test_fairness import flood; flood({server.endpoint!r}, {rate})"
