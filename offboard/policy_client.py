@@ -9,6 +9,7 @@ for, and `onboard=` answers when no server does.
 import logging
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from types import TracebackType
 from typing import Any, TypeVar
 
@@ -39,17 +40,21 @@ class _Client:
         endpoint: str,
         token: str | None,
         *,
+        groot: bool = False,
         onboard: Onboard | None,
         sites: Mapping[str, str] | None,
         deadline_s: float | None,
         settings: Settings | None,
     ) -> None:
+        own = settings or Settings()
+        if token is not None:
+            own = replace(own, tokens={**own.tokens, SERVER: token})
         self._sites = PolicySites(
             {SERVER: endpoint, **(sites or {})},
+            groot=groot,
             onboard=onboard,
             deadline_s=deadline_s,
-            tokens={} if token is None else {SERVER: token},
-            settings=settings,
+            settings=own,
         )
         until_s = time.monotonic() + (FIRST_S if onboard is None else CONNECT_S)
         while not self._sites.wait(min(SAID_S, max(0.0, until_s - time.monotonic()))):
@@ -173,6 +178,7 @@ class PolicyClient(_Client):
         super().__init__(
             f"{GROOT}{host}:{port}",
             api_token,
+            groot=True,
             onboard=onboard,
             sites=sites,
             deadline_s=timeout_ms / 1000 if deadline_s is None else deadline_s,

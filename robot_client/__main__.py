@@ -5,12 +5,17 @@ What a command does is in `check`, `common.security.keys` and `offboard/ros2`.
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from offboard.common.command_line import Command, CommandParser, add_flags, run_commands
 from offboard.common.config import check, resolve, setting
+
+if TYPE_CHECKING:
+    from offboard.robot_client.check.steps import Line
+    from offboard.robot_client.discovery.roster import Server
 
 ENDPOINT = (
     "tcp://HOST:PORT of the server; dns://HOST:PORT or a sites file FILE.toml: each server there; "
@@ -59,45 +64,50 @@ def _check(argv: Sequence[str]) -> int:
     sys.path.insert(0, str(Path.cwd()))  # so that task modules here are found, as with `python -m`
     import logging
 
-    from offboard.robot_client.check.steps import FAIL, Check
+    from offboard.robot_client.check.steps import FAIL
+    from offboard.robot_client.discovery.roster import Server
     from offboard.robot_client.servers import read_servers
-    from offboard.robot_client.sites.endpoint import is_policy_server
+    from offboard.robot_client.sites.endpoint import check_policy_server, is_policy_server
 
     logging.disable(logging.WARNING)  # the lines say the same
     if is_policy_server(flags.endpoint):
-        return _check_policy_server(flags.endpoint, config)
+        check_policy_server("ENDPOINT", flags.endpoint, insecure=True)
+        servers = [Server(config.site, flags.endpoint)]
+    else:
+        servers = read_servers(flags.endpoint, config.keys)
     failed = False
-    servers = read_servers(flags.endpoint, config.keys)
     for server in servers:
         if len(servers) > 1:
             print(f"{server.site}: {server.endpoint}", flush=True)
-        steps = Check(
-            server.endpoint,
-            keys=config.keys,
-            modules=config.tasks,
-            timeout_s=config.timeout_s,
-            key=server.key,
-        )
-        for line in steps.run():
+        steps = _policy_check if is_policy_server(server.endpoint) else _server_check
+        for line in steps(server, config):
             print(line, flush=True)
             failed = failed or line.status == FAIL
     return int(failed)
 
 
-def _check_policy_server(endpoint: str, config: CheckConfig) -> int:
+def _server_check(server: "Server", config: CheckConfig) -> "Iterator[Line]":
+    from offboard.robot_client.check.steps import Check
+
+    return Check(
+        server.endpoint,
+        keys=config.keys,
+        modules=config.tasks,
+        timeout_s=config.timeout_s,
+        key=server.key,
+    ).run()
+
+
+def _policy_check(server: "Server", config: CheckConfig) -> "Iterator[Line]":
     from offboard.common.security.keys import policy_token
     from offboard.robot_client.check.policy_steps import PolicyCheck
-    from offboard.robot_client.check.steps import FAIL
-    from offboard.robot_client.sites.endpoint import check_policy_server
 
-    check_policy_server("ENDPOINT", endpoint, insecure=True)
-    failed = False
-    token = policy_token(config.keys, config.site)
-    steps = PolicyCheck(endpoint, token=token, observation=config.observation, timeout_s=config.timeout_s)
-    for line in steps.run():
-        print(line, flush=True)
-        failed = failed or line.status == FAIL
-    return int(failed)
+    return PolicyCheck(
+        server.endpoint,
+        token=server.token or policy_token(config.keys, server.site),
+        observation=config.observation,
+        timeout_s=config.timeout_s,
+    ).run()
 
 
 def _gateway(argv: Sequence[str]) -> int:

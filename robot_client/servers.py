@@ -1,6 +1,6 @@
 """Connects an offloader to its servers: those with an endpoint, and those of lists that change.
 
-What a runner does is in `sites` and, for policy servers, in `openpi`; how lists are followed is in
+What a runner does is in `sites` and, for policy servers, in `policy_servers`; how lists are followed is in
 `discovery`.
 """
 
@@ -49,7 +49,8 @@ def connect_sites(
     names = servers.keys() - fixed.keys()
     sources: list[Source] = [DnsName(site, servers[site], key_of(site, None)) for site in sorted(names)]
     if isinstance(sites, Path | str):
-        sources.append(SitesFile(Path(sites), key_of, {ONBOARD, BOTH, *fixed}))
+        taken = {ONBOARD, BOTH, *fixed}
+        sources.append(SitesFile(Path(sites), key_of, taken, insecure=settings.insecure))
     heartbeat_s = EVERY_S if settings.beats(policy) else 0.0
     background = Background()
     connect = partial(
@@ -85,7 +86,7 @@ def read_servers(operand: str, keys: Path | None) -> list[Server]:
     if is_dns(operand):
         return DnsName(CLOUD, operand, key_of(CLOUD, None)).read()
     if operand.endswith(".toml"):
-        return SitesFile(Path(operand), key_of, {ONBOARD, BOTH}).read() or []
+        return SitesFile(Path(operand), key_of, {ONBOARD, BOTH}, insecure=True).read() or []
     check_endpoint("ENDPOINT", operand)
     return [Server(CLOUD, operand)]
 
@@ -104,7 +105,8 @@ def _connect(
             heartbeat_s=heartbeat_s,
             seed=settings.seed,
             insecure=settings.insecure,
-            token=settings.tokens.get(server.site) or policy_token(keys, server.site),
+            token=settings.tokens.get(server.site) or server.token or policy_token(keys, server.site),
+            convert=settings.convert.get(server.site),
             background=background,
         )
     return CloudRunner(

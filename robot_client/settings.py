@@ -143,6 +143,8 @@ class Settings(DecisionOptions):
     `reread_s`: seconds between two reads of a list of servers.
     `seed`: for policies and predictors that draw; the same seed draws the same numbers.
     `tokens`: what policy servers want to see, by site, in place of NAME.token in the folder of the keys.
+    `convert`: for policy servers that want other observations, by site: an object with two functions,
+        `observation`, from that of the task to that of the server, and `action`, back from its answer.
     """
 
     objective: Objective = Mean()
@@ -154,6 +156,7 @@ class Settings(DecisionOptions):
     reread_s: float = 2.0
     seed: int = 0
     tokens: Mapping[str, str] = field(default_factory=dict, repr=False)
+    convert: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         check_types(Settings, {field.name: getattr(self, field.name) for field in fields(self)})
@@ -201,7 +204,7 @@ def check_types(of: Callable[..., Any], given: Mapping[str, Any]) -> None:
     for name, hint in typing.get_type_hints(of).items():
         if name in given and not _fits(given[name], hint):
             kinds = typing.get_args(hint) if _class_of(hint) in _UNIONS else (hint,)
-            allowed = " or ".join(_SHOWN.get(kind := _class_of(one), kind.__name__) for one in kinds)
+            allowed = " or ".join(_shown(one) for one in kinds)
             raise ConfigError(f"{name} {given[name]!r:.200}: must be {allowed}")
 
 
@@ -218,16 +221,25 @@ _SHOWN = {
 }
 
 
+def _shown(hint: Any) -> str:
+    if _class_of(hint) is Mapping and Any in typing.get_args(hint):
+        return "a dictionary"
+    return _SHOWN.get(kind := _class_of(hint), kind.__name__)
+
+
 def _fits(value: object, hint: Any) -> bool:
     kind, parts = _class_of(hint), typing.get_args(hint)
     if kind in _UNIONS:
         return any(_fits(value, one) for one in parts)
+    if kind is Any:
+        return True
     if kind in (int, float):  # numbers of numpy too
         return isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
     if not isinstance(value, kind) or (kind is Iterable and isinstance(value, str)):
         return False
-    items = [*value.keys(), *value.values()] if isinstance(value, Mapping) else value
-    return not isinstance(items, list | tuple) or all(_fits(one, parts[0]) for one in items)
+    if isinstance(value, Mapping):
+        return all(_fits(key, parts[0]) and _fits(one, parts[1]) for key, one in value.items())
+    return not isinstance(value, list | tuple) or all(_fits(one, parts[0]) for one in value)
 
 
 def _class_of(hint: Any) -> Any:

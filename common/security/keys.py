@@ -115,11 +115,14 @@ def robot_keys(folder: Path, site: str, server: bytes | None = None) -> RobotKey
 def policy_token(folder: Path | None, site: str) -> str | None:
     """What a policy server wants to see: the text of SITE.token, a private file; None: nothing."""
     path = None if folder is None else folder / f"{site}{TOKEN}"
-    if path is None or not path.exists():
-        return None
-    token = read_private("keys", path).strip()
+    return None if path is None or not path.exists() else read_token("keys", path)
+
+
+def read_token(where: str, path: Path) -> str:
+    """The token in a private file; ConfigError names the file."""
+    token = read_private(where, path).strip()
     if not _TOKEN.fullmatch(token):
-        raise ConfigError(f"keys: {path} must hold one token: printable letters in one line")
+        raise ConfigError(f"{where}: {path} must hold one token: printable letters in one line")
     return token
 
 

@@ -5,7 +5,7 @@ Lists come from `server_lists` or a simulation; `present_sites` connects to the 
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from random import Random
 
 from offboard.common.errors import ConfigError
@@ -21,12 +21,13 @@ TRY_EVERY = 10  # looks, of which the last one lets the robot try another server
 class Server:
     """A server of a list. Servers with a site GROUP/NAME are equal to the others of their group.
 
-    `key`: its public key (None: the connection is not encrypted).
+    `key`: its public key (None: the connection is not encrypted). `token`: what a policy server wants to see.
     """
 
     site: str
     endpoint: str
     key: bytes | None = None
+    token: str | None = field(default=None, repr=False)
 
 
 class Roster:

@@ -12,12 +12,19 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from offboard.common.errors import CloudBroken, ConfigError, DataError, OffloadError
+from offboard.common.security.keys import read_token
 from offboard.common.security.plain_files import read_plain
 from offboard.common.toml_file import parse_toml, unknown
 from offboard.common.variants import IN_GROUP, SITE_LENGTH_MAX
 from offboard.robot_client.discovery.present_sites import PresentSites
 from offboard.robot_client.discovery.roster import Server
-from offboard.robot_client.sites.endpoint import check_dns, check_endpoint, host_and_port
+from offboard.robot_client.sites.endpoint import (
+    check_dns,
+    check_endpoint,
+    check_policy_server,
+    host_and_port,
+    is_policy_server,
+)
 
 ADDRESSES_MAX = 1_000  # of a name
 FILE_BYTES_MAX = 1_000_000
@@ -26,7 +33,7 @@ TEND_S = 2.0  # the longest pause until the sites connect to new servers and clo
 SETTLE = 0.2  # of the usual pause: until a list that has just changed is read again
 
 _NAME = re.compile(rf"[A-Za-z0-9_-]{{1,{SITE_LENGTH_MAX}}}")
-_KEYS = ("endpoint", "key", "group")
+_KEYS = ("endpoint", "key", "group", "token_file")
 
 log = logging.getLogger(__name__)
 
@@ -45,18 +52,24 @@ class SitesFile:
     """Reads the file. Every mistake in it is a ConfigError or a DataError that names the file.
 
     `key_of`: the public key for a site and the `key` of its entry, if it has one.
-    `taken`: names that sites of this file cannot have.
+    `taken`: names that sites of this file cannot have. `insecure`: see `check_policy_server`.
     `settling`: the file has just changed and may be half-written, so it should be read again soon.
     """
 
     def __init__(
-        self, path: Path, key_of: Callable[[str, str | None], bytes | None], taken: Collection[str]
+        self,
+        path: Path,
+        key_of: Callable[[str, str | None], bytes | None],
+        taken: Collection[str],
+        *,
+        insecure: bool = False,
     ) -> None:
         self.name = f"sites {path}"
         self.settling = False
         self._path = path
         self._key_of = key_of
         self._taken = taken
+        self._insecure = insecure
         self._seen: bytes | None = None
         self._used: bytes | None = None
 
@@ -92,7 +105,9 @@ class SitesFile:
     def _server(self, name: str, table: object) -> Server:
         where = f"{self._path}: [{name}]"
         if not isinstance(table, Mapping):
-            raise DataError(f"{where}: must be a table with `endpoint`, and perhaps `key` and `group`")
+            raise DataError(
+                f"{where}: must be a table with `endpoint`, and perhaps `key`, `group`, `token_file`"
+            )
         for key in table:
             if key not in _KEYS:
                 raise DataError(f"{where}: {unknown('key', key, _KEYS)}")
@@ -105,11 +120,23 @@ class SitesFile:
         if endpoint is None:
             raise DataError(f"{where}: `endpoint` is missing")
         site = name if group is None else f"{group}{IN_GROUP}{name}"
+        key, token_file = _text(where, table, "key"), _text(where, table, "token_file")
         try:
+            if is_policy_server(endpoint):
+                return self._policy_server(site, endpoint, key=key, token_file=token_file)
+            if token_file is not None:
+                raise ConfigError("token_file: only policy servers (ws://, wss://, groot://) take a token")
             check_endpoint("endpoint", endpoint)
-            return Server(site, endpoint, self._key_of(site, _text(where, table, "key")))
+            return Server(site, endpoint, self._key_of(site, key))
         except ConfigError as error:
             raise DataError(f"{where}: {error}") from error
+
+    def _policy_server(self, site: str, endpoint: str, *, key: str | None, token_file: str | None) -> Server:
+        check_policy_server("endpoint", endpoint, insecure=self._insecure)
+        if key is not None:
+            raise ConfigError("key: a policy server has none; wss:// proves who it is by a certificate")
+        path = None if token_file is None else self._path.parent / token_file
+        return Server(site, endpoint, token=None if path is None else read_token("token_file", path))
 
 
 def _text(where: str, table: Mapping[str, Any], key: str) -> str | None:

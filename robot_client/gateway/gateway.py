@@ -8,7 +8,6 @@ import logging
 import signal
 import sys
 import threading
-from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -19,6 +18,7 @@ from offboard.common.logs import start_log
 from offboard.robot_client.gateway.gateway_config import GatewayConfig
 from offboard.robot_client.gateway.groot_gateway import GrootGateway
 from offboard.robot_client.gateway.policy_sites import Onboard, PolicySites
+from offboard.robot_client.policy_servers.converted import check_convert
 from offboard.robot_client.policy_servers.groot import GROOT
 from offboard.robot_client.records.recording import Recording
 from offboard.robot_client.settings import Settings
@@ -31,12 +31,20 @@ log = logging.getLogger(__name__)
 def run_gateway(config: GatewayConfig) -> int:
     """Serve clients until SIGTERM or Ctrl-C."""
     start_log(config.log, "text")
-    onboard = None if config.onboard is None else _function(config.onboard)
+    onboard: Onboard | None = None
+    if config.onboard is not None:
+        onboard = _object("--onboard", config.onboard)
+        if not callable(onboard):
+            raise ConfigError(f"--onboard: {config.onboard!r} is not a function")
+    convert = {site: _object(f"--convert {site}", name) for site, name in config.converts().items()}
+    for site, one in convert.items():
+        check_convert(f"--convert {site}", one)
+    settings = Settings(insecure=config.insecure, convert=convert)
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     with contextlib.closing(Recording(trace=config.trace, metrics=config.metrics)) as recording:
-        connect = partial(_connect, config, onboard, recording)
+        connect = partial(_connect, config, onboard, settings=settings, recording=recording)
         if config.listen.startswith(GROOT):
             GrootGateway(config.listen, connect).serve(stop)
         else:
@@ -46,15 +54,18 @@ def run_gateway(config: GatewayConfig) -> int:
     return 0
 
 
-def _connect(config: GatewayConfig, onboard: Onboard | None, recording: Recording) -> PolicySites:
+def _connect(
+    config: GatewayConfig, onboard: Onboard | None, *, settings: Settings, recording: Recording
+) -> PolicySites:
     """The sites of one client."""
     sites = PolicySites(
         config.sites(),
+        groot=config.listen.startswith(GROOT),
         onboard=onboard,
         quality=config.quality,
         deadline_s=config.deadline_s,
         keys=config.keys,
-        settings=Settings(insecure=config.insecure),
+        settings=settings,
         observers=recording.observers,
     )
     if recording.live is not None:
@@ -64,15 +75,12 @@ def _connect(config: GatewayConfig, onboard: Onboard | None, recording: Recordin
     return sites
 
 
-def _function(name: str) -> Callable[[Any], Any]:
-    """The function of MODULE:FUNCTION."""
+def _object(flag: str, name: str) -> Any:
+    """What MODULE:OBJECT names; the folder in which the gateway was started is searched, too."""
     module, _, attribute = name.partition(":")
-    sys.path.insert(0, str(Path.cwd()))
+    if str(Path.cwd()) not in sys.path:
+        sys.path.insert(0, str(Path.cwd()))
     try:
-        found: Any = getattr(import_module(module), attribute)
+        return getattr(import_module(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f"--onboard: {name!r}: {error}; give MODULE:FUNCTION") from error
-    if not callable(found):
-        raise ConfigError(f"--onboard: {name!r} is not a function")
-    function: Callable[[Any], Any] = found
-    return function
+        raise ConfigError(f"{flag}: {name!r}: {error}; give MODULE:NAME") from error

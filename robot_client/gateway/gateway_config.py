@@ -32,6 +32,12 @@ class GatewayConfig:
     onboard: str | None = setting(
         None, "policy on the robot, which maps an observation to an action", metavar="MODULE:FUNCTION"
     )
+    convert: tuple[str, ...] = setting(
+        (),
+        "for a server that wants other observations or speaks the other protocol: an object with the "
+        "functions observation and action",
+        metavar="NAME=MODULE:OBJECT",
+    )
     quality: float = setting(
         QUALITY_ONBOARD, "quality of the onboard policy, where the servers have 1", minimum=0.0, maximum=1.0
     )
@@ -58,10 +64,14 @@ class GatewayConfig:
         if not on_loopback(host):
             text = "--listen: %s: anybody who reaches it can ask; remedy: listen on loopback"
             log.warning(text, self.listen)
+        converts = self.converts()
+        if unknown := converts.keys() - self.sites().keys():
+            raise ConfigError(f"--convert: {min(unknown)!r} is no --site")
         for site, endpoint in self.sites().items():
-            if not endpoint.startswith(schemes):
+            if not endpoint.startswith(schemes) and site not in converts:
                 raise ConfigError(
-                    f"--site {site}: {endpoint!r} is not {' or '.join(schemes)}, as --listen is"
+                    f"--site {site}: {endpoint!r} is not {' or '.join(schemes)}, as --listen is; give a "
+                    f"--convert {site}=MODULE:OBJECT"
                 )
             check_policy_server(f"--site {site}", endpoint, insecure=self.insecure)
 
@@ -71,10 +81,17 @@ class GatewayConfig:
         return host.strip("[]"), int(port) if port.isdigit() else 0
 
     def sites(self) -> dict[str, str]:
-        found = {}
-        for one in self.site:
-            name, equals, endpoint = one.partition("=")
-            if not equals or not name or name in found:
-                raise ConfigError(f"--site: {one!r} is not NAME=ws://HOST:PORT with a name of its own")
-            found[name] = endpoint
-        return found
+        return _named("--site", self.site, "NAME=ws://HOST:PORT")
+
+    def converts(self) -> dict[str, str]:
+        return _named("--convert", self.convert, "NAME=MODULE:OBJECT")
+
+
+def _named(flag: str, given: tuple[str, ...], shape: str) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for one in given:
+        name, equals, value = one.partition("=")
+        if not equals or not name or name in found:
+            raise ConfigError(f"{flag}: {one!r} is not {shape} with a name of its own")
+        found[name] = value
+    return found

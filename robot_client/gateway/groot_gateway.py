@@ -134,9 +134,9 @@ class Session:
         if endpoint == "ping":
             return protocol.pack_value(READY)
         if endpoint == "get_action":
-            found = sites.call(Raw(data))
+            found = sites.call(Raw(data, protocol))
         elif endpoint in ("reset", "get_modality_config"):
-            found = sites.ask_all(Raw(data), str(endpoint))
+            found = sites.ask_all(Raw(data, protocol), str(endpoint))
         else:
             raise OffloadError(f"endpoint {str(endpoint)[:40]!r}: the gateway answers {', '.join(ENDPOINTS)}")
         return bytes(found.data)

@@ -13,8 +13,7 @@ from typing import Any
 from offboard.common.errors import CloudBroken, ConfigError, OffloadError, TaskFailed
 from offboard.common.tasks import task
 from offboard.robot_client.offloader import Offloader
-from offboard.robot_client.policy_servers.groot import GROOT, Groot, GrootCall
-from offboard.robot_client.policy_servers.openpi import pack, unpack
+from offboard.robot_client.policy_servers.groot import GROOT, observation_of
 from offboard.robot_client.policy_servers.protocol import Raw
 from offboard.robot_client.records.record import Record
 from offboard.robot_client.settings import Settings
@@ -29,16 +28,18 @@ LOOK_S = 0.02  # between two looks whether a server is there
 Onboard = Callable[[Any], Any]
 
 _lock = threading.Lock()
-_tasks: dict[tuple[Onboard | None, float, bool], Callable[[Any], Any]] = {}
+_tasks: dict[tuple[Onboard | None, float], Callable[[Any], Any]] = {}
 
 
 class PolicySites:
     """Answers observations, each by one of `sites` or onboard.
 
+    groot: whether the client speaks the protocol of GR00T, or else that of openpi. Sites of the other
+    protocol need an entry in `settings.convert`.
     onboard: maps an observation to an action; without it an observation that no server answers raises
     OffloadError. quality: of its actions, where those of the servers have 1.
     deadline_s: until which an answer should be there; onboard starts in time for that.
-    tokens: what servers want to see, by site; the folder `keys` may hold them as NAME.token.
+    keys: folder with NAME.token, what the server of a site wants to see.
     observers: called with the record of each observation.
     """
 
@@ -46,33 +47,32 @@ class PolicySites:
         self,
         sites: Mapping[str, str],
         *,
+        groot: bool = False,
         onboard: Onboard | None = None,
         quality: float = QUALITY_ONBOARD,
         deadline_s: float | None = None,
         keys: Path | str | None = None,
-        tokens: Mapping[str, str] | None = None,
         settings: Settings | None = None,
         observers: Iterable[Callable[[Record], None]] = (),
     ) -> None:
         for site, endpoint in sites.items():
             if not is_policy_server(endpoint):
                 raise ConfigError(f"{site}: {endpoint!r} is no policy server (ws://, wss:// or groot://)")
-        schemes = {endpoint.startswith(GROOT) for endpoint in sites.values()}
-        if len(schemes) != 1:
-            raise ConfigError(
-                f"{', '.join(sites.values()) or 'sites'}: give servers of one protocol, ws or groot"
-            )
         own = settings or Settings()
+        for site, endpoint in sites.items():
+            if endpoint.startswith(GROOT) != groot and site not in own.convert:
+                needs = f"{GROOT}, as the client does" if groot else "ws:// or wss://, as the client does"
+                raise ConfigError(f"{site}: {endpoint!r} does not speak {needs}; give a `convert` for it")
         if onboard is None:
             own = replace(own, s_per_quality=NO_ONBOARD_S, duplicates=0.0)
         self._has_onboard, self._deadline_s = onboard is not None, deadline_s
         self._only = next(iter(sites)) if len(sites) == 1 else None
-        groot = schemes == {True}
-        self._task = _task_of(onboard, 0.0 if onboard is None else quality, groot=groot)
+        self._converted = own.convert.keys()
+        self._task = _task_of(onboard, 0.0 if onboard is None else quality)
         self.offload = Offloader.connect(
             sites=sites,
             keys=keys,
-            settings=replace(own, tokens={**own.tokens, **(tokens or {})}),
+            settings=own,
             observers=observers,
         )
 
@@ -93,9 +93,9 @@ class PolicySites:
         return self._call(item)[0]
 
     def ask_all(self, call: Any, what: str) -> Any:
-        """Send this request to each server that is there; the answer of the last one."""
+        """Send this request to each server that is there and needs no conversion; the last answer."""
         answer = None
-        for site in self._present():
+        for site in self._present().keys() - self._converted:
             answer, record = self._call(call, where=site)
             if record.used != site:
                 raise CloudBroken(f"{what}: {record.happened}")
@@ -151,10 +151,10 @@ class PolicySites:
         return sorted(present, key=lambda site: seconds.get(site, 0.0))
 
 
-def _task_of(onboard: Onboard | None, quality: float, *, groot: bool) -> Callable[[Any], Any]:
+def _task_of(onboard: Onboard | None, quality: float) -> Callable[[Any], Any]:
     """The task of this onboard policy; one for each, as the number of tasks is limited."""
     with _lock:
-        key = onboard, quality, groot
+        key = onboard, quality
         if key not in _tasks:
 
             @task(
@@ -168,27 +168,9 @@ def _task_of(onboard: Onboard | None, quality: float, *, groot: bool) -> Callabl
                 if onboard is None:
                     raise OffloadError("there is no onboard policy")
                 if not isinstance(item, Raw):
-                    return onboard(_observation(item))
-                if groot:
-                    return _groot_answer(onboard, item.data)
-                return Raw(pack(onboard(unpack(item.data))))
+                    return onboard(observation_of(item))
+                answer = onboard(item.client.read_request(item.data))
+                return Raw(item.client.pack_answer(answer), item.client)
 
             _tasks[key] = policy
         return _tasks[key]
-
-
-def _groot_answer(onboard: Onboard, data: bytes) -> Raw:
-    """The answer of the onboard policy to a request of a client of GR00T."""
-    protocol = Groot("")
-    request = protocol.read(data)
-    answer = onboard(_observation(GrootCall(request.get("endpoint", "get_action"), request.get("data"))))
-    return Raw(protocol.pack_value(list(answer) if isinstance(answer, tuple) else [answer, {}]))
-
-
-def _observation(item: Any) -> Any:
-    """What the onboard policy gets."""
-    if isinstance(item, GrootCall):
-        if item.endpoint != "get_action" or item.data is None:
-            raise OffloadError(f"{item.endpoint}: the onboard policy has no such request")
-        return item.data["observation"]
-    return item

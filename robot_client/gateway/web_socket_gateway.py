@@ -10,7 +10,7 @@ from typing import Any
 
 from offboard.common.errors import ConfigError, MissingExtra, OffloadError, describe
 from offboard.robot_client.gateway.policy_sites import PolicySites
-from offboard.robot_client.policy_servers.openpi import pack
+from offboard.robot_client.policy_servers.openpi import OpenPi, pack
 from offboard.robot_client.policy_servers.protocol import OBSERVATION_BYTES_MAX, Raw, shortened
 
 try:
@@ -76,12 +76,13 @@ class WebSocketGateway:
 
     def _talk(self, client: ServerConnection, sites: PolicySites) -> None:
         """Answer one observation after the other, until the client leaves."""
+        protocol = OpenPi("")
         client.send(pack(sites.metadata()))
         for message in client:
             try:
                 if not isinstance(message, bytes):
                     raise OffloadError("an observation is a binary message")
-                answer = sites.call(Raw(message))
+                answer = sites.call(Raw(message, protocol))
             except Exception as error:  # noqa: BLE001 - the client gets it, as from a policy server
                 text = shortened(str(error) if isinstance(error, OffloadError) else describe(error))
                 client.send(text)

@@ -122,8 +122,8 @@ def _planned(first: str, forecast: Forecast) -> Hedge | str:
             return "no second site answers"
         return "no second site is known" if forecast.deadline_s is None else "no second site is as good"
     second = cheapest(others)
-    lost_s = 0.0 if others[second] == math.inf else forecast.sites[second].quality.lost_s
-    after_s = late_after_s(chosen, others[second], max(0.0, lost_s - chosen.quality.lost_s))
+    lost_s = forecast.sites[second].quality.lost_s - chosen.quality.lost_s
+    after_s = late_after_s(chosen, others[second], max(0.0, lost_s))
     if after_s is None or after_s <= 0:  # a line below 0 does not say when a task is late
         return f"unknown when {first} is late"
     if forecast.deadline_s is not None and after_s >= forecast.deadline_s:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import msgpack
 import numpy as np
 
-from offboard.common.errors import BadValue, CloudBroken, ProtocolError
+from offboard.common.errors import BadValue, CloudBroken, OffloadError, ProtocolError
 from offboard.common.wire.item_count import check_items
 from offboard.common.wire.values import NESTING_MAX, unpack_bounded
 from offboard.robot_client.policy_servers.asyncio_timeout import timeout
@@ -24,6 +24,8 @@ from offboard.robot_client.policy_servers.protocol import (
     OBSERVATION_BYTES_MAX,
     OPEN_S,
     Channel,
+    Raw,
+    check_finite,
     failed,
 )
 
@@ -46,6 +48,8 @@ class Groot:
 
     token: the `api_token` of each request.
     """
+
+    converts = False
 
     def __init__(self, endpoint: str, token: str | None = None) -> None:
         self._endpoint, self._token = endpoint.removeprefix(GROOT), token
@@ -85,17 +89,25 @@ class Groot:
         check_items(packed, "it", BadValue)
         return packed
 
-    def forward(self, data: bytes) -> bytes:
+    def forward(self, raw: Raw) -> bytes:
         if self._token is None:
-            return data
-        request = unpack_bounded(data, OBSERVATION_BYTES_MAX)
+            return raw.data
+        request = unpack_bounded(raw.data, OBSERVATION_BYTES_MAX)
         if not isinstance(request, dict):
             raise BadValue("the request is no map")
         packed: bytes = msgpack.packb({**request, "api_token": self._token})
         return packed
 
+    def read_request(self, data: bytes) -> Any:
+        request = self.read(data)
+        call = GrootCall(request.get("endpoint", "get_action"), request.get("data"))
+        return observation_of(call)
+
+    def pack_answer(self, value: Any) -> bytes:
+        return self.pack_value(list(value) if isinstance(value, tuple) else [value, {}])
+
     def pack_value(self, value: Any) -> bytes:
-        """The message of an answer, in the encoding of what was read."""
+        """The bytes of a value, in the encoding of what was read."""
         packed: bytes = msgpack.packb(value, default=_map_of if self._maps else _npy_of)
         return packed
 
@@ -109,7 +121,11 @@ class Groot:
             if self._maps is None:  # perhaps it speaks the other one
                 self._tries_maps = not self._tries_maps
             raise failed(value["error"])
-        return tuple(value) if isinstance(value, list) else value
+        if not isinstance(value, list):
+            return value
+        for part in value[:1]:
+            check_finite(part)
+        return tuple(value)
 
     def run_s(self, value: Any) -> float | None:  # noqa: ARG002 - it does not say
         return None
@@ -134,6 +150,15 @@ class Groot:
         if isinstance(tree, msgpack.ExtType | msgpack.Timestamp):
             raise ProtocolError(f"unexpected {type(tree).__name__} in a value")
         return tree
+
+
+def observation_of(item: Any) -> Any:
+    """What another policy than a server of GR00T gets: the observation without what is around it."""
+    if not isinstance(item, GrootCall):
+        return item
+    if item.endpoint != "get_action" or item.data is None:
+        raise OffloadError(f"{item.endpoint}: only servers of GR00T have such a request")
+    return item.data["observation"]
 
 
 def array_of(data: Any) -> "np.ndarray[Any, Any]":

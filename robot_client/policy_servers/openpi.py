@@ -22,6 +22,8 @@ from offboard.robot_client.policy_servers.protocol import (
     OBSERVATION_BYTES_MAX,
     OPEN_S,
     Channel,
+    Raw,
+    check_finite,
     failed,
     shortened,
 )
@@ -40,6 +42,8 @@ class OpenPi:
 
     token: sent as `Authorization`; `Api-Key` comes before it, unless it names its scheme.
     """
+
+    converts = False
 
     def __init__(self, endpoint: str, token: str | None = None) -> None:
         from offboard.robot_client.policy_servers.web_socket import open_web_socket  # its library is an extra
@@ -69,8 +73,14 @@ class OpenPi:
     def pack(self, item: Any) -> bytes:
         return pack(item)
 
-    def forward(self, data: bytes) -> bytes:
-        return data
+    def forward(self, raw: Raw) -> bytes:
+        return raw.data
+
+    def read_request(self, data: bytes) -> Any:
+        return unpack(data)
+
+    def pack_answer(self, value: Any) -> bytes:
+        return pack(value)
 
     def read(self, message: bytes | str) -> Any:
         if isinstance(message, str):
@@ -78,6 +88,7 @@ class OpenPi:
         value = unpack(message)
         if isinstance(value, dict) and isinstance(value.get("type"), str) and value["type"] == "error":
             raise failed(value.get("message"))
+        check_finite(value.get("actions") if isinstance(value, dict) else value)
         return value
 
     def run_s(self, value: Any) -> float | None:

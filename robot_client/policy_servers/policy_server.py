@@ -19,6 +19,7 @@ from offboard.common.logs import RareLog
 from offboard.common.tasks import Kind, Task
 from offboard.common.wire.channel import check_room
 from offboard.common.wire.payload import payload_bytes
+from offboard.robot_client.policy_servers.converted import Convert, Converted
 from offboard.robot_client.policy_servers.groot import GROOT, Groot
 from offboard.robot_client.policy_servers.openpi import OpenPi
 from offboard.robot_client.policy_servers.protocol import Channel, Observation, PolicyProtocol, Raw
@@ -44,7 +45,8 @@ class PolicyServerRunner:
     is sent while an observation is under way, but just before it, if one is due.
 
     A thread with an event loop owns the connection. `insecure`: allow plain connections beyond this computer.
-    `token`: what the server wants to see. `metadata`: what it says about itself.
+    `token`: what the server wants to see. `convert`: for a server that wants other
+    observations. `metadata`: what it says about itself.
     """
 
     def __init__(
@@ -56,6 +58,7 @@ class PolicyServerRunner:
         seed: int = 0,
         insecure: bool = False,
         token: str | None = None,
+        convert: Convert | None = None,
         background: Background | None = None,
     ) -> None:
         check_policy_server(site, endpoint, insecure=insecure)
@@ -66,7 +69,8 @@ class PolicyServerRunner:
             log.warning(
                 "%s: %s: its token is sent over a plain connection; remedy: use wss://", site, endpoint
             )
-        self._protocol = protocol_of(endpoint, token)
+        protocol = protocol_of(endpoint, token)
+        self._protocol = protocol if convert is None else Converted(protocol, convert)
         self.metadata: dict[Any, Any] = {}
         self.site = site
         self._endpoint = endpoint
@@ -97,8 +101,8 @@ class PolicyServerRunner:
         published_s = time.perf_counter()
         item = task.args[0]
         try:
-            forward, packed = self._protocol.forward, self._protocol.pack
-            data = forward(item.data) if isinstance(item, Raw) else packed(item)
+            raw = item if isinstance(item, Raw) else None
+            data = self._protocol.pack(item) if raw is None else self._protocol.forward(raw)
         except Exception as error:  # noqa: BLE001 - whatever cannot be sent, onboard can answer
             why = str(error) if isinstance(error, BadValue) else describe(error)
             return self._pauses.refuse(self.site, task.kind.name, f"observation: {why}")
@@ -107,7 +111,7 @@ class PolicyServerRunner:
             task=task,
             protocol=self._protocol,
             data=data,
-            raw=isinstance(item, Raw),
+            raw=raw,
             published_s=published_s,
             deadline_s=published_s + budget_s,
         )

@@ -9,6 +9,8 @@ from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
+
 from offboard.common.errors import CloudBroken, ProtocolError
 from offboard.robot_client.sites.conversation import PendingRequest
 from offboard.robot_client.sites.runner import Execution
@@ -18,12 +20,6 @@ ANSWER_BYTES_MAX = 16 * 1024 * 1024
 DIMENSIONS_MAX = 32
 TEXT_LENGTH_MAX = 200  # of an error of the server, in logs and records
 OPEN_S = 5.0  # an attempt to connect, and then the greeting, are short, so that the next one begins soon
-
-
-class Raw(NamedTuple):
-    """A message as it crosses the link. A raw observation gets a raw answer."""
-
-    data: bytes
 
 
 class Channel(Protocol):
@@ -38,8 +34,23 @@ class Channel(Protocol):
         """Send a ping; `answered` is called if its answer comes."""
 
 
+class ClientProtocol(Protocol):
+    """The protocol of a client, whose messages are forwarded as they are where that is possible."""
+
+    def read_request(self, data: bytes) -> Any:
+        """The observation in a request, as the onboard policy gets it."""
+
+    def pack_answer(self, value: Any) -> bytes:
+        """The message of an answer that no server of this protocol has given."""
+
+
 class PolicyProtocol(Protocol):
-    """One protocol, for one server."""
+    """One protocol, for one server.
+
+    converts: whether a client would not understand the answers of this server as they come.
+    """
+
+    converts: bool
 
     def open(self) -> "AbstractAsyncContextManager[Channel]": ...
 
@@ -49,7 +60,7 @@ class PolicyProtocol(Protocol):
     def pack(self, item: Any) -> bytes:
         """The message for an observation. An error that it raises says what cannot be sent."""
 
-    def forward(self, data: bytes) -> bytes:
+    def forward(self, raw: "Raw") -> bytes:
         """The message for a raw observation: the same, with our own token if the server wants one."""
 
     def read(self, message: bytes | str) -> Any:
@@ -59,13 +70,23 @@ class PolicyProtocol(Protocol):
         """The computing time that the server says in its answer, in seconds; None if it does not."""
 
 
+class Raw(NamedTuple):
+    """A message as it crosses the link to a client. A raw observation gets a raw answer.
+
+    client: the protocol of that client.
+    """
+
+    data: bytes
+    client: ClientProtocol
+
+
 @dataclass(eq=False, slots=True, kw_only=True)
 class Observation(PendingRequest):
-    """The observation of one task, as bytes. raw: its answer is returned as it came."""
+    """The observation of one task, as bytes. raw: what it was, if its answer is to be raw, too."""
 
     protocol: PolicyProtocol
     data: bytes
-    raw: bool = False
+    raw: Raw | None = None
 
     def answered(self, message: bytes | str, now_s: float) -> Execution:
         """The execution that the answer means; the server says in it how long it computed, if it does."""
@@ -75,8 +96,9 @@ class Observation(PendingRequest):
         run_s = self.protocol.run_s(value)
         if run_s is not None and run_s > seconds - queue_s:
             run_s = None
-        if self.raw and failure is None and isinstance(message, bytes):
-            value = Raw(message)
+        if self.raw is not None and failure is None and isinstance(message, bytes):
+            client = self.raw.client
+            value = Raw(client.pack_answer(value) if self.protocol.converts else message, client)
         return Execution(
             self.site,
             seconds,
@@ -97,6 +119,13 @@ class Observation(PendingRequest):
             return None, error
         except ProtocolError as error:
             return None, CloudBroken(f"answer: {error}")
+
+
+def check_finite(action: Any) -> None:
+    """ProtocolError if an array of an action has a number that is not finite: a robot must not play it."""
+    for part in action.values() if isinstance(action, dict) else (action,):
+        if isinstance(part, np.ndarray) and part.dtype.kind == "f" and not np.isfinite(part).all():
+            raise ProtocolError("an action has values that are not finite")
 
 
 def shortened(text: str) -> str:

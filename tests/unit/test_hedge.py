@@ -107,6 +107,9 @@ def test_a_first_call_does_not_wait_for_a_server_alone() -> None:
     decision = decide("hedge:greedy", sites)
     assert (decision.site, decision.both) == (CLOUD, False)
     assert decision.second == Hedge(ONBOARD, pytest.approx(0.1 + 1.645 * 0.01))
+    worse = sites[ONBOARD]._replace(quality=Quality(0.5, 0.5))
+    later = decide("hedge:greedy", sites | {ONBOARD: worse}).second
+    assert later == Hedge(ONBOARD, pytest.approx(0.1 + 1.645 * 0.01 + 0.5)), "the better answer should come"
     many = known(1.0, errors=LATE)
     assert decide("hedge:greedy", sites | {CLOUD: many}).second == Hedge(ONBOARD, 12.25), "later than any"
     failing = {ONBOARD: Outlook(failures=6), CLOUD: many}

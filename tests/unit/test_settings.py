@@ -150,6 +150,7 @@ WRONG_SETTINGS = [
     ({"reread_s": "2"}, "reread_s '2': must be a number"),
     ({"seed": "1"}, "seed '1': must be a whole number"),
     ({"tokens": "x"}, "tokens 'x': must be a dictionary of strings"),
+    ({"convert": "x"}, "convert 'x': must be a dictionary"),
 ]
 
 

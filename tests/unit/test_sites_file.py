@@ -38,6 +38,34 @@ def test_a_file_lists_servers_by_name(listed: SitesFile, tmp_path: Path) -> None
     ]
 
 
+def test_a_policy_server_may_have_a_token(listed: SitesFile, tmp_path: Path) -> None:
+    """It is in a private file next to the list, and is not shown; the server needs no key."""
+    (tmp_path / "gpu.token").write_text("a-secret\n")
+    (tmp_path / "gpu.token").chmod(0o600)
+    (tmp_path / "sites.toml").write_text(
+        '[gpu]\nendpoint = "wss://10.0.0.7:8000"\ntoken_file = "gpu.token"\n'
+        '[near]\nendpoint = "groot://127.0.0.1:5555"\n'
+    )
+    servers = listed.read()
+    assert servers == [
+        Server("gpu", "wss://10.0.0.7:8000", token="a-secret"),
+        Server("near", "groot://127.0.0.1:5555"),
+    ]
+    assert "a-secret" not in repr(servers)
+
+
+def test_a_token_that_others_can_read_is_refused(listed: SitesFile, tmp_path: Path) -> None:
+    """The error names the file, and not the token."""
+    (tmp_path / "gpu.token").write_text("a-secret\n")
+    (tmp_path / "gpu.token").chmod(0o644)
+    (tmp_path / "sites.toml").write_text(
+        '[gpu]\nendpoint = "wss://10.0.0.7:8000"\ntoken_file = "gpu.token"\n'
+    )
+    with pytest.raises(DataError, match=r"\[gpu\]: token_file: .*gpu\.token") as raised:
+        listed.read()
+    assert "a-secret" not in str(raised.value)
+
+
 def test_a_change_counts_once_two_reads_agree(listed: SitesFile, tmp_path: Path) -> None:
     """A list that is being written, even one that is whole so far, is not used before it stands still."""
     path = tmp_path / "sites.toml"
@@ -65,6 +93,9 @@ def test_a_change_counts_once_two_reads_agree(listed: SitesFile, tmp_path: Path)
         ("[gpu]\nendpoint = 5", r"\[gpu\]: endpoint 5 must be a string"),
         ('[gpu]\nendpoint = "tcp://a"', r"\[gpu\]: endpoint: 'tcp://a' is not tcp://HOST:PORT"),
         (f'{GPU}keys = "a"', r"\[gpu\]: unknown key 'keys'; did you mean 'key'\?"),
+        (f'{GPU}token_file = "a"', r"\[gpu\]: token_file: only policy servers"),
+        (GPU.replace("tcp", "wss") + 'key = "a"', r"\[gpu\]: key: a policy server has none"),
+        (GPU.replace("tcp", "ws"), r"\[gpu\]: endpoint: 'ws://10.0.0.7:5555' is not encrypted"),
         (f'{GPU}group = "a b"', r"\[gpu\]: 'a b' is not a free name"),
         (GPU.replace("gpu", "onboard"), r"\[onboard\]: 'onboard' is not a free name"),
         (GPU.replace("gpu", "nokey"), r"\[nokey\]: it needs keys"),

@@ -5,6 +5,7 @@ import os
 import signal
 import socket
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -64,3 +65,48 @@ def policy_server(third_party: Path, tmp_path: Path) -> Iterator[Callable[[], Po
             return server
 
         yield start
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as unused:
+        return int(unused.getsockname()[1])
+
+
+class GrootServer:
+    """A server in a process, which can be killed and started again."""
+
+    def __init__(self, dialect: str, token: str | None) -> None:
+        self.port = free_port()
+        self.endpoint = f"groot://127.0.0.1:{self.port}"
+        self._command = [
+            sys.executable,
+            str(HERE / "groot_server.py"),
+            str(self.port),
+            dialect,
+            *([token] if token else []),
+        ]
+        self.start()
+
+    def start(self) -> None:
+        self._process = subprocess.Popen(self._command)
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait()
+
+    def signal(self, number: signal.Signals) -> None:
+        self._process.send_signal(number)
+
+
+@pytest.fixture
+def groot() -> Iterator[Callable[..., GrootServer]]:
+    """Factory: a running server that speaks one of the encodings."""
+    made: list[GrootServer] = []
+
+    def start(dialect: str = "npy", token: str | None = None) -> GrootServer:
+        made.append(GrootServer(dialect, token))
+        return made[-1]
+
+    yield start
+    for one in made:
+        one.kill()

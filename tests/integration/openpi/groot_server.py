@@ -48,6 +48,8 @@ BAD = {
     },
     "dtype": lambda: as_map(np.array([1 + 2j])),
     "map object": lambda: {b"nd": True, b"type": "|O", b"kind": b"O", b"shape": (1,), b"data": b"x"},
+    "nan": lambda: npy(np.array([0.0, np.nan])),
+    "items": lambda: [{}] * 999_000,
     "large": lambda: npy(np.zeros(100_000_000, np.uint8)),
 }
 

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -18,12 +17,14 @@ from offboard import CloudBroken, ConfigError, Offloader, Settings, task
 from offboard.policy_client import PolicyClient
 from offboard.robot_client.policy_servers.groot import Groot, GrootCall, array_of
 from offboard.robot_client.sites.runner import ONBOARD
+from tests.integration.openpi.conftest import GrootServer, free_port
 from tests.integration.openpi.robot import until
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
 
-SERVER = Path(__file__).parent / "groot_server.py"
 STATE = np.arange(3, dtype=np.float32)
+BAD = ("object", "header", "length", "shape", "dtype", "map object", "nan", "large")
+MEMORY_MIB_MAX = 256  # as docs/policy_servers.md says
 START_S = 20.0
 BACK_S = 3.0
 
@@ -37,45 +38,6 @@ BACK_S = 3.0
 )
 def act(observation: dict[str, Any]) -> Any:
     return {"action": np.asarray(observation["state"]) * 2}, {"by": "onboard"}
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as unused:
-        return int(unused.getsockname()[1])
-
-
-class GrootServer:
-    """A server in a process, which can be killed and started again."""
-
-    def __init__(self, dialect: str, token: str | None) -> None:
-        self.port = free_port()
-        self.endpoint = f"groot://127.0.0.1:{self.port}"
-        self._command = [sys.executable, str(SERVER), str(self.port), dialect, *([token] if token else [])]
-        self.start()
-
-    def start(self) -> None:
-        self._process = subprocess.Popen(self._command)
-
-    def kill(self) -> None:
-        self._process.kill()
-        self._process.wait()
-
-    def signal(self, number: signal.Signals) -> None:
-        self._process.send_signal(number)
-
-
-@pytest.fixture
-def groot() -> Iterator[Callable[..., GrootServer]]:
-    """Factory: a running server that speaks one of the encodings."""
-    made: list[GrootServer] = []
-
-    def start(dialect: str = "npy", token: str | None = None) -> GrootServer:
-        made.append(GrootServer(dialect, token))
-        return made[-1]
-
-    yield start
-    for one in made:
-        one.kill()
 
 
 @pytest.fixture
@@ -113,7 +75,7 @@ def test_a_site_answers_in_either_encoding(
         assert time.monotonic() - began_s < BACK_S
 
 
-@pytest.mark.parametrize("bad", ["object", "header", "length", "shape", "dtype", "map object", "large"])
+@pytest.mark.parametrize("bad", BAD)
 def test_a_hostile_answer_is_refused_with_one_line(
     groot: Callable[..., GrootServer], offload: Callable[..., Offloader], bad: str
 ) -> None:
@@ -126,6 +88,17 @@ def test_a_hostile_answer_is_refused_with_one_line(
     (error,) = [one.error for one in record.executions if one.site == "gpu"]
     assert error.startswith("CloudBroken: ")
     assert "\n" not in error
+
+
+def test_hostile_answers_take_little_memory(groot: Callable[..., GrootServer]) -> None:
+    """For none of them the robot holds more than MEMORY_MIB_MAX, nor for the most items allowed."""
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.integration.openpi.hostile_memory", groot().endpoint, *BAD, "items"],
+        capture_output=True, text=True, check=True, timeout=90,
+    )  # fmt: skip
+    held = {kind: float(mib) for kind, _, mib in (line.rpartition(" ") for line in done.stdout.splitlines())}
+    assert list(held) == [*BAD, "items"]
+    assert 16 < held["items"] < MEMORY_MIB_MAX
 
 
 def test_a_frozen_server_costs_one_answer(
