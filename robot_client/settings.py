@@ -224,7 +224,7 @@ _SHOWN = {
 def _shown(hint: Any) -> str:
     if _class_of(hint) is Mapping and Any in typing.get_args(hint):
         return "a dictionary"
-    return _SHOWN.get(kind := _class_of(hint), kind.__name__)
+    return _SHOWN.get(kind := _class_of(hint), str(kind.__name__))
 
 
 def _fits(value: object, hint: Any) -> bool:
