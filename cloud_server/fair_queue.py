@@ -1,8 +1,9 @@
 """The queue of accepted requests: one line per robot, without clocks; `scheduler` decides who enters it."""
 
+import math
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field
 
 from offboard.common.wire.blobs import StoredBlob
 from offboard.common.wire.messages import Request, byte_count
@@ -23,6 +24,10 @@ class Work:
     queue_s: float = 0.0
     wanted: bool = True
     charged_s: float = 0.0  # worker time that its robot was charged at the start
+    group: tuple[str, str] | None = None  # what it may run together with; None: it runs alone
+    useless_s: float = math.inf  # when nobody needs the answer any more
+    number: int = 0  # of its run, in `Gathering`
+    more: "list[Work]" = field(default_factory=list)  # what runs together with it
 
     def expired(self, now: float) -> bool:
         return now - self.arrived >= self.request.budget_s
@@ -35,6 +40,9 @@ class FairQueue:
     pause: when it returns, it starts with the worker time of the robot that was chosen last. While a request
     runs, its robot is charged the usual run time (start-time fair queueing, Goyal, Vin and Cheng 1996). If
     the queue is full, the longest line loses its newest request.
+
+    Of the robots that are at most a usual run ahead, the one whose answer becomes useless first is served
+    first. So nobody gains by always being in a hurry.
     """
 
     def __init__(self, queue_max: int) -> None:
@@ -46,6 +54,7 @@ class FairQueue:
         self._usual_s = 0.0
         self._count = 0
         self._held = _HeldBytes()
+        self.groups: Counter[tuple[str, str]] = Counter()  # waiting requests that may run together
 
     def bytes_with(self, work: Work) -> int:
         """Memory of all waiting and running requests, in bytes, if this one is added."""
@@ -62,33 +71,72 @@ class FairQueue:
             line = self._longest()
             evicted = line.pop()
             self._held.drop(evicted)
-            self._count -= 1
+            self._left(evicted)
         self._held.add(work)
         self._had_s[work.robot] = max(self._had_s.get(work.robot, 0.0), self._least_s)
         self._lines.setdefault(work.robot, deque()).append(work)
-        self._count += 1
+        self._came(work)
         return evicted
+
+    def put_back(self, work: Work) -> None:
+        """A request from `next` waits again, as the first one of its robot. It is no longer charged."""
+        self.done(work, 0.0)
+        self._held.add(work)
+        self._had_s.setdefault(work.robot, self._least_s)
+        self._lines.setdefault(work.robot, deque()).appendleft(work)
+        self._came(work)
+
+    def _came(self, work: Work) -> None:
+        self._count += 1
+        if work.group is not None:
+            self.groups[work.group] += 1
+
+    def _left(self, work: Work) -> None:
+        self._count -= 1
+        if work.group is not None:
+            self.groups[work.group] -= 1
+            if not self.groups[work.group]:
+                del self.groups[work.group]
 
     def _longest(self) -> deque[Work]:
         return max(self._lines.values(), key=len)
 
-    def next(self) -> Work | None:
-        """The next request. Its robot is charged the usual run time, until `done` reports the true one."""
-        if not self._lines:
+    def next(self, fits: Callable[[Work], bool] | None = None) -> Work | None:
+        """The next request. Its robot is charged the usual run time, until `done` reports the true one.
+
+        `fits`: only requests for which it is true; None: all.
+        """
+        robots: Collection[bytes] = self._lines
+        if fits is not None:
+            robots = [robot for robot, line in self._lines.items() if fits(line[0])]
+        if not robots:
             return None
-        robot = next(iter(self._lines))
-        if len(self._lines) > 1:
-            robot = min(self._lines, key=lambda robot: (self._had_s[robot], self._lines[robot][0].arrived))
+        robot = next(iter(robots))
         self._least_s = self._had_s[robot]
+        if len(robots) > 1:
+            robot, self._least_s = self._first_of(robots)
         line = self._lines[robot]
         work = line.popleft()
         if not line:
             del self._lines[robot]
-        self._count -= 1
+        self._left(work)
         work.charged_s = self._usual_s
         self._had_s[robot] += work.charged_s
         self._running[robot] = self._running.get(robot, 0) + 1
         return work
+
+    def _first_of(self, robots: Collection[bytes]) -> tuple[bytes, float]:
+        """Whose request is next, and the least worker time of these robots.
+
+        Of the robots that are at most a usual run ahead of the least one, that whose answer is useless first.
+        """
+        least = min(robots, key=lambda robot: (self._had_s[robot], self._lines[robot][0].arrived))
+        least_s = self._had_s[least]
+        urgent = [one for one in robots if self._lines[one][0].useless_s < math.inf]
+        if urgent:
+            near = [one for one in urgent if self._had_s[one] <= least_s + self._usual_s]
+            least = min(near, key=lambda robot: self._lines[robot][0].useless_s, default=least)
+        return least, least_s
 
     def done(self, work: Work, run_s: float) -> None:
         """A request from `next` has ended after `run_s` in a worker, or never started (0)."""
@@ -117,7 +165,7 @@ class FairQueue:
                 del self._lines[robot]
         for work in taken:
             self._held.drop(work)
-        self._count -= len(taken)
+            self._left(work)
         return taken
 
     def __len__(self) -> int:

@@ -14,6 +14,7 @@ LABELS_MAX = 1024  # counters of one metric that are kept at hand: looking one u
 COUNTED_S = 10.0  # after the last look
 ROBOTS_MAX = 256  # robots that the page /live tells apart; further ones are counted together
 OTHERS = b""  # the name of the further ones
+COUNT_BUCKETS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64, 128, 256)
 SECONDS_BUCKETS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30)
 
 
@@ -88,6 +89,18 @@ class Metrics:
         self.queue_s_of = lru_cache(LABELS_MAX)(queue_s.labels)
         run_s = seconds("offboard_server_run_seconds", "Time in the worker")
         self.run_s_of = lru_cache(LABELS_MAX)(run_s.labels)
+        together = Histogram(
+            "offboard_server_run_requests",
+            "Requests that ran in one call, of kinds that run together",
+            ["kind"],
+            buckets=COUNT_BUCKETS,
+            registry=self.registry,
+        )
+        self.together_of = lru_cache(LABELS_MAX)(together.labels)
+        held_s = seconds("offboard_server_held_seconds", "Time that a run waited for more requests")
+        self.held_s_of = lru_cache(LABELS_MAX)(held_s.labels)
+        too_late = "Requests refused because their answers would come too late"
+        self.too_late = counter("offboard_server_too_late_requests", too_late, ["kind"])
         self.bytes_in = counter("offboard_server_received_bytes", "Bytes of messages received")
         self.bytes_out = counter("offboard_server_sent_bytes", "Bytes of messages sent")
         self.blob_bytes = gauge("offboard_server_blob_bytes", "Bytes of stored large arguments")

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from concurrent import futures
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 from offboard.cloud_server.executors.executor import Call, Executor, Outcome
@@ -151,7 +151,15 @@ class ReaderThreads:
     def _call(self, work: Work) -> Call:
         request, left_s = work.request, work.request.budget_s - work.queue_s
         wanted = partial(self._wanted, work)
-        return Call(request.kind, request.body, work.blobs, wanted, budget_s=left_s)
+        call = Call(request.kind, request.body, work.blobs, wanted, budget_s=left_s)
+        return self._joint(call, work.more) if work.more else call
+
+    def _joint(self, call: Call, others: list[Work]) -> Call:
+        """This call with those that run together with it: it ends when the last of them must."""
+        more = tuple(map(self._call, others))
+        wanted = [one.wanted for one in (call, *more)]
+        left_s = max(one.budget_s for one in (call, *more))
+        return replace(call, more=more, wanted=lambda: any(one() for one in wanted), budget_s=left_s)
 
     def _finished(self, work: Work, start: _Start, future: "Future[Outcome]") -> None:
         """Called in the thread of a worker, so that no reply and no task waits for the reading thread."""

@@ -4,23 +4,25 @@ Every method but `wanted` is called under the lock of the channel.
 """
 
 import logging
+import math
 import time
-from collections import Counter, OrderedDict
+from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 
 from offboard.cloud_server.authorisation import Access
 from offboard.cloud_server.executors.executor import Executor, Outcome, bounded
+from offboard.cloud_server.failures import CRASHES_MAX, CrashCount, FailureLog
 from offboard.cloud_server.fair_queue import FairQueue, Work
+from offboard.cloud_server.gathering import Gathering, Group
 from offboard.cloud_server.metrics import Metrics
 from offboard.cloud_server.robot_socket import ReplySender
 from offboard.common import tasks
 from offboard.common.load import LoadWatch
 from offboard.common.wire.blobs import BlobStore
-from offboard.common.wire.messages import Reply, Request
+from offboard.common.wire.messages import Reply, Request, byte_count
 
-CRASHES_MAX = 3  # workers that one request may cost
-CRASHED_KEPT = 1024  # requests whose crashes are remembered
-FAILURES_KEPT = 256  # kinds and types of errors that are logged: a task may make types without limit
+RUN_BYTES_MAX = 64 << 20  # of the requests that run together, without their blobs
 
 log = logging.getLogger("offboard.cloud_server")
 
@@ -33,6 +35,7 @@ class Refusal:
     error: str = ""
     queue_s: float = 0.0
     missing: tuple[bytes, ...] = ()
+    waits_s: float = 0.0
 
 
 class Scheduler:
@@ -67,6 +70,9 @@ class Scheduler:
         self._crashes = CrashCount()
         self._failures = FailureLog()
         self._running: set[Work] = set()
+        self._gathering = Gathering()
+        self._runs = 0  # a run may hold several requests
+        self.wakes_s = math.inf  # when held requests start at the latest
         self._chosen: list[Work] = []  # counts as running; the thread that chose it starts it
 
     @property
@@ -87,11 +93,17 @@ class Scheduler:
 
     def request(self, peer: bytes, request: Request) -> None:
         """Put a request into the queue, or answer why not."""
-        work = Work(peer, request, {}, time.monotonic(), robot=self._access.robot_of(peer))
+        now = time.monotonic()
+        work = Work(peer, request, {}, now, robot=self._access.robot_of(peer))
+        if request.useless_s is not None:
+            work.useless_s = now + request.useless_s
         refusal = self._refusal(work)
         if refusal is not None:
             self.refuse(peer, request, refusal)
             return
+        if tasks.kind_named(request.kind).together is not None:
+            work.group = request.kind, request.key
+            self._gathering.arrived(work.group, now)
         evicted = self._queue.add(work)
         if evicted is not None:
             self.refuse(evicted.peer, evicted.request, self._full())
@@ -117,7 +129,28 @@ class Scheduler:
             return Refusal("need_blob", missing=missing)
         if self._queue.bytes_with(work) > self._blobs.bytes_max + self._message_bytes_max:
             return Refusal("busy", "waiting requests hold all the memory allowed")
-        return None
+        return None if work.useless_s == math.inf else self._too_late(work, work.arrived)
+
+    def _too_late(self, work: Work, now: float, *, waits: bool = True) -> Refusal | None:
+        """Why the answer to this request cannot come in time; None if it can, or if nobody knows."""
+        kind = work.request.kind
+        run_s = self._gathering.run_s(kind, 1)
+        if run_s is None:
+            return None
+        waits_s = self._waits_s(now, run_s) if waits else 0.0
+        if now + waits_s + run_s <= work.useless_s:
+            return None
+        self._metrics.too_late.labels(kind).inc()
+        text = f"its answer would come after {waits_s + run_s:.3g} s, when nobody needs it"
+        return Refusal("busy", text, waits_s=waits_s)
+
+    def _waits_s(self, now: float, run_s: float) -> float:
+        """How long a request that came now would wait, if runs take `run_s` where none holds several."""
+        up = max(1, self._executor.up)
+        if self._gathering.used:
+            return self._gathering.waits_s(len(self._queue), up - self._runs, now)
+        ahead = len(self._queue) + self._runs - up + 1
+        return max(0, ahead) * run_s / up
 
     def _full(self) -> Refusal:
         return Refusal("busy", f"{len(self._queue)} requests are waiting")
@@ -150,22 +183,64 @@ class Scheduler:
 
     def _choose(self) -> None:
         """Move waiting requests to the free workers. From then on they count as running."""
-        while self.ready and len(self._running) < self._executor.up:
-            work = self._queue.next()
+        self.wakes_s = math.inf
+        while self.ready and self._runs < self._executor.up:
+            work = self._queue.next(self._startable if self._queue.groups else None)
             if work is None:
                 return
-            now = time.monotonic()
-            work.queue_s = now - work.arrived
-            if not self._access.knows(work.peer):
-                self._queue.done(work, 0.0)
-                self._count(work.request, "cancelled")
-                continue
-            if work.expired(now):
-                self._queue.done(work, 0.0)
-                self.refuse(work.peer, work.request, Refusal("expired", queue_s=work.queue_s))
-                continue
-            self._running.add(work)
-            self._chosen.append(work)
+            if self._starts(work):
+                if work.group is not None:
+                    self._gather(work, work.group)
+                self._runs += 1
+                self._chosen.append(work)
+
+    def _starts(self, work: Work) -> bool:
+        """Count a request as running, unless nobody needs its answer any more."""
+        now = time.monotonic()
+        work.queue_s = now - work.arrived
+        if not self._access.knows(work.peer):
+            self._queue.done(work, 0.0)
+            self._count(work.request, "cancelled")
+            return False
+        refusal = Refusal("expired", queue_s=work.queue_s) if work.expired(now) else None
+        if refusal is None and work.useless_s < math.inf:
+            refusal = self._too_late(work, now, waits=False)
+        if refusal is not None:
+            self._queue.done(work, 0.0)
+            self.refuse(work.peer, work.request, refusal)
+            return False
+        self._running.add(work)
+        return True
+
+    def _startable(self, work: Work) -> bool:
+        """Whether a request may start now, or waits for others to run with it."""
+        group = work.group
+        together = None if group is None else tasks.kind_named(work.request.kind).together
+        if group is None or together is None:
+            return True
+        now = time.monotonic()
+        until_s = self._gathering.until_s(group, together, self._queue.groups[group], now)
+        if until_s <= now:
+            return True
+        self.wakes_s = min(self.wakes_s, until_s)
+        return False
+
+    def _gather(self, work: Work, group: Group) -> None:
+        """Find the requests that run together with this one."""
+        together = tasks.kind_named(work.request.kind).together
+        assert together is not None
+        left = RUN_BYTES_MAX - byte_count(work.request.body)
+        while len(work.more) + 1 < together.at_most and self._queue.groups[group]:
+            other = self._queue.next(partial(_fits, group, left))
+            if other is None:
+                break
+            if self._starts(other):
+                work.more.append(other)
+                left -= byte_count(other.request.body)
+        count = 1 + len(work.more)
+        work.number, held_s = self._gathering.began(group, count, time.monotonic())
+        self._metrics.held_s_of(work.request.kind).observe(held_s)
+        self._metrics.together_of(work.request.kind).observe(count)
 
     def wanted(self, work: Work) -> bool:
         """False if this run should stop: its answer is not wanted, or its robot may not have it.
@@ -178,11 +253,48 @@ class Scheduler:
         return goes_on and self._access.knows(work.peer)
 
     def answer(self, work: Work, outcome: Outcome) -> None:
-        """A task has ended: send its reply."""
+        """A run has ended: send its replies."""
+        self._runs -= 1
+        if work.group is not None:
+            self._ended(work, outcome)
+        elif work.useless_s < math.inf and outcome.status == "ok":
+            self._gathering.learn(work.request.kind, 1, outcome.run_s)
+        if not work.more:
+            self._answer(work, outcome)
+            return
+        works, work.more = (work, *work.more), []
+        if outcome.crashed or outcome.status == "busy":  # one of them may be the culprit
+            for one in reversed(works):
+                self._alone(one, outcome)
+            return
+        for one, its_own in zip(works, (outcome, *outcome.more), strict=True):
+            self._answer(one, its_own)
+
+    def _ended(self, work: Work, outcome: Outcome) -> None:
+        """Learn from a run of a kind with `together`."""
+        assert work.group is not None
+        self._gathering.ended(work.number)
+        if outcome.status == "ok" and outcome.together == 1 + len(work.more):
+            self._gathering.learn(work.request.kind, outcome.together, outcome.run_s)
+        self._gathering.answered(work.group, self._queue.groups[work.group], time.monotonic())
+        self._failures.say(work.request.kind, outcome.note)
+
+    def _alone(self, work: Work, outcome: Outcome) -> None:
+        """The worker of a run died: let this request of it wait again, to run alone, if it may run twice."""
+        if not work.wanted or (outcome.crashed and not tasks.kind_named(work.request.kind).duplicate):
+            self._answer(work, outcome)
+            return
         self._running.discard(work)
-        self._queue.done(work, outcome.run_s)
-        self.last_task = time.monotonic()
+        work.group = None
+        self._queue.put_back(work)
+
+    def _answer(self, work: Work, outcome: Outcome) -> None:
+        self._running.discard(work)
+        self._queue.done(work, outcome.run_s / outcome.together)
+        self.last_task = now = time.monotonic()
         request = work.request
+        if outcome.queue_s:
+            work.queue_s += outcome.queue_s
         if outcome.crashed:
             self._crashes.note(work.peer, request.id)
         outcome = bounded(outcome, self._message_bytes_max)
@@ -196,6 +308,11 @@ class Scheduler:
                 body=outcome.frames, cpu_s=outcome.cpu_s, load=load, capacity=capacity,
                 traceback=outcome.traceback,
             )  # fmt: skip
+            if outcome.together > 1:
+                reply.run_s = self._gathering.own_s(request.kind, outcome.together, outcome.run_s)
+                reply.queue_s += outcome.run_s - reply.run_s
+            if self._gathering.used:
+                reply.waits_s = self._waits_s(now, 0.0)
             self._sender.send(work.peer, reply)
         self._count(request, outcome.status if work.wanted else "cancelled", work.queue_s, outcome.run_s)
         self._metrics.queue_s_of(request.kind).observe(work.queue_s)
@@ -205,6 +322,10 @@ class Scheduler:
             use.tasks += 1
             use.queue_s += work.queue_s
             use.run_s += outcome.run_s
+
+    def waits_s(self) -> float:
+        """How long a request that came now would wait; 0 if no requests run together here."""
+        return self._waits_s(time.monotonic(), 0.0) if self._gathering.used else 0.0
 
     def give_up(self) -> int:
         """Answer the waiting requests with `busy`; returns how many requests were waiting or running.
@@ -223,7 +344,7 @@ class Scheduler:
             self._metrics.robots.of(self._access.robot_of(peer)).refused += 1
         reply = Reply(
             request.id, why.status, why.error,
-            queue_s=why.queue_s, queue_depth=len(self._queue), missing=why.missing,
+            queue_s=why.queue_s, queue_depth=len(self._queue), missing=why.missing, waits_s=why.waits_s,
         )  # fmt: skip
         self._sender.send(peer, reply)
 
@@ -237,34 +358,5 @@ class Scheduler:
             log.debug(text, request.id, kind, status, queue_s, run_s, extra={"task": fields})
 
 
-class CrashCount:
-    """How many workers each request has cost, for the last CRASHED_KEPT requests that cost one."""
-
-    def __init__(self) -> None:
-        self._counts: OrderedDict[tuple[bytes, int], int] = OrderedDict()
-
-    def note(self, peer: bytes, id: int) -> None:
-        self._counts[peer, id] = self._counts.pop((peer, id), 0) + 1
-        if len(self._counts) > CRASHED_KEPT:
-            self._counts.popitem(last=False)
-
-    def too_many(self, peer: bytes, id: int) -> bool:
-        return self._counts.get((peer, id), 0) >= CRASHES_MAX
-
-
-class FailureLog:
-    """Logs the traceback of a failing task, once for each kind and type of error."""
-
-    def __init__(self) -> None:
-        self._logged: set[tuple[str, str]] = set()
-
-    def note(self, kind: str, outcome: Outcome) -> None:
-        failure = kind, outcome.error.partition(":")[0]
-        if not outcome.traceback or failure in self._logged or len(self._logged) == FAILURES_KEPT:
-            return
-        self._logged.add(failure)
-        log.warning(
-            "task %s failed; its next failures with %s are not logged; remedy: correct the task\n%s",
-            *failure,
-            outcome.traceback.rstrip(),
-        )
+def _fits(group: Group, bytes_left: int, work: Work) -> bool:
+    return work.group == group and byte_count(work.request.body) <= bytes_left

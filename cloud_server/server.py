@@ -1,6 +1,7 @@
 """The server: reads the messages of robots, and answers or hands on each of them."""
 
 import logging
+import math
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -167,7 +168,7 @@ class Server:
 
     def _turn(self) -> list[Work]:
         """Wait for messages and read them; returns the work to start."""
-        self._channel.wait(POLL_S)
+        self._channel.wait(max(0.0, min(POLL_S, self._scheduler.wakes_s - time.monotonic())))
         with self._channel.lock:
             now = self._last_turn = time.monotonic()
             self._tend_executor()
@@ -268,7 +269,8 @@ class Server:
                 self._decompress(peer, file, data, size)
             case Ping(id):
                 self._connections.pings(peer)
-                self._sender.send(peer, Pong(id, self._scheduler.waiting, *self._latest_load()))
+                state = self._scheduler.waiting, *self._latest_load(), self._scheduler.waits_s()
+                self._sender.send(peer, Pong(id, *state))
             case Hello():
                 self._other_versions.hear(message)
                 # Robots repeat their hello until it is answered, and send no task before that.
@@ -299,8 +301,9 @@ class Server:
                 return []
             self._scheduler.answer(work, outcome)
             chosen = self._scheduler.take_chosen()
-        if self._drain_until is not None:
-            self._channel.wake()
+            held = self._scheduler.wakes_s < math.inf
+        if held or self._drain_until is not None:
+            self._channel.wake()  # the reading thread must look in time, or leave
         return chosen
 
     def _hello(self) -> Hello:

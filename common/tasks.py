@@ -11,6 +11,7 @@ from typing import Any, Concatenate, Literal, ParamSpec, Protocol, TypeVar, over
 from offboard.common.dataclass_types import check_types
 from offboard.common.errors import BadValue, ConfigError, UnknownTask, describe, is_interrupt
 from offboard.common.source.covers import Covers, contract_hash, covers_by_site, covers_of, source_hash
+from offboard.common.together import Together, by_site
 from offboard.common.variants import (
     AT,
     CLOUD,
@@ -36,6 +37,7 @@ NAME_LENGTH_MAX = 64
 KINDS_MAX = 256  # a `hello` message names all of them
 SIZE_NUMBERS_MAX = 8  # a size sums up the arguments; with more numbers, a window says too little of each
 
+ByTogether = Mapping[str, Together]  # by site
 Size = float | tuple[float, ...]  # a tuple has 2 to SIZE_NUMBERS_MAX numbers
 
 
@@ -53,7 +55,7 @@ class Kind:
     `variants` holds a kind for each site, if sites run different functions, with the `quality` of its answers
     from 0 to 1. `source_hash` then covers what they have in common: parameters, dataclasses, pack and unpack.
     `covers` says what else counts as source; the contents of its files are no part of `source_hash`.
-    `policy_server`: a policy server may answer too.
+    `policy_server`: a policy server may answer too. `together`: how a server runs several requests at once.
     """
 
     name: str
@@ -72,6 +74,7 @@ class Kind:
     unpack: Callable[[Any], Any] | None = None
     policy_server: bool = False
     covers: Covers = field(default_factory=Covers, compare=False)
+    together: Together | None = None
     _counts: list[int] = field(default_factory=list, compare=False, repr=False)  # the first one holds for all
 
     def bind(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:
@@ -165,6 +168,7 @@ class Task:
 
     `compress`: the numbers of the arguments that are compressed on the way to the site.
     `parcel`: keeps its packed arguments for further sites, if its kind packs them.
+    `useless_s`: when nobody needs the answer any more, on the clock of `time.perf_counter`; None: unknown.
     """
 
     kind: Kind
@@ -173,6 +177,7 @@ class Task:
     id: int = field(default_factory=itertools.count(1).__next__)
     compress: tuple[int, ...] = ()
     parcel: Any = field(default=None, compare=False, repr=False)
+    useless_s: float | None = None
 
 
 class PlainTask(Protocol[P, R_co]):
@@ -206,7 +211,7 @@ def task(
     work: Callable[[Any], float] | None = ..., setup: None = ...,
     variants: Mapping[str, Callable[..., Any] | None] | None = ..., quality: Mapping[str, float] | None = ...,
     pack: Callable[..., Any] | None = ..., unpack: Callable[[Any], Any] | None = ...,
-    policy_server: bool = ..., version: str | int = ...,
+    policy_server: bool = ..., version: str | int = ..., together: Together | ByTogether | None = ...,
     covers: Sequence[Any] | Mapping[str, Sequence[Any]] = ...,
 ) -> Callable[[F], F]: ...  # fmt: skip
 @overload
@@ -216,7 +221,7 @@ def task(
     work: Callable[[Any], float] | None = ..., setup: Callable[[], Any] | Mapping[str, Callable[[], Any]],
     variants: Mapping[str, Callable[..., Any] | None] | None = ..., quality: Mapping[str, float] | None = ...,
     pack: Callable[..., Any] | None = ..., unpack: Callable[[Any], Any] | None = ...,
-    policy_server: bool = ..., version: str | int = ...,
+    policy_server: bool = ..., version: str | int = ..., together: Together | ByTogether | None = ...,
     covers: Sequence[Any] | Mapping[str, Sequence[Any]] = ...,
 ) -> Callable[[Callable[Concatenate[Any, P], R_co]], SetupTask[P, R_co]]: ...  # fmt: skip
 def task(
@@ -235,6 +240,7 @@ def task(
     policy_server: bool = False,
     version: str | int = "",
     covers: Sequence[Any] | Mapping[str, Sequence[Any]] = (),
+    together: Together | ByTogether | None = None,
 ) -> Any:
     """Register a function as a kind of task. It can still be called as an ordinary function.
 
@@ -250,7 +256,8 @@ def task(
     dictionary by site too.
 
     With `policy_server`, policy servers may answer too: the function takes one observation and returns an
-    action, and no source is compared.
+    action, and no source is compared. `together`: what a server calls for several requests at once, of
+    `cloud` or by site if there are variants.
     """
     if not isinstance(name, str) or len(name) > NAME_LENGTH_MAX or not name.isidentifier():
         raise ConfigError(f"task name {name!r} is not an identifier of at most {NAME_LENGTH_MAX} characters")
@@ -261,17 +268,18 @@ def task(
             name, function, variants=variants, quality=quality, setup=setup, policy_server=policy_server
         )
         own: Any = found[CLOUD].setup if found else setup
-        by_site = covers_by_site(name, function, covers=covers, sites=found)
-        shared = () if isinstance(covers, Mapping) else covers
+        covered = covers_by_site(name, function, covers=covers, sites=found)
+        shared, joint = () if isinstance(covers, Mapping) else covers, by_site(name, together, found)
         kind = _checked(
             Kind(
                 name, function, size, duplicate,
                 types=tuple(types), warm=warm, work=work, setup=own,
                 pack=pack, unpack=unpack, policy_server=policy_server,
+                together=None if found else joint.get(CLOUD),
                 covers=covers_of(name, function, version=version, covers=shared),
             )
         )  # fmt: skip
-        _add(_with_variants(kind, found, by_site) if found else kind)
+        _add(_with_variants(kind, found, covered, joint) if found else kind)
         return function
 
     return register
@@ -280,12 +288,6 @@ def task(
 def first_number(size: Size) -> float:
     """The number of a size, or the first one of several."""
     return size[0] if isinstance(size, tuple) else size
-
-
-def show_size(size: Size, form: str) -> str:
-    """A size in words, with each number in this format."""
-    numbers = size if isinstance(size, tuple) else (size,)
-    return " and ".join(format(number, form) for number in numbers)
 
 
 def kind_of(function: Callable[..., Any]) -> Kind:
@@ -330,7 +332,7 @@ def _checked(kind: Kind) -> Kind:
     if kind.policy_server and (count != 1 or kind.pack is not None):
         needs = "a function of one argument, the observation, and no pack="
         raise ConfigError(f"task {name}: policy_server=True needs {needs}")
-    packing = (kind.pack, kind.unpack)
+    packing = (kind.pack, kind.unpack, *(kind.together.sources if kind.together else ()))
     own_hash = source_hash(function, setup, kind.types, packing, covers=kind.covers)
     return replace(kind, positional=count, source_hash=own_hash)
 
@@ -347,7 +349,9 @@ def _add(kind: Kind) -> None:
     _on_servers.update((one.name, one) for one in kind.on_servers())
 
 
-def _with_variants(kind: Kind, found: Mapping[str, Variant], by_site: Mapping[str, Covers]) -> Kind:
+def _with_variants(
+    kind: Kind, found: Mapping[str, Variant], covered: Mapping[str, Covers], joint: ByTogether
+) -> Kind:
     """The kind with a kind for each site, named TASK@SITE."""
     name, given = kind.name, kind.signature()
     if kind.work is not None:
@@ -360,10 +364,11 @@ def _with_variants(kind: Kind, found: Mapping[str, Variant], by_site: Mapping[st
             function = one.function
             check_ordinary(name, variant=function, setup=one.setup)
             check_variant(name, site, function, setup=one.setup, given=given)
-            own_hash = source_hash(function, one.setup, kind.types, packing, covers=by_site[site])
+            parts = (*packing, *(joint[site].sources if site in joint else ()))
+            own_hash = source_hash(function, one.setup, kind.types, parts, covers=covered[site])
         made[site] = replace(
             kind, name=f"{name}{AT}{site}", function=function, setup=one.setup, source_hash=own_hash,
-            quality=one.quality, covers=by_site[site],
+            quality=one.quality, covers=covered[site], together=joint.get(site),
         )  # fmt: skip
         if len(made[site].name) > NAME_LENGTH_MAX:
             raise ConfigError(f"task {name}: {made[site].name!r} has over {NAME_LENGTH_MAX} characters")

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     )
     from offboard.common.task_call import check_wanted
     from offboard.common.tasks import task
+    from offboard.common.together import Together
     from offboard.robot_client.execution.call_future import CallFuture
     from offboard.robot_client.learning.savings import Savings
     from offboard.robot_client.offloader import Offloader
@@ -69,6 +70,7 @@ __all__ = [
     "Step",
     "TaskError",
     "TaskFailed",
+    "Together",
     "Trace",
     "UnknownTask",
     "Unwanted",
@@ -94,6 +96,7 @@ _HOMES = {
     "Settings": "robot_client.settings",
     "Step": "robot_client.streams.action_stream",
     "Trace": "robot_client.records.trace",
+    "Together": "common.together",
     "check_wanted": "common.task_call",
     "task": "common.tasks",
 }

@@ -6,6 +6,7 @@ they check none, as PEP 612 allows no further keywords next to those of the task
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, ParamSpec, TypeAlias, TypeVar, cast, overload
 
@@ -17,7 +18,7 @@ from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.lifetime import Lifetime
 from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.outgoing import new_task
-from offboard.robot_client.sites.runner import Execution
+from offboard.robot_client.sites.runner import Execution, checked_timeout
 from offboard.robot_client.sites.waiting import Clock
 from offboard.robot_client.streams.action_stream import ActionStream, Ask, OnEmpty
 from offboard.robot_client.streams.asking import BLEND, MISS_RATE, Pace
@@ -256,11 +257,19 @@ class Calls:
         """One call. `caller`: its future, which may cancel it."""
         self._life.refuse_in_fork()
         kind = kind_in_use(function)
-        answer, record = self._answer_call(new_task(kind, kind.bind(args, kwargs)), options, caller)
+        task = new_task(kind, kind.bind(args, kwargs))
+        if caller is not None and caller.useful_s is not None:
+            task, _ = self._hurried(task, caller.useful_s)
+        answer, record = self._answer_call(task, options, caller)
         if answer.failure is not None:
             answer.failure.record = record
             raise answer.failure
         return cast("R", answer.value), record
+
+    def _hurried(self, task: Task, deadline_s: float) -> tuple[Task, float]:
+        """The same task, whose answer is useless after this time, and the time as a float."""
+        within_s = checked_timeout(deadline_s, "deadline_s")
+        return replace(task, useless_s=self._clock.now_s() + within_s), within_s
 
     def _answer_call(
         self, task: Task, options: Options, caller: CallFuture[Any] | None

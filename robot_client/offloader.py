@@ -266,7 +266,7 @@ class Offloader(Calls):
         budget_s = self._timeout_s if timeout_s is None else checked_timeout(timeout_s)
         if deadline_s is None:
             return self._finish(self._begin(task, where, budget_s, caller=caller))
-        within_s = checked_timeout(deadline_s, "deadline_s")
+        task, within_s = self._hurried(task, deadline_s)
         pending = self._begin(task, where, budget_s, deadline_s=within_s, caller=caller)
         return self._answer_in_time(pending, within_s)
 

@@ -9,10 +9,10 @@ from typing import Any
 from offboard.cloud_server import (
     authorisation,
     connections,
+    failures,
     http_api,
     rate_limit,
     robot_socket,
-    scheduler,
     server,
 )
 from offboard.cloud_server.config import ServerConfig
@@ -184,7 +184,7 @@ SERVER = {
     ],
     "memory of a worker process": [default(ServerConfig, "worker_memory") * 2**20],
     "a task in a worker process": [worker.OVERTIME_S],
-    "workers that one request costs": [scheduler.CRASHES_MAX],
+    "workers that one request costs": [failures.CRASHES_MAX],
     "the text of an error; its traceback": [messages.ERROR_LENGTH_MAX, task_call.TRACEBACK_LENGTH_MAX],
     "log lines about bad messages, and about refused robots": [logs.PAUSE_S],
     "time to finish tasks after SIGTERM": [default(ServerConfig, "drain_s")],

@@ -25,7 +25,8 @@ class Call:
     """A task to run.
 
     `frames` are the encoded arguments; `blobs` holds the large ones by digest. `wanted` tells whether
-    anybody still waits for the answer. After `budget_s` nobody does.
+    anybody still waits for the answer. After `budget_s` nobody does. `more`: further calls of the same
+    kind, which run together with this one.
     """
 
     kind: str
@@ -33,6 +34,12 @@ class Call:
     blobs: Blobs = field(default_factory=dict)
     wanted: Callable[[], bool] = always
     budget_s: float = math.inf
+    more: "tuple[Call, ...]" = ()
+
+    @property
+    def all_blobs(self) -> Blobs:
+        """Those of all calls that run together."""
+        return {**self.blobs, **{digest: blob for one in self.more for digest, blob in one.blobs.items()}}
 
 
 @dataclass(slots=True)
@@ -43,6 +50,8 @@ class Outcome:
     same quota, or else by the process that ran the task. `server_fault`: the task failed, but the task is not
     the cause. `crashed`: its worker process died. `traceback`: of a task that raised, else empty.
     `load`: load and capacity of the computer that ran the task; None: the computer of the server.
+    `together`: how many requests ran in one call; `more`: the outcomes of the further calls, in their order.
+    `queue_s`: the time that the task waited in its worker. `note`: what the log of the server should say.
     """
 
     status: str
@@ -54,6 +63,10 @@ class Outcome:
     crashed: bool = False
     traceback: str = ""
     load: tuple[float, float] | None = None
+    together: int = 1
+    queue_s: float = 0.0
+    note: str = ""
+    more: "list[Outcome]" = field(default_factory=list)
 
 
 class Executor(Protocol):
@@ -118,11 +131,7 @@ def run_task(call: Call, states: TaskStates) -> Outcome:
     result: list[Buffer] = []
     try:
         kind = tasks.kind_named(call.kind)
-        args = decode(call.frames, kind.types, call.blobs)
-        if not isinstance(args, list):
-            raise ProtocolError("the body is not a list of arguments")
-        if kind.unpack is not None:
-            args = _unpacked(kind, args)
+        args = arguments(kind, call)
         with states.lend(kind) as state:
             in_task = True
             value = call_while(call.wanted, kind.function, (*state, *args))
@@ -131,15 +140,26 @@ def run_task(call: Call, states: TaskStates) -> Outcome:
     except BaseException as error:  # noqa: BLE001 - a task may raise anything
         status, failure = "failed", describe(error)
         server_fault = not in_task or isinstance(error, Unwanted)
-        # Of the server's own faults, only an `unpack` that raised has a traceback.
-        if not server_fault:
-            traceback = traceback_of(error)
-        elif error.__cause__ is not None:
-            traceback = traceback_of(error.__cause__, _unpacked)
+        traceback = traceback_in(error, server_fault=server_fault)
     run_s, cpu_s = time.perf_counter() - started, cpu_time.used_s() - cpu_before_s
     return Outcome(
         status, failure, run_s, cpu_s, frames=result, server_fault=server_fault, traceback=traceback
     )
+
+
+def traceback_in(error: BaseException, *, server_fault: bool) -> str:
+    """The traceback of a task that raised. Of the server's own faults, only a raising `unpack` has one."""
+    if not server_fault:
+        return traceback_of(error)
+    return "" if error.__cause__ is None else traceback_of(error.__cause__, _unpacked)
+
+
+def arguments(kind: tasks.Kind, call: Call) -> Sequence[Any]:
+    """The arguments of a call. An error that it raises is no fault of the task."""
+    args = decode(call.frames, kind.types, call.blobs)
+    if not isinstance(args, list):
+        raise ProtocolError("the body is not a list of arguments")
+    return args if kind.unpack is None else _unpacked(kind, args)
 
 
 def _unpacked(kind: tasks.Kind, received: Sequence[Any]) -> Sequence[Any]:

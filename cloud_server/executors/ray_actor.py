@@ -1,16 +1,18 @@
 """What runs in a Ray actor: one task after the other. `ray_worker` is the other end. Ray is not imported."""
 
 import faulthandler
+import math
 import os
 import socket
 import sys
 import traceback
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from offboard.cloud_server.executors.executor import Call, Outcome, bounded, run_task, warm_kinds
+from offboard.cloud_server.executors.executor import Call, Outcome, bounded, warm_kinds
+from offboard.cloud_server.executors.joint_run import run_calls
 from offboard.cloud_server.executors.worker_process import ANSWER_BYTES_MAX, full, limit_memory
 from offboard.common import VERSION, tasks
 from offboard.common.cpu_time import SELF, process_s
@@ -100,22 +102,28 @@ class RayActor:
         digests: Sequence[bytes],
         new: Sequence[bytes],
         dropped: Sequence[bytes],
+        more: Sequence[tuple[list[bytes], Sequence[bytes], float]] = (),
     ) -> Ran:
         """Run one task. `digests` name its blobs; `new` names `blobs`, which this actor does not have.
 
-        The blobs that were `dropped` are forgotten first.
+        The blobs that were `dropped` are forgotten first. `more`: frames, digests and time limit of each task
+        that runs together with this one.
         """
         for digest in dropped:
             self._blobs.pop(digest, None)
         for digest, data in zip(new, blobs, strict=True):
             self._blobs[digest] = StoredBlob(memoryview(data))
-        known = {digest: self._blobs[digest] for digest in digests}
-        call = Call(kind, frames, known, lambda: self._stopped != number)
-        outcome = bounded(run_task(call, self._states), ANSWER_BYTES_MAX)
-        outcome.frames = [bytes(frame) for frame in outcome.frames]
+        first, *others = [
+            Call(kind, one, self._known(named), lambda: self._stopped != number, budget_s=budget_s)
+            for one, named, budget_s in ((frames, digests, math.inf), *more)
+        ]
+        outcome = _sendable(run_calls(replace(first, more=tuple(others)) if more else first, self._states))
         self._load.hurry()  # the load during the task, not before it
         outcome.load = self._load.latest()
         return Ran(outcome, full(outcome.error), process_s(os.getpid()))
+
+    def _known(self, digests: Sequence[bytes]) -> dict[bytes, StoredBlob]:
+        return {digest: self._blobs[digest] for digest in digests}
 
     def stop(self, number: int) -> None:
         """Nobody wants the answer of this run any more."""
@@ -128,3 +136,11 @@ class RayActor:
 
     def _own_s(self) -> float:
         return sum(map(process_s, (os.getpid(), *self._siblings)))
+
+
+def _sendable(outcome: Outcome) -> Outcome:
+    """The same outcome, of bounded size and without views of memory."""
+    outcome = bounded(outcome, ANSWER_BYTES_MAX)
+    outcome.frames = [bytes(frame) for frame in outcome.frames]
+    outcome.more = [_sendable(one) for one in outcome.more]
+    return outcome

@@ -85,7 +85,9 @@ class RayWorker:
         new = [digest for digest in references if digest not in self.known]
         self.known.update(new)
         blobs = [references[digest] for digest in new]
-        named: dict[str, Any] = {"digests": list(references), "new": new, "dropped": dropped}
+        named: dict[str, Any] = {"digests": list(task.blobs), "new": new, "dropped": dropped}
+        if task.more:
+            named["more"] = [([*map(bytes, one.frames)], list(one.blobs), one.budget_s) for one in task.more]
         frames = [bytes(frame) for frame in task.frames]
         self._call("run", self._ran, *blobs, number=self._number, kind=task.kind, frames=frames, **named)
 

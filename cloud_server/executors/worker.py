@@ -23,7 +23,14 @@ from typing import Any, NoReturn
 import msgpack
 
 from offboard.cloud_server.executors.executor import Call, Outcome
-from offboard.cloud_server.executors.worker_process import CHUNK_BYTES, STOPS, Setup, new_unpacker
+from offboard.cloud_server.executors.worker_process import (
+    CHUNK_BYTES,
+    STOPS,
+    Setup,
+    new_unpacker,
+    outcome_of,
+    packed,
+)
 from offboard.cloud_server.executors.worker_set import Assignment, Died
 from offboard.common.errors import TaskFailed, describe
 from offboard.common.task_call import always
@@ -125,7 +132,7 @@ class Worker:
             answer = self._next(process, limit_s, call.wanted)
             if answer is not None:
                 *fields, full = answer
-                outcome = Outcome(*fields)
+                outcome = outcome_of(fields)
                 if full:
                     raise Died("memory", "kept too much memory", outcome=outcome)
                 return outcome
@@ -195,7 +202,7 @@ class _Process:
     def send(self, call: Call) -> None:
         self._stop[0] = 0
         self._unpacker = new_unpacker()  # the last one may have grown with its message
-        message = msgpack.packb([call.kind, list(call.frames), list(call.blobs)])
+        message = msgpack.packb(packed(call))
         try:
             self._pipe.sendall(message)
         except OSError as error:

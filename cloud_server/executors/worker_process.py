@@ -2,6 +2,7 @@
 
 import ctypes
 import faulthandler
+import math
 import mmap
 import os
 import resource
@@ -10,20 +11,22 @@ import socket
 import sys
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import msgpack
 
-from offboard.cloud_server.executors.executor import Call, Outcome, bounded, run_task, warm_kinds
+from offboard.cloud_server.executors.executor import Call, Outcome, bounded, warm_kinds
+from offboard.cloud_server.executors.joint_run import run_calls
 from offboard.common.errors import TaskFailed, describe
 from offboard.common.source.task_modules import load_modules
 from offboard.common.task_states import TaskStates
 from offboard.common.wire.blobs import BlobStore, StoredBlob
 
 CHUNK_BYTES = 1 << 16
+FIELDS = 8  # of an outcome in a message; more of them if several requests ran in one call
 ANSWER_BYTES_MAX = (1 << 31) - (1 << 20)  # no message is larger
 PR_SET_PDEATHSIG = 1
 # Ctrl-C, and some service managers, reach all processes of the server.
@@ -71,7 +74,7 @@ def work(parent: int, pipe_fd: int, flag: int, setup: Setup) -> None:
         pipe.sendall(msgpack.packb([describe(error), ""], unicode_errors="replace"))
         return
     pipe.sendall(msgpack.packb(["", ""]))
-    store, run = BlobStore(setup.blob_bytes_max), partial(run_task, states=states)
+    store, run = BlobStore(setup.blob_bytes_max), partial(run_calls, states=states)
     while (call := _receive(pipe)) is not None:
         pipe.sendall(_answer(call, store, Path(setup.folder), wanted=lambda: not stop[0], run=run))
         del call  # free its memory before the next one comes
@@ -113,15 +116,22 @@ def _answer(
     run: Callable[[Call], Outcome],
 ) -> bytes:
     """Run one task; returns the message about its outcome."""
-    kind, frames, digests = message
+    kind, frames, digests, *joint = message
     try:
         try:
-            blobs = {digest: _blob(store, folder, digest) for digest in digests}
+            calls = [
+                Call(kind, one, _blobs(store, folder, named), wanted, budget_s=budget_s)
+                for one, named, budget_s in ([frames, digests, math.inf], *joint)
+            ]
         except OSError as error:
             return _message(Outcome("failed", describe(error), server_fault=True))
-        return _message(run(Call(kind, frames, blobs, wanted)))
+        return _message(run(calls[0] if not joint else replace(calls[0], more=tuple(calls[1:]))))
     except MemoryError:
         return NOTHING_LEFT
+
+
+def _blobs(store: BlobStore, folder: Path, digests: list[bytes]) -> dict[bytes, StoredBlob]:
+    return {digest: _blob(store, folder, digest) for digest in digests}
 
 
 def _blob(store: BlobStore, folder: Path, digest: bytes) -> StoredBlob:
@@ -133,12 +143,36 @@ def _blob(store: BlobStore, folder: Path, digest: bytes) -> StoredBlob:
     return blob
 
 
+def packed(call: Call) -> list[Any]:
+    """The message for a call: its kind, frames and digests; then those of each call that runs with it."""
+    message = [call.kind, list(call.frames), list(call.blobs)]
+    return message + [[list(one.frames), list(one.blobs), one.budget_s] for one in call.more]
+
+
+def outcome_of(fields: list[Any]) -> Outcome:
+    """The outcome in a message, without its last field."""
+    outcome = Outcome(*fields[:FIELDS])
+    if len(fields) > FIELDS:
+        outcome.together, outcome.queue_s, outcome.note, *more = fields[FIELDS:]
+        outcome.more = [outcome_of(one) for one in more]
+    return outcome
+
+
 def _message(outcome: Outcome) -> bytes:
-    kept, outcome = full(outcome.error), bounded(outcome, ANSWER_BYTES_MAX)
+    kept = full(outcome.error)
+    each_max = ANSWER_BYTES_MAX // (1 + len(outcome.more))
+    message: bytes = msgpack.packb([*_fields(outcome, each_max), kept], unicode_errors="replace")
+    return message
+
+
+def _fields(outcome: Outcome, bytes_max: int) -> list[Any]:
+    outcome = bounded(outcome, bytes_max)
     fields = [outcome.status, outcome.error, outcome.run_s, outcome.cpu_s, outcome.frames]
     fields += [outcome.server_fault, outcome.crashed, outcome.traceback]
-    message: bytes = msgpack.packb([*fields, kept], unicode_errors="replace")
-    return message
+    if outcome.more or outcome.together > 1 or outcome.queue_s:
+        fields += [outcome.together, outcome.queue_s, outcome.note]
+        fields += [_fields(one, bytes_max) for one in outcome.more]
+    return fields
 
 
 def full(error: str) -> bool:

@@ -69,11 +69,11 @@ class WorkerSet(Executor, Generic[W, R]):
         return min(len(self._up), self.workers)
 
     def submit(self, call: Call, done: "Callable[[Future[Outcome]], None]") -> "Future[Outcome]":
-        assignment = Assignment(call)
-        assignment.answer.add_done_callback(lambda _: self._blobs.unpin(call.blobs))
+        assignment, blobs = Assignment(call), call.all_blobs if call.more else call.blobs
+        assignment.answer.add_done_callback(lambda _: self._blobs.unpin(blobs))
         assignment.answer.add_done_callback(done)
         try:
-            references = self._blobs.pin(call.blobs)
+            references = self._blobs.pin(blobs)
         except OSError as error:
             assignment.answer.set_result(Outcome("busy", f"{self.no_room}: {error}"))
             return assignment.answer

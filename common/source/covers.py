@@ -23,7 +23,7 @@ COVERS_MAX = 64  # functions, classes and files of one task, or of one of its va
 VERSION_LENGTH_MAX = 64
 HASH_LENGTH = 64  # characters; the hash of covered files follows that of the source
 
-Packing = tuple[Callable[..., Any] | None, Callable[..., Any] | None]  # pack and unpack
+Packing = tuple[Callable[..., Any] | None, ...]  # pack and unpack, and what runs requests together
 
 log = logging.getLogger(__name__)
 

@@ -13,6 +13,7 @@ import msgpack
 from offboard.common.errors import BadValue, ProtocolError
 from offboard.common.task_call import TRACEBACK_LENGTH_MAX, bounded
 from offboard.common.tasks import NAME_LENGTH_MAX
+from offboard.common.together import KEY_LENGTH_MAX
 from offboard.common.wire.blobs import BlobStore, Buffer, StoredBlob
 from offboard.common.wire.fields import IDLE, TEXT_LENGTH_MAX, Fields
 from offboard.common.wire.values import ARRAYS_MAX, BLOB_BYTES_MIN, Body, decode, encode, unpack_bounded
@@ -52,7 +53,8 @@ class Request:
     """Run a task. `body` is the encoded list of arguments, `blobs` are the digests that it refers to.
 
     `budget_s` is the time that was left when the request was sent. `attempt` starts at 1 and grows when the
-    same id is sent again after `need_blob`.
+    same id is sent again after `need_blob`. `key`: only requests with equal keys may run together.
+    `useless_s`: in how many seconds nobody needs the answer any more; None: it is in no hurry.
     """
 
     id: int
@@ -61,6 +63,8 @@ class Request:
     attempt: int = 1
     blobs: tuple[bytes, ...] = ()
     body: list[Buffer] = field(default_factory=list)
+    key: str = ""
+    useless_s: float | None = None
 
 
 @dataclass(slots=True)
@@ -70,7 +74,8 @@ class Reply:
     `server_fault`: the task failed, but the task is not the cause, so another site may answer it. `cpu_s` is
     the CPU time that the server used while the task ran. It is None, and not sent, if the task did not run or
     if the server is too old to send it. `load` and `capacity` are as in a pong. `traceback` is that of a task
-    that raised; an empty one is not sent.
+    that raised; an empty one is not sent. If other requests ran with it, `run_s` is what it would have taken
+    alone, and the rest counts as `queue_s`. `waits_s`: as in a pong.
     """
 
     id: int
@@ -86,6 +91,7 @@ class Reply:
     load: float = 0.0
     capacity: float = 1.0
     traceback: str = ""
+    waits_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,12 +105,15 @@ class Pong:
 
     `load` is the share of the CPU that other programs take, 0 to 1. `capacity` is the share of one CPU that a
     task may use, above 0 and at most 1. Both are sent only if they differ from those of an idle machine.
+    `waits_s`: the seconds that a request that came now would wait, also for those that would run with it. It
+    is sent by servers where requests run together, and where one is refused because it would be too late.
     """
 
     id: int
     queue_depth: int = 0
     load: float = 0.0
     capacity: float = 1.0
+    waits_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +200,9 @@ def _request(fields: Fields, rest: list[Buffer]) -> Request:
         raise ProtocolError("request without a body")
     attempt = fields.whole("attempt", 1, COUNT_MAX)
     id, blobs = fields.whole("id", 0, ID_MAX), fields.digests("blobs")
-    return Request(id, kind, budget_s, attempt, blobs=blobs, body=rest)
+    key = fields.text("key", KEY_LENGTH_MAX) if "key" in fields.values else ""
+    useless_s = fields.seconds("useless_s") if "useless_s" in fields.values else None
+    return Request(id, kind, budget_s, attempt, blobs=blobs, body=rest, key=key, useless_s=useless_s)
 
 
 def _reply(fields: Fields, rest: list[Buffer]) -> Reply:
@@ -214,12 +225,17 @@ def _reply(fields: Fields, rest: list[Buffer]) -> Reply:
         load=fields.share("load"),
         capacity=fields.share("capacity"),
         traceback=fields.text("traceback", TRACEBACK_LENGTH_MAX) if "traceback" in fields.values else "",
+        waits_s=fields.seconds("waits_s") if "waits_s" in fields.values else 0.0,
     )
 
 
 _RAW = ("body", "data")  # fields that follow the header as frames
 # Fields that are not sent while they have this value.
-_OPTIONAL: dict[str, object] = {**IDLE, "cpu_s": None, "traceback": "", "compressions": (), "size": None}
+_OPTIONAL: dict[str, object] = {
+    **IDLE,
+    "cpu_s": None, "traceback": "", "compressions": (), "size": None,
+    "key": "", "useless_s": None, "waits_s": 0.0,
+}  # fmt: skip
 _NAMES = {kind: [one.name for one in dataclasses.fields(kind)] for kind in get_args(Message)}
 _FIELDS: dict[type, tuple[str, list[str], list[tuple[str, object]]]] = {
     kind: (
@@ -245,6 +261,7 @@ _READERS: dict[str, Callable[[Fields, list[Buffer]], Message]] = {
         id=fields.whole("id", 0, ID_MAX),
         load=fields.share("load"),
         capacity=fields.share("capacity"),
+        waits_s=fields.seconds("waits_s") if "waits_s" in fields.values else 0.0,
     ),
     "cancel": lambda fields, _: Cancel(fields.whole("id", 0, ID_MAX)),
     "blob": lambda fields, rest: Blob(

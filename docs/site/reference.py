@@ -21,7 +21,7 @@ PAGE = Path("docs/api.md")
 BLOCK = "<!-- api: {} -->"
 END = "<!-- end -->"
 GROUPS = {
-    "Offload": ("Offloader", "CallFuture", "task", "Settings", "check_wanted"),
+    "Offload": ("Offloader", "CallFuture", "task", "Together", "Settings", "check_wanted"),
     "Streams": ("ActionStream", "Step"),
     "What happened": ("Record", "Decision", "Execution", "Savings", "Trace"),
     "Ask before": ("Expectation", "Forecast", "Outlook", "Prediction"),

@@ -7,8 +7,8 @@ import statistics
 from array import array
 from collections.abc import Sequence
 
-from offboard.common.tasks import show_size
 from offboard.common.wording import duration
+from offboard.robot_client.policies.reason import show_size
 from offboard.robot_client.records.record import Record
 from offboard.robot_client.sites.runner import ONBOARD
 

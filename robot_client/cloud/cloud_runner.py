@@ -135,6 +135,11 @@ class CloudRunner:
         except Exception as error:  # noqa: BLE001 - whatever cannot be sent, onboard can answer
             why = str(error) if isinstance(error, BadValue) else f"arguments: {describe(error)}"
             return self._pauses.refuse(self.site, task.kind.name, why)
+        together = task.kind.at(self.site).together
+        try:
+            key = "" if together is None else together.key_of(task.args)
+        except BadValue as error:
+            return self._pauses.refuse(self.site, task.kind.name, str(error))
         largest = max([wire.byte_count(body.frames), *(raw.nbytes for raw in body.blobs.values())])
         if largest > bytes_max - wire.HEADER_BYTES_MAX:
             why = f"arguments of {largest} bytes; the server takes messages of {bytes_max}"
@@ -147,6 +152,7 @@ class CloudRunner:
             future=Answer(self._reader),
             body=body,
             outgoing=outgoing,
+            key=key,
         )
         with self._socket.lock:
             if self._conversation.closed or self._reader.closed:
@@ -298,7 +304,7 @@ class CloudRunner:
             return
         if not isinstance(message, wire.Pong | wire.Reply):
             return
-        report = ServerReport(message.queue_depth, message.load, message.capacity)
+        report = ServerReport(message.queue_depth, message.load, message.capacity, message.waits_s)
         if isinstance(message, wire.Pong):
             self._conversation.pong(message.id, received_s, report)
             return

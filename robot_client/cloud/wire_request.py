@@ -25,6 +25,7 @@ class WireRequest(PendingRequest):
     attempt: how often it was sent, counted from 1.
     last_message: the number of the message that carried it last; 0 if it was never sent.
     doubtful: whether its large arguments were only named, and the server may lack one of them.
+    key: what must be equal for requests that run together.
     """
 
     body: wire.Body
@@ -32,20 +33,27 @@ class WireRequest(PendingRequest):
     attempt: int = 1
     last_message: int = 0
     doubtful: bool = False
+    key: str = ""
 
     @property
     def packed(self) -> tuple[Packed, ...]:
         return self.outgoing.packed
 
     def message(self, now_s: float) -> wire.Request:
-        return wire.Request(
+        kind = self.task.kind.at(self.site)
+        request = wire.Request(
             id=self.task.id,
-            kind=self.task.kind.at(self.site).name,
+            kind=kind.name,
             budget_s=self.deadline_s - now_s,
             attempt=self.attempt,
             blobs=tuple(self.body.blobs),
             body=self.body.frames,
         )
+        if kind.together is not None:
+            request.key = self.key
+        if self.task.useless_s is not None:
+            request.useless_s = max(0.0, self.task.useless_s - now_s)
+        return request
 
     def answered(self, reply: wire.Reply, received_s: float, bytes_in: int) -> Execution:
         value, failure = None, _failure(self.task.kind.name, reply)

@@ -20,14 +20,15 @@ class CallFuture(Future[R]):
     Its state stays pending until it is done, as a future that runs cannot be cancelled.
     `stop`: done once the call is cancelled; its thread then leaves the runs.
     `withdraw`: what cancels the runs that are under way; a batch has one future for all of its calls.
+    `useful_s`: how long the answer is of use, in seconds; None: as long as the call waits for it.
     `falls_back`: whether the call runs onboard if its site fails.
     `take`: called with the answer, or the failure, before the record is made; what it returns is the chunk of
     the record.
     """
 
-    def __init__(self, *, falls_back: bool = True) -> None:
+    def __init__(self, *, falls_back: bool = True, useful_s: float | None = None) -> None:
         super().__init__()
-        self.falls_back = falls_back
+        self.falls_back, self.useful_s = falls_back, useful_s
         self.take: Callable[[Execution], ChunkRecord | None] | None = None
         self.stop: Future[None] = Future()
         self.withdraw: set[Callable[[], None]] = set()

@@ -1,6 +1,6 @@
 """Why a site was chosen, in words: predictions, what was measured, and how old the other sites are."""
 
-from offboard.common.tasks import show_size
+from offboard.common.tasks import Size
 from offboard.common.wording import duration, with_interval
 from offboard.robot_client.policies.forecast import WHOLE, Forecast, Outlook
 from offboard.robot_client.sites.runner import ONBOARD, Condition
@@ -53,3 +53,9 @@ def _measured(site: str, condition: Condition, of: str) -> str:
     if condition.wait_s:
         said += f", wait{of} {duration(condition.wait_s)}"
     return said
+
+
+def show_size(size: Size, form: str) -> str:
+    """A size in words, with each number in this format."""
+    numbers = size if isinstance(size, tuple) else (size,)
+    return " and ".join(format(number, form) for number in numbers)

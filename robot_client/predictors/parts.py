@@ -35,6 +35,7 @@ class Parts:
         self._network = self.LINE(together=False)
         self._loaded = self.LINE(together=True)  # runs while other programs take the CPU
         self._usual_run = RunningMean()
+        self._wait_error = RunningMean()  # of what a server says that tasks will wait
         self._amount = self._bytes = 0.0  # the units
 
     def at_site(self, *, remote: bool) -> "Parts":
@@ -71,7 +72,7 @@ class Parts:
             return Prediction(seconds, spread_s, error_s)
         x = call.moved / self._bytes if self._bytes else 0.0
         network_s = (condition.round_trip_s or 0.0) + self._network.at(x)
-        seconds += network_s * (1.0 + self._network.tail) + condition.queue * self._usual_run.value
+        seconds += network_s * (1.0 + self._network.tail) + self._waits_s(condition)
         spread_s = math.hypot(spread_s, self._network.deviation * network_s)
         return Prediction(seconds + call.pack_s, spread_s, math.hypot(error_s, self._network.error(x)))
 
@@ -87,7 +88,7 @@ class Parts:
             if not (self.remote and self._network.count):  # onboard, or a server that does not tell the parts
                 self._learn_run(size, seconds, condition)
                 return
-            expected_s = self._run_s(size, condition)[0] + condition.queue * self._usual_run.value
+            expected_s = self._run_s(size, condition)[0] + self._waits_s(condition)
             self._learn_network(call.moved, max(0.0, seconds - expected_s - rtt_s), rtt_s, bound=False)
             return
         if run_s is None or not self.remote:  # onboard, a busy CPU also makes the run begin late
@@ -95,7 +96,15 @@ class Parts:
         else:
             rest_s = seconds - (run.queue_s or 0.0) - run_s - rtt_s
             self._learn_network(call.moved, max(0.0, rest_s), rtt_s, bound=run.bound)
+            if condition.queue_s:
+                self._wait_error.add((run.queue_s or 0.0) - condition.queue_s)
         self._learn_run(size, run_s, condition)
+
+    def _waits_s(self, condition: Condition) -> float:
+        """The wait in the queue: what the server expects and how far off that was, or usual runs."""
+        if condition.queue_s:
+            return max(0.0, condition.queue_s + self._wait_error.value)
+        return condition.queue * self._usual_run.value
 
     def _run_s(self, size: float, condition: Condition) -> tuple[float, float]:
         """The seconds of a run, and their standard error, which alone is known where the line is below 0."""

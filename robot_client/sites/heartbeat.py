@@ -28,6 +28,7 @@ class ServerReport(NamedTuple):
     queue: int = 0
     load: float = 0.0
     capacity: float = 1.0
+    waits_s: float = 0.0
 
 
 class Heartbeat:
@@ -140,10 +141,11 @@ class Heartbeat:
         return self._condition(silent=silent, wait_s=unheard_s if late else 0.0)
 
     def _condition(self, *, silent: bool = False, wait_s: float = 0.0) -> Condition:
-        queue, load, capacity = self._report
+        queue, load, capacity, queue_s = self._report
         return Condition(
-            self._round_trip_s, silent, queue, wait_s=wait_s, capacity=capacity, server_load=load
-        )
+            self._round_trip_s, silent, queue,
+            wait_s=wait_s, capacity=capacity, server_load=load, queue_s=queue_s,
+        )  # fmt: skip
 
     def _unheard_s(self, now_s: float) -> float:
         """Seconds since a heartbeat went unanswered and nothing else came; negative if all are answered."""

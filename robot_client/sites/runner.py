@@ -112,6 +112,7 @@ class Condition(NamedTuple):
         is silent: as long again as it has been so far.
     capacity: share of one CPU at full clock that a task may use there, above 0 to 1.
     server_load: share of the server's CPU that other programs take, in its last report.
+    queue_s: how long a task would wait there, in the server's last report; 0: it does not say.
     """
 
     round_trip_s: float | None = None
@@ -121,6 +122,7 @@ class Condition(NamedTuple):
     wait_s: float = 0.0
     capacity: float = 1.0
     server_load: float = 0.0
+    queue_s: float = 0.0
 
 
 UNMEASURED = Condition()

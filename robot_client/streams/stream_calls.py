@@ -53,9 +53,15 @@ class StreamCalls:
         }
 
     def call(
-        self, item: Any, site: str, timeout_s: float, take: Callable[[Execution], ChunkRecord | None]
+        self,
+        item: Any,
+        site: str,
+        timeout_s: float,
+        take: Callable[[Execution], ChunkRecord | None],
+        *,
+        useful_s: float | None = None,
     ) -> CallFuture[Any]:
-        future = CallFuture[Any](falls_back=False)
+        future = CallFuture[Any](falls_back=False, useful_s=useful_s)
         future.take = take
         return self._submit(self._kind.arguments_in(item), site, timeout_s, future)
 

@@ -43,7 +43,8 @@ class Caller:
     def able(self) -> dict[str, float]:
         return dict(self.sites)
 
-    def call(self, item: Any, site: str, timeout_s: float, take: Any) -> CallFuture[Any]:
+    def call(self, item: Any, site: str, timeout_s: float, take: Any, *, useful_s: float) -> CallFuture[Any]:
+        assert 0 < useful_s <= PACE.horizon_s
         assert timeout_s == PACE.horizon_s
         future = CallFuture[Any](falls_back=False)
         future.take = lambda answer: self.chunks.append(take(replace(answer, site=site)))

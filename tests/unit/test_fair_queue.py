@@ -1,5 +1,6 @@
 """Which request is next, and which one leaves a full queue."""
 
+import math
 from collections import Counter
 
 from offboard.cloud_server.fair_queue import ROBOTS_MAX, FairQueue, Work
@@ -113,3 +114,56 @@ def test_taken_requests_are_gone_and_idle_robots_are_forgotten() -> None:
         assert work is not None
         queue.done(work, 0.01)
     assert len(queue._had_s) <= ROBOTS_MAX + 1
+
+
+def urgent_loop(hurries: tuple[bool, bool], count: int) -> Counter[bytes]:
+    """Two robots, each with one request at a time that takes a second; the share of each."""
+    queue, found, now_s = FairQueue(8), Counter[bytes](), 0.0
+    for robot, hurry in zip((b"a", b"b"), hurries, strict=True):
+        queue.add(hurried(robot, now_s, hurry=hurry))
+    for _ in range(count):
+        work = queue.next()
+        assert work is not None
+        now_s += 1.0
+        queue.done(work, 1.0)
+        found[work.robot] += 1
+        queue.add(hurried(work.robot, now_s, hurry=hurries[work.robot == b"b"]))
+    return found
+
+
+def hurried(robot: bytes, now_s: float, *, hurry: bool) -> Work:
+    work = request(robot, 0, now_s)
+    work.useless_s = now_s + 1.0 if hurry else math.inf
+    return work
+
+
+def test_always_being_in_a_hurry_does_not_pay() -> None:
+    """Over a minute, the share of a robot that always is differs by 5 % at most from that of an equal one."""
+    found = urgent_loop((True, False), 60)
+    assert found[b"a"] <= 1.05 * found[b"b"] + 1
+    assert found[b"a"] >= found[b"b"]
+
+
+def test_the_earliest_useless_answer_goes_first() -> None:
+    """Among robots that have had about as much."""
+    queue = FairQueue(8)
+    for robot, useless_s in ((b"a", math.inf), (b"b", 5.0), (b"c", 2.0)):
+        work = request(robot, 0)
+        work.useless_s = useless_s
+        queue.add(work)
+    order = []
+    while (work := queue.next()) is not None:
+        order.append(work.robot)
+    assert order == [b"c", b"b", b"a"]
+
+
+def test_a_request_that_is_put_back_is_the_next_of_its_robot() -> None:
+    """Its run has cost nothing, and no other one is lost."""
+    queue = FairQueue(8)
+    for id in range(3):
+        queue.add(request(b"a", id))
+    first = queue.next()
+    assert first is not None
+    queue.put_back(first)
+    assert [work.request.id for work in queue] == [0, 1, 2]
+    assert len(queue) == 3

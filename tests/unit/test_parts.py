@@ -325,6 +325,7 @@ CONDITIONS = st.builds(
     load=st.floats(0, 1),
     capacity=st.floats(0.001, 1),
     server_load=st.floats(0, 1),
+    queue_s=SECONDS,
 )
 LEARNED = st.tuples(NUMBER, SECONDS, st.none() | SECONDS, NUMBER, CONDITIONS, st.sampled_from("abc"))
 

@@ -3,7 +3,7 @@
 import pytest
 
 from offboard.cloud_server.executors.executor import Outcome
-from offboard.cloud_server.scheduler import CRASHED_KEPT, CRASHES_MAX, FAILURES_KEPT, CrashCount, FailureLog
+from offboard.cloud_server.failures import CRASHED_KEPT, CRASHES_MAX, FAILURES_KEPT, CrashCount, FailureLog
 
 
 def test_a_request_is_refused_after_its_last_crash() -> None:

@@ -9,11 +9,11 @@ from tests import structure
 
 ROOT = Path(__file__).parents[2]
 MODULES = structure.modules(ROOT)
-FOLDER_FILES_MAX = {"common": 16, "cloud_server": 15}
+FOLDER_FILES_MAX = {"common": 17, "cloud_server": 15}
 FILES_MAX = 14
 MODULE_LINES_MAX = 400
 TEST_LINES_MAX = 400
-ROBOT_LINES_MAX = 13_100
+ROBOT_LINES_MAX = 13_200
 GLOSSARY_MAX = 60
 FLAGS_MAX = 16
 

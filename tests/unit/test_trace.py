@@ -101,6 +101,7 @@ def test_a_line_holds_every_field_of_the_format(tmp_path: Path) -> None:
             "cloud.wait_s": 0.0,
             "cloud.capacity": 1.0,
             "cloud.server_load": 0.0,
+            "cloud.queue_s": 0.0,
         },
         "sites": {
             "onboard": {
