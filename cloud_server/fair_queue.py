@@ -3,7 +3,7 @@
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from offboard.common.wire.blobs import StoredBlob
 from offboard.common.wire.messages import Request, byte_count
@@ -27,7 +27,7 @@ class Work:
     group: tuple[str, str] | None = None  # what it may run together with; None: it runs alone
     useless_s: float = math.inf  # when nobody needs the answer any more
     number: int = 0  # of its run, in `Gathering`
-    more: "list[Work]" = field(default_factory=list)  # what runs together with it
+    more: "tuple[Work, ...]" = ()  # what runs together with it
 
     def expired(self, now: float) -> bool:
         return now - self.arrived >= self.request.budget_s
@@ -71,32 +71,31 @@ class FairQueue:
             line = self._longest()
             evicted = line.pop()
             self._held.drop(evicted)
-            self._left(evicted)
+            self._count -= 1
+            if evicted.group is not None:
+                self._ungroup(evicted.group)
         self._held.add(work)
         self._had_s[work.robot] = max(self._had_s.get(work.robot, 0.0), self._least_s)
         self._lines.setdefault(work.robot, deque()).append(work)
-        self._came(work)
-        return evicted
-
-    def put_back(self, work: Work) -> None:
-        """A request from `next` waits again, as the first one of its robot. It is no longer charged."""
-        self.done(work, 0.0)
-        self._held.add(work)
-        self._had_s.setdefault(work.robot, self._least_s)
-        self._lines.setdefault(work.robot, deque()).appendleft(work)
-        self._came(work)
-
-    def _came(self, work: Work) -> None:
         self._count += 1
         if work.group is not None:
             self.groups[work.group] += 1
+        return evicted
 
-    def _left(self, work: Work) -> None:
-        self._count -= 1
-        if work.group is not None:
-            self.groups[work.group] -= 1
-            if not self.groups[work.group]:
-                del self.groups[work.group]
+    def put_back(self, work: Work) -> None:
+        """A request from `next` waits again, alone, as the first one of its robot. It is not charged."""
+        self.done(work, 0.0)
+        work.group = None
+        self._held.add(work)
+        self._had_s.setdefault(work.robot, self._least_s)
+        self._lines.setdefault(work.robot, deque()).appendleft(work)
+        self._count += 1
+
+    def _ungroup(self, group: tuple[str, str]) -> None:
+        """A request of this group waits no more."""
+        self.groups[group] -= 1
+        if not self.groups[group]:
+            del self.groups[group]
 
     def _longest(self) -> deque[Work]:
         return max(self._lines.values(), key=len)
@@ -119,7 +118,9 @@ class FairQueue:
         work = line.popleft()
         if not line:
             del self._lines[robot]
-        self._left(work)
+        self._count -= 1
+        if work.group is not None:
+            self._ungroup(work.group)
         work.charged_s = self._usual_s
         self._had_s[robot] += work.charged_s
         self._running[robot] = self._running.get(robot, 0) + 1
@@ -165,7 +166,9 @@ class FairQueue:
                 del self._lines[robot]
         for work in taken:
             self._held.drop(work)
-            self._left(work)
+            if work.group is not None:
+                self._ungroup(work.group)
+        self._count -= len(taken)
         return taken
 
     def __len__(self) -> int:

@@ -68,7 +68,7 @@ class _Arrivals:
 
 
 class Gathering:
-    """What is learned of the kinds with `together`.
+    """What is learned of the kinds with `together`. `used`: whether any run had one.
 
     A request is held, if the next one is expected so soon that all that wait lose less than the next one
     gains, which is a whole run: count x gap < time of a run. After PATIENCE gaps, and once the wait has cost
@@ -77,6 +77,7 @@ class Gathering:
     """
 
     def __init__(self) -> None:
+        self.used = False
         self._arrivals: dict[Group, _Arrivals] = {}
         self._times: dict[str, RunTimes] = {}
         self._typical: dict[str, float] = {}  # requests of a run, by kind
@@ -84,11 +85,6 @@ class Gathering:
         self._ends_s: dict[int, float] = {}  # when each run should end, by its number
         self._runs = 0
         self._last = ""  # the kind that ran last
-
-    @property
-    def used(self) -> bool:
-        """Whether any run had a kind with `together`."""
-        return bool(self._last)
 
     def arrived(self, group: Group, now_s: float) -> None:
         """A request of this group has come."""
@@ -138,7 +134,7 @@ class Gathering:
         self._held_s += TYPICAL_RATE * (held_s - self._held_s)
         before = self._typical.get(group[0], float(count))
         self._typical[group[0]] = before + TYPICAL_RATE * (count - before)
-        self._last = group[0]
+        self.used, self._last = True, group[0]
         self._runs += 1
         self._ends_s[self._runs] = now_s + (self.run_s(group[0], count) or 0.0)
         return self._runs, held_s

@@ -154,7 +154,7 @@ class ReaderThreads:
         call = Call(request.kind, request.body, work.blobs, wanted, budget_s=left_s)
         return self._joint(call, work.more) if work.more else call
 
-    def _joint(self, call: Call, others: list[Work]) -> Call:
+    def _joint(self, call: Call, others: tuple[Work, ...]) -> Call:
         """This call with those that run together with it: it ends when the last of them must."""
         more = tuple(map(self._call, others))
         wanted = [one.wanted for one in (call, *more)]

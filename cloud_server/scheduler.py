@@ -93,26 +93,26 @@ class Scheduler:
 
     def request(self, peer: bytes, request: Request) -> None:
         """Put a request into the queue, or answer why not."""
-        now = time.monotonic()
-        work = Work(peer, request, {}, now, robot=self._access.robot_of(peer))
+        work = Work(peer, request, {}, time.monotonic(), robot=self._access.robot_of(peer))
         if request.useless_s is not None:
-            work.useless_s = now + request.useless_s
-        refusal = self._refusal(work)
+            work.useless_s = work.arrived + request.useless_s
+        kind = tasks.find_kind(request.kind)
+        refusal = self._refusal(work, kind)
         if refusal is not None:
             self.refuse(peer, request, refusal)
             return
-        if tasks.kind_named(request.kind).together is not None:
+        if kind is not None and kind.together is not None:
             work.group = request.kind, request.key
-            self._gathering.arrived(work.group, now)
+            self._gathering.arrived(work.group, work.arrived)
         evicted = self._queue.add(work)
         if evicted is not None:
             self.refuse(evicted.peer, evicted.request, self._full())
         self._choose()
 
-    def _refusal(self, work: Work) -> Refusal | None:
+    def _refusal(self, work: Work, kind: tasks.Kind | None) -> Refusal | None:
         """Why this request cannot be accepted; None if it can, and then it has its blobs."""
         request = work.request
-        if not tasks.is_kind(request.kind):
+        if kind is None:
             return Refusal("unknown_task", f"no task named {request.kind!r} on this server")
         if self._crashes.too_many(work.peer, request.id):
             return Refusal("failed", f"its worker died {CRASHES_MAX} times; it is not run again")
@@ -184,7 +184,7 @@ class Scheduler:
     def _choose(self) -> None:
         """Move waiting requests to the free workers. From then on they count as running."""
         self.wakes_s = math.inf
-        while self.ready and self._runs < self._executor.up:
+        while self.warm and self._runs < self._executor.up:
             work = self._queue.next(self._startable if self._queue.groups else None)
             if work is None:
                 return
@@ -235,7 +235,7 @@ class Scheduler:
             if other is None:
                 break
             if self._starts(other):
-                work.more.append(other)
+                work.more += (other,)
                 left -= byte_count(other.request.body)
         count = 1 + len(work.more)
         work.number, held_s = self._gathering.began(group, count, time.monotonic())
@@ -262,7 +262,7 @@ class Scheduler:
         if not work.more:
             self._answer(work, outcome)
             return
-        works, work.more = (work, *work.more), []
+        works, work.more = (work, *work.more), ()
         if outcome.crashed or outcome.status == "busy":  # one of them may be the culprit
             for one in reversed(works):
                 self._alone(one, outcome)
@@ -285,7 +285,6 @@ class Scheduler:
             self._answer(work, outcome)
             return
         self._running.discard(work)
-        work.group = None
         self._queue.put_back(work)
 
     def _answer(self, work: Work, outcome: Outcome) -> None:

@@ -168,7 +168,8 @@ class Server:
 
     def _turn(self) -> list[Work]:
         """Wait for messages and read them; returns the work to start."""
-        self._channel.wait(max(0.0, min(POLL_S, self._scheduler.wakes_s - time.monotonic())))
+        wakes_s = self._scheduler.wakes_s
+        self._channel.wait(POLL_S if wakes_s == math.inf else max(0.0, wakes_s - time.monotonic()))
         with self._channel.lock:
             now = self._last_turn = time.monotonic()
             self._tend_executor()

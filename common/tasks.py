@@ -307,8 +307,8 @@ def kind_named(name: str) -> Kind:
         raise UnknownTask(f"no task named {name!r}; known: {known}") from None
 
 
-def is_kind(name: str) -> bool:
-    return name in _on_servers
+def find_kind(name: str) -> Kind | None:
+    return _on_servers.get(name)
 
 
 def hashes() -> dict[str, str]:

@@ -66,7 +66,7 @@ class Outcome:
     together: int = 1
     queue_s: float = 0.0
     note: str = ""
-    more: "list[Outcome]" = field(default_factory=list)
+    more: "Sequence[Outcome]" = ()
 
 
 class Executor(Protocol):

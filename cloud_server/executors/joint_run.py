@@ -13,10 +13,8 @@ from offboard.common.together import Together
 from offboard.common.wire.values import encode
 
 
-def run_calls(call: Call, states: TaskStates) -> Outcome:
+def run_joint(call: Call, states: TaskStates) -> Outcome:
     """Run this call, and with it those that run together with it; their outcomes are in `more`."""
-    if not call.more:
-        return run_task(call, states)
     first, *more = JointRun([call, *call.more], states).outcomes()
     first.more = more
     return first

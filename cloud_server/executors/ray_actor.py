@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from offboard.cloud_server.executors.executor import Call, Outcome, bounded, warm_kinds
-from offboard.cloud_server.executors.joint_run import run_calls
+from offboard.cloud_server.executors.executor import Call, Outcome, bounded, run_task, warm_kinds
+from offboard.cloud_server.executors.joint_run import run_joint
 from offboard.cloud_server.executors.worker_process import ANSWER_BYTES_MAX, full, limit_memory
 from offboard.common import VERSION, tasks
 from offboard.common.cpu_time import SELF, process_s
@@ -117,7 +117,11 @@ class RayActor:
             Call(kind, one, self._known(named), lambda: self._stopped != number, budget_s=budget_s)
             for one, named, budget_s in ((frames, digests, math.inf), *more)
         ]
-        outcome = _sendable(run_calls(replace(first, more=tuple(others)) if more else first, self._states))
+        if others:
+            outcome = run_joint(replace(first, more=tuple(others)), self._states)
+        else:
+            outcome = run_task(first, self._states)
+        outcome = _sendable(outcome)
         self._load.hurry()  # the load during the task, not before it
         outcome.load = self._load.latest()
         return Ran(outcome, full(outcome.error), process_s(os.getpid()))

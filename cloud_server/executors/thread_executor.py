@@ -7,8 +7,8 @@ from concurrent.futures import Future
 from functools import partial
 from queue import Empty, SimpleQueue
 
-from offboard.cloud_server.executors.executor import Call, Executor, Outcome, warm_kinds
-from offboard.cloud_server.executors.joint_run import run_calls
+from offboard.cloud_server.executors.executor import Call, Executor, Outcome, run_task, warm_kinds
+from offboard.cloud_server.executors.joint_run import run_joint
 from offboard.common.task_call import join_all
 from offboard.common.task_states import TaskStates
 
@@ -44,13 +44,14 @@ class ThreadExecutor(Executor):
     def submit(self, call: Call, done: "Callable[[Future[Outcome]], None]") -> "Future[Outcome]":
         outcome: Future[Outcome] = Future()
         outcome.add_done_callback(done)
-        self._calls.put(lambda: outcome.set_result(run_calls(call, self._states)))
+        run = run_joint if call.more else run_task
+        self._calls.put(lambda: outcome.set_result(run(call, self._states)))
         return outcome
 
     def run(self, call: Call, *, meanwhile: Callable[[], None] | None) -> Outcome | None:
         if meanwhile is not None:
             self._calls.put(meanwhile)
-        return run_calls(call, self._states)
+        return (run_joint if call.more else run_task)(call, self._states)
 
     def close(self) -> None:
         with contextlib.suppress(Empty):

@@ -18,8 +18,8 @@ from typing import Any
 
 import msgpack
 
-from offboard.cloud_server.executors.executor import Call, Outcome, bounded, warm_kinds
-from offboard.cloud_server.executors.joint_run import run_calls
+from offboard.cloud_server.executors.executor import Call, Outcome, bounded, run_task, warm_kinds
+from offboard.cloud_server.executors.joint_run import run_joint
 from offboard.common.errors import TaskFailed, describe
 from offboard.common.source.task_modules import load_modules
 from offboard.common.task_states import TaskStates
@@ -74,9 +74,9 @@ def work(parent: int, pipe_fd: int, flag: int, setup: Setup) -> None:
         pipe.sendall(msgpack.packb([describe(error), ""], unicode_errors="replace"))
         return
     pipe.sendall(msgpack.packb(["", ""]))
-    store, run = BlobStore(setup.blob_bytes_max), partial(run_calls, states=states)
+    store = BlobStore(setup.blob_bytes_max)
     while (call := _receive(pipe)) is not None:
-        pipe.sendall(_answer(call, store, Path(setup.folder), wanted=lambda: not stop[0], run=run))
+        pipe.sendall(_answer(call, store, Path(setup.folder), wanted=lambda: not stop[0], states=states))
         del call  # free its memory before the next one comes
 
 
@@ -113,7 +113,7 @@ def _answer(
     folder: Path,
     *,
     wanted: Callable[[], bool],
-    run: Callable[[Call], Outcome],
+    states: TaskStates,
 ) -> bytes:
     """Run one task; returns the message about its outcome."""
     kind, frames, digests, *joint = message
@@ -125,7 +125,9 @@ def _answer(
             ]
         except OSError as error:
             return _message(Outcome("failed", describe(error), server_fault=True))
-        return _message(run(calls[0] if not joint else replace(calls[0], more=tuple(calls[1:]))))
+        if joint:
+            return _message(run_joint(replace(calls[0], more=tuple(calls[1:])), states))
+        return _message(run_task(calls[0], states))
     except MemoryError:
         return NOTHING_LEFT
 

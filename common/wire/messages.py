@@ -141,14 +141,14 @@ def pack(message: Message) -> list[Buffer]:
     """The frames of a message; its buffers are not copied. BadValue if the message is too large."""
     kind, names, optional = _FIELDS[type(message)]
     fields = {field: getattr(message, field) for field in names}
+    for name, absent in optional:
+        if (value := getattr(message, name)) != absent:
+            fields[name] = value
     if kind == "reply":
         if fields["error"]:
             fields["error"] = _sendable(fields["error"][:ERROR_LENGTH_MAX])
-        if fields["traceback"]:
+        if "traceback" in fields:
             fields["traceback"] = _sendable(bounded(fields["traceback"]))
-    for name, absent in optional:
-        if fields[name] == absent:
-            del fields[name]
     header: bytes = msgpack.packb([VERSION, kind, fields])
     frames: list[Buffer] = [header]
     if isinstance(message, Request | Reply):
@@ -240,7 +240,7 @@ _NAMES = {kind: [one.name for one in dataclasses.fields(kind)] for kind in get_a
 _FIELDS: dict[type, tuple[str, list[str], list[tuple[str, object]]]] = {
     kind: (
         kind.__name__.lower(),
-        [name for name in names if name not in _RAW],
+        [name for name in names if name not in _RAW and name not in _OPTIONAL],
         [(name, _OPTIONAL[name]) for name in names if name in _OPTIONAL],
     )
     for kind, names in _NAMES.items()

@@ -135,7 +135,7 @@ class CloudRunner:
         except Exception as error:  # noqa: BLE001 - whatever cannot be sent, onboard can answer
             why = str(error) if isinstance(error, BadValue) else f"arguments: {describe(error)}"
             return self._pauses.refuse(self.site, task.kind.name, why)
-        together = task.kind.at(self.site).together
+        together = (task.kind.at(self.site) if task.kind.variants else task.kind).together
         try:
             key = "" if together is None else together.key_of(task.args)
         except BadValue as error:

@@ -40,16 +40,15 @@ class WireRequest(PendingRequest):
         return self.outgoing.packed
 
     def message(self, now_s: float) -> wire.Request:
-        kind = self.task.kind.at(self.site)
         request = wire.Request(
             id=self.task.id,
-            kind=kind.name,
+            kind=self.task.kind.at(self.site).name,
             budget_s=self.deadline_s - now_s,
             attempt=self.attempt,
             blobs=tuple(self.body.blobs),
             body=self.body.frames,
         )
-        if kind.together is not None:
+        if self.key:
             request.key = self.key
         if self.task.useless_s is not None:
             request.useless_s = max(0.0, self.task.useless_s - now_s)

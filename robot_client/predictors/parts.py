@@ -72,7 +72,8 @@ class Parts:
             return Prediction(seconds, spread_s, error_s)
         x = call.moved / self._bytes if self._bytes else 0.0
         network_s = (condition.round_trip_s or 0.0) + self._network.at(x)
-        seconds += network_s * (1.0 + self._network.tail) + self._waits_s(condition)
+        seconds += network_s * (1.0 + self._network.tail)
+        seconds += self._waits_s(condition) if condition.queue_s else condition.queue * self._usual_run.value
         spread_s = math.hypot(spread_s, self._network.deviation * network_s)
         return Prediction(seconds + call.pack_s, spread_s, math.hypot(error_s, self._network.error(x)))
 

@@ -102,7 +102,7 @@ def test_servers_run_all_variants_but_that_of_onboard() -> None:
     assert kind_named("sort_out@edge").function is sort_on_the_edge
     assert kind_of(only_there).on_servers() == ()
     for name in ("sort_out", "sort_out@onboard", "only_there@cloud", "sort_out@fog"):
-        assert not tasks.is_kind(name)
+        assert tasks.find_kind(name) is None
         with pytest.raises(UnknownTask, match=f"no task named '{name}'"):
             kind_named(name)
 
