@@ -22,6 +22,7 @@ TABLES = (
     "attacks",
     "footprint",
     "page_cost",
+    "shared_server",
     "stream_steps",
     "task_cost",
 )

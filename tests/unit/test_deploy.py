@@ -93,6 +93,32 @@ def test_kustomize_renders_all_manifests() -> None:
     ]
 
 
+def test_the_gpu_component_patches_what_is_there() -> None:
+    """It names the Deployment and the container, replaces a variable that they have, and asks for one GPU."""
+    patch = yaml.safe_load((FOLDER / "gpu" / "deployment.yaml").read_text())
+    component = yaml.safe_load((FOLDER / "gpu" / "kustomization.yaml").read_text())
+    assert (component["kind"], component["patches"]) == ("Component", [{"path": "deployment.yaml"}])
+    deployment = resource("deployment.yaml")
+    assert patch["metadata"]["name"] == deployment["metadata"]["name"]
+    (changed,) = patch["spec"]["template"]["spec"]["containers"]
+    (container,) = deployment["spec"]["template"]["spec"]["containers"]
+    assert changed["name"] == container["name"]
+    assert {one["name"] for one in changed["env"]} <= {one["name"] for one in container["env"]}
+    assert changed["resources"] == {"limits": {"nvidia.com/gpu": 1}}
+
+
+def test_kubectl_renders_the_gpu_component(tmp_path: Path) -> None:
+    """With `components: [gpu]`, the server has one worker and one GPU."""
+    folder = tmp_path / "kubernetes"
+    shutil.copytree(FOLDER, folder)
+    with (folder / "kustomization.yaml").open("a") as file:
+        file.write("components: [gpu]\n")
+    rendered = [one for one in kubectl("kustomize", str(folder)) if one["kind"] == "Deployment"]
+    (container,) = rendered[0]["spec"]["template"]["spec"]["containers"]
+    assert {"name": "CLOUD_WORKERS", "value": "1"} in container["env"]
+    assert container["resources"]["limits"]["nvidia.com/gpu"] == 1
+
+
 def test_the_documented_commands_make_what_the_pod_mounts(tmp_path: Path) -> None:
     """The commands of docs/deployment.md make the Secret and the ConfigMap that the pod asks for."""
     kubernetes_validate = pytest.importorskip("kubernetes_validate")
