@@ -1,5 +1,6 @@
 """Tasks for the tests of executors, and how to run them."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ ON_THIS_COMPUTER = ("processes", "threads")  # executors; `make ray` tests the o
 ROOT = Path(__file__).parents[1]
 MODULE = '''
 import asyncio, dataclasses, os, pathlib, threading, time
+from offboard import Together
 from offboard.common.tasks import task
 from offboard.common.task_call import check_wanted
 
@@ -91,6 +93,15 @@ def exec_wait_for_file(path):
     with open(path) as pipe:  # a named pipe: opening waits for the writer
         return pipe.read()
 
+def sums(arrays):
+    if any(array.size == 0 for array in arrays):
+        raise ValueError("empty")
+    return [[float(array.sum()), len(arrays)] for array in arrays]
+
+@task("exec_joint", size=lambda array: 0, together=Together(sums, key=lambda array: array.ndim))
+def exec_joint(array):
+    return sums([array])[0]
+
 @task("exec_burn", size=lambda seconds: seconds)
 def exec_burn(seconds):
     """Compute until this thread has used this many CPU seconds; returns the exact number."""
@@ -113,6 +124,13 @@ def call(kind: str, *args: Any, **options: Any) -> Call:
     body = encode(args, blobs=True)
     blobs = {digest: StoredBlob(data) for digest, data in body.blobs.items()}
     return Call(kind, body.frames, blobs, **options)
+
+
+def run_joint(executor: Executor, kind: str, *items: Any) -> list[Outcome]:
+    """The outcomes of calls that run together, one for each of these arguments."""
+    first, *more = [call(kind, item) for item in items]
+    outcome = executor.submit(replace(first, more=tuple(more)), lambda _: None).result(WAIT_S)
+    return [outcome, *outcome.more]
 
 
 def run(executor: Executor, kind: str, *args: Any) -> Outcome:

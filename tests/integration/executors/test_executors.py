@@ -14,7 +14,7 @@ import pytest
 from offboard.cloud_server.executors import EXECUTORS, Executor
 from offboard.cloud_server.executors.executor import Call, Outcome
 from offboard.common.wire.values import encode
-from tests.executor_tasks import ON_THIS_COMPUTER, WAIT_S, call, run, value
+from tests.executor_tasks import ON_THIS_COMPUTER, WAIT_S, call, run, run_joint, value
 from tests.wire_values import Pose
 
 pytestmark = pytest.mark.integration
@@ -66,6 +66,24 @@ def test_what_a_task_raises_is_its_outcome(
 def test_a_kind_that_packs_gets_its_arguments_unpacked(executor: Executor) -> None:
     """The one value that was sent becomes all arguments."""
     assert value(run(executor, "exec_packed", {"a": 1, "b": [2]})) == [1, [2]]
+
+
+def test_calls_that_run_together_have_their_own_outcomes(executor: Executor) -> None:
+    """In their order, with their blobs; one with another key runs alone."""
+    arrays = [np.full(10, 1.0), np.full(100_000, 2.0), np.full((2, 3), 3.0), np.full(10, 4.0)]
+    outcomes = run_joint(executor, "exec_joint", *arrays)
+    assert [value(one) for one in outcomes] == [[10.0, 3], [200_000.0, 3], [18.0, 1], [40.0, 3]]
+    assert [one.together for one in outcomes] == [3, 3, 1, 3]
+
+
+def test_a_raising_run_is_repeated_one_by_one(executor: Executor) -> None:
+    """Only the call that raises alone fails, and the outcome says what happened."""
+    outcomes = run_joint(executor, "exec_joint", np.ones(2), np.ones(0), np.ones(3))
+    assert [one.status for one in outcomes] == ["ok", "failed", "ok"]
+    assert outcomes[1].error == "ValueError: empty"
+    assert "in sums" in outcomes[1].traceback
+    assert [value(one) for one in (outcomes[0], outcomes[2])] == [[2.0, 1], [3.0, 1]]
+    assert outcomes[0].note == "a run of 3 requests failed, so each runs alone: ValueError: empty"
 
 
 @pytest.mark.parametrize(
