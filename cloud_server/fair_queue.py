@@ -51,10 +51,15 @@ class FairQueue:
         self._running: dict[bytes, int] = {}
         self._had_s: dict[bytes, float] = {}  # worker time of each robot
         self._least_s = 0.0  # worker time of the robot chosen last; a returning robot starts with it
-        self._usual_s = 0.0
+        self.usual_s = 0.0
         self._count = 0
         self._held = _HeldBytes()
         self.groups: Counter[tuple[str, str]] = Counter()  # waiting requests that may run together
+
+    @property
+    def robots(self) -> int:
+        """How many robots have waiting requests."""
+        return len(self._lines)
 
     def bytes_with(self, work: Work) -> int:
         """Memory of all waiting and running requests, in bytes, if this one is added."""
@@ -121,7 +126,7 @@ class FairQueue:
         self._count -= 1
         if work.group is not None:
             self._ungroup(work.group)
-        work.charged_s = self._usual_s
+        work.charged_s = self.usual_s
         self._had_s[robot] += work.charged_s
         self._running[robot] = self._running.get(robot, 0) + 1
         return work
@@ -135,7 +140,7 @@ class FairQueue:
         least_s = self._had_s[least]
         urgent = [one for one in robots if self._lines[one][0].useless_s < math.inf]
         if urgent:
-            near = [one for one in urgent if self._had_s[one] <= least_s + self._usual_s]
+            near = [one for one in urgent if self._had_s[one] <= least_s + self.usual_s]
             least = min(near, key=lambda robot: self._lines[robot][0].useless_s, default=least)
         return least, least_s
 
@@ -145,7 +150,7 @@ class FairQueue:
         self._held.drop(work)
         self._had_s[robot] += run_s - work.charged_s
         if run_s > 0:
-            self._usual_s += USUAL_RATE * (run_s - self._usual_s)
+            self.usual_s += USUAL_RATE * (run_s - self.usual_s)
         self._running[robot] -= 1
         if not self._running[robot]:
             del self._running[robot]

@@ -13,6 +13,7 @@ GROUPS_MAX = 256  # keys are told by robots
 GAP_RATE = 0.2  # share of each new gap in what is expected
 PATIENCE = 3.0  # expected gaps without a request, after which none is waited for
 RISK = 0.25  # of what the next request would gain, is risked even if it was expected earlier
+LEAST_RATE = 0.01  # share of each longer run in the shortest one
 KEPT = 0.98  # of the weight of earlier runs, when a run is learned
 TYPICAL_RATE = 0.1  # share of each new run in what is typical
 
@@ -23,9 +24,15 @@ class RunTimes:
     """The time of a run as a function of how many requests it holds: a line, by weighted least squares."""
 
     def __init__(self) -> None:
+        self.least_s = math.inf  # of one request; it rises slowly if all runs are longer
         self._weight = self._n = self._s = self._nn = self._ns = 0.0
 
     def learn(self, count: int, run_s: float) -> None:
+        own_s = run_s / count
+        if own_s < self.least_s:
+            self.least_s = own_s
+        else:
+            self.least_s += LEAST_RATE * (own_s - self.least_s)
         self._weight = KEPT * self._weight + 1.0
         self._n = KEPT * self._n + count
         self._s = KEPT * self._s + run_s
@@ -153,6 +160,11 @@ class Gathering:
     def run_s(self, kind: str, count: float) -> float | None:
         times = self._times.get(kind)
         return None if times is None else times.seconds(count)
+
+    def least_s(self, kind: str) -> float | None:
+        """About the shortest run of this kind, for each request; None if nothing is known."""
+        times = self._times.get(kind)
+        return None if times is None else times.least_s
 
     def own_s(self, kind: str, count: int, run_s: float) -> float:
         """The part of a run of so many that one of its requests would have taken alone."""

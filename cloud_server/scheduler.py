@@ -132,25 +132,27 @@ class Scheduler:
         return None if work.useless_s == math.inf else self._too_late(work, work.arrived)
 
     def _too_late(self, work: Work, now: float, *, waits: bool = True) -> Refusal | None:
-        """Why the answer to this request cannot come in time; None if it can, or if nobody knows."""
+        """Why the answer to this request cannot come in time; None if it can, or if nobody knows.
+
+        Its run may be as short as the shortest one of its kind.
+        """
         kind = work.request.kind
-        run_s = self._gathering.run_s(kind, 1)
-        if run_s is None:
+        least_s = self._gathering.least_s(kind)
+        if least_s is None:
             return None
-        waits_s = self._waits_s(now, run_s) if waits else 0.0
-        if now + waits_s + run_s <= work.useless_s:
+        waits_s = self._waits_s(now) if waits else 0.0
+        if now + waits_s + least_s <= work.useless_s:
             return None
         self._metrics.too_late.labels(kind).inc()
-        text = f"its answer would come after {waits_s + run_s:.3g} s, when nobody needs it"
+        text = f"its answer would come after {waits_s + least_s:.3g} s, when nobody needs it"
         return Refusal("busy", text, waits_s=waits_s)
 
-    def _waits_s(self, now: float, run_s: float) -> float:
-        """How long a request that came now would wait, if runs take `run_s` where none holds several."""
+    def _waits_s(self, now: float) -> float:
+        """How long a request that came now would wait: one run of each waiting robot, or as learned."""
         up = max(1, self._executor.up)
         if self._gathering.used:
             return self._gathering.waits_s(len(self._queue), up - self._runs, now)
-        ahead = len(self._queue) + self._runs - up + 1
-        return max(0, ahead) * run_s / up
+        return max(0, self._queue.robots + self._runs - up) * self._queue.usual_s / up
 
     def _full(self) -> Refusal:
         return Refusal("busy", f"{len(self._queue)} requests are waiting")
@@ -311,7 +313,7 @@ class Scheduler:
                 reply.run_s = self._gathering.own_s(request.kind, outcome.together, outcome.run_s)
                 reply.queue_s += outcome.run_s - reply.run_s
             if self._gathering.used:
-                reply.waits_s = self._waits_s(now, 0.0)
+                reply.waits_s = self._waits_s(now)
             self._sender.send(work.peer, reply)
         self._count(request, outcome.status if work.wanted else "cancelled", work.queue_s, outcome.run_s)
         self._metrics.queue_s_of(request.kind).observe(work.queue_s)
@@ -324,7 +326,7 @@ class Scheduler:
 
     def waits_s(self) -> float:
         """How long a request that came now would wait; 0 if no requests run together here."""
-        return self._waits_s(time.monotonic(), 0.0) if self._gathering.used else 0.0
+        return self._waits_s(time.monotonic()) if self._gathering.used else 0.0
 
     def give_up(self) -> int:
         """Answer the waiting requests with `busy`; returns how many requests were waiting or running.

@@ -64,18 +64,13 @@ class Seen(NamedTuple):
 
 @dataclass(slots=True)
 class Question:
-    """One question to a site, and when it was asked.
-
-    useful_s: after this time the answer is useless: the queue has ended and another site has taken over, or,
-    without another one, its own last action is over. taken: its answer, or its failure, has come.
-    """
+    """One question to a site, and when it was asked. taken: its answer, or its failure, has come."""
 
     site: str
     seen: Seen
     step: int
     at_s: float
     episode: int
-    useful_s: float
     taken: bool = False
 
 
@@ -256,19 +251,15 @@ class ActionStream:
             for site in sites:
                 self.asking.asked(site, now_s, seen=seen.number)
                 self.counts.asked[site] += 1
-            useful_s = left_s if left_s > 0 and len(able) > 1 else self._pace.horizon_s
-            questions = [
-                Question(site, seen, step, at_s=now_s, episode=self._episode, useful_s=useful_s)
-                for site in sites
-            ]
+            questions = [Question(site, seen, step, at_s=now_s, episode=self._episode) for site in sites]
         for question in questions:
-            self._send(question)
+            self._send(question, self.asking.useful_s(question.site, left_s, able))
 
-    def _send(self, question: Question) -> None:
+    def _send(self, question: Question, useful_s: float) -> None:
         take = partial(self._take, question)
         try:
             future = self._caller.call(
-                self._item(question), question.site, self.asking.patience_s, take, useful_s=question.useful_s
+                self._item(question), question.site, self.asking.patience_s, take, useful_s=useful_s
             )
         except BaseException as error:  # `ask` is the user's own
             with self._lock:

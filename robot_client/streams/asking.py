@@ -4,7 +4,7 @@ What becomes of the answers is in `action_queue`; `action_stream` carries out wh
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from offboard.common.errors import ConfigError
@@ -81,6 +81,16 @@ class Asking:
         """The forecast: the delay that the next chunk of this site should stay below."""
         arrival = self._arrivals.get(site)
         return None if arrival is None else arrival.late_s
+
+    def useful_s(self, site: str, left_s: float, able: Iterable[str]) -> float:
+        """How long an answer of this site that is asked for now is of use, if the queue lasts for `left_s`.
+
+        That is until the queue ends, if another site could be asked now and take over in time. Otherwise a
+        late answer is better than none, until its own last action is over.
+        """
+        others = [self.late_s(one) for one in able if one != site]
+        in_time = any(late_s is not None and late_s <= left_s for late_s in others)
+        return left_s if in_time else self._pace.horizon_s
 
     def due(self, now_s: float, left_s: float, lost_s: Mapping[str, float], *, seen: int) -> list[str]:
         """The sites to ask now. The caller asks them, and says so by `asked`.

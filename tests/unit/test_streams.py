@@ -302,3 +302,18 @@ def test_a_pace_that_cannot_be_kept_is_refused(given: dict[str, Any], said: str)
     """The message names the option, its value and what is allowed."""
     with pytest.raises(ConfigError, match=said):
         Pace(**{"hz": 10.0, "horizon": 20, **given})
+
+
+def test_an_answer_is_useless_once_another_site_has_taken_over() -> None:
+    """Without a site that could take over before the queue ends, a late answer is better than none."""
+    asking = Asking(PACE)
+    assert asking.useful_s(CLOUD, 0.5, BOTH) == PACE.horizon_s, "nothing is known of onboard"
+    for _ in range(30):
+        asking.asked(ONBOARD, 0.0, seen=1)
+        asking.arrived(ONBOARD, 0.2)
+    late_s = asking.late_s(ONBOARD)
+    assert late_s is not None
+    assert asking.useful_s(CLOUD, late_s + 0.1, BOTH) == late_s + 0.1
+    assert asking.useful_s(CLOUD, late_s - 0.1, BOTH) == PACE.horizon_s
+    assert asking.useful_s(ONBOARD, late_s + 0.1, BOTH) == PACE.horizon_s, "it is the only one that is known"
+    assert asking.useful_s(CLOUD, late_s + 0.1, {CLOUD: 0.0}) == PACE.horizon_s
