@@ -1,9 +1,10 @@
 """Eight streams on one busy worker, with and without saying when their answers are useless.
 
-    python -m benchmarks.urgency [--seconds 60] [--load 0.9] [--demand azure-code]
+    python -m benchmarks.urgency [--seconds 60] [--load 0.9] [--demand azure-code] [--seed 1]
 
-Other robots ask for runs of the same length when a recorded demand says so, as fast as fills the worker up to
-this load. Both cases are played on real processes in turn. `benchmarks/demand` holds the recordings.
+Other robots ask for runs of the same length when a recorded demand says so, scaled so that the worker is busy
+for this share of the time. Both cases are played on real processes in turn; the recordings are in
+`benchmarks/demand`.
 """
 
 import argparse
@@ -28,7 +29,7 @@ from offboard.robot_client.execution.call_future import CallFuture
 STREAMS, OTHERS = 8, 8
 HZ, HORIZON = 30.0, 50
 RUN_S = 0.06
-CALLS_PER_S, ASKED_PER_S = 1.2, 0.75  # chunks of each stream: the limit, and about what it asks for
+CALLS_PER_S = 1.2  # of each stream, which asks as often as it may
 DEMAND = Path(__file__).parent / "demand"
 FIRST_S = 10.0  # of a stream, which is not counted
 WAIT_S = 20.0
@@ -55,11 +56,13 @@ def policy(observation: float) -> Floats:
     return np.full((HORIZON, 1), observation)
 
 
-def arrivals(name: str, per_s: float, seconds: float) -> list[float]:
-    """When the others ask, in seconds: the recorded gaps, scaled to this rate."""
-    times = np.loadtxt(DEMAND / f"{name}.csv", skiprows=1) / 1000.0
-    scaled = times * (len(times) / times[-1]) / per_s
-    return [float(one) for one in scaled if one < seconds]
+def arrivals(name: str, per_s: float, seconds: float, seed: int) -> list[float]:
+    """When the others ask, in seconds: as many successive gaps of a recording, from a drawn place, scaled."""
+    times = np.loadtxt(DEMAND / f"{name}.csv", skiprows=1)
+    count = int(per_s * seconds)
+    first = int(np.random.default_rng(seed).integers(len(times) - count))
+    part = times[first : first + count + 1] - times[first]
+    return [float(one) for one in part[:-1] * (seconds / part[-1])]
 
 
 class Others:
@@ -114,7 +117,7 @@ def played(endpoint: str, seconds: float) -> list[tuple[int, int, list[float]]]:
         return list(pool.map(robot, range(STREAMS)))
 
 
-def case(flags: argparse.Namespace, *, urgent: bool) -> tuple[float, float, float]:
+def case(flags: argparse.Namespace, seed: int, *, urgent: bool) -> tuple[float, float, float]:
     """The share of empty steps, the mean age of actions in ms, and the answers of the others per second."""
     hidden = mock.patch.object(CallFuture, "useful_s", property(lambda _: None, lambda *_: None), create=True)
     with contextlib.ExitStack() as stack:
@@ -123,9 +126,9 @@ def case(flags: argparse.Namespace, *, urgent: bool) -> tuple[float, float, floa
         server = stack.enter_context(
             cloud_server("benchmarks.urgency", CLOUD_WORKERS="1", CLOUD_EXECUTOR="threads")
         )
-        own = STREAMS * ASKED_PER_S
+        own = STREAMS * CALLS_PER_S
         seconds = flags.seconds + FIRST_S
-        times = arrivals(flags.demand, max(0.0, flags.load / RUN_S - own), seconds)
+        times = arrivals(flags.demand, max(0.0, flags.load / RUN_S - own), seconds, seed)
         others = Others(server.endpoint, times)
         stack.callback(others.close)
         others.start()
@@ -142,11 +145,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0, help="of each stream (default: %(default)s)")
     parser.add_argument("--load", type=float, default=0.9, help="of the worker (default: %(default)s)")
     parser.add_argument("--demand", default="azure-code", help="a recording (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=1, help="of the place in it (default: %(default)s)")
     flags = parser.parse_args()
     found: dict[bool, list[tuple[float, float, float]]] = {True: [], False: []}
-    for _ in range(ROUNDS):
+    for number in range(ROUNDS):
         for urgent in found:
-            found[urgent].append(case(flags, urgent=urgent))
+            found[urgent].append(case(flags, flags.seed + number, urgent=urgent))
     mean = {
         urgent: [statistics.mean(column) for column in zip(*rows, strict=True)]
         for urgent, rows in found.items()

@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from offboard.common.wire.blobs import StoredBlob
 from offboard.common.wire.messages import Request, byte_count
 
+AHEAD_S = (
+    0.5  # of worker time, that a robot in a hurry may have had more: over a minute, below 5 % of its share
+)
 USUAL_RATE = 0.1  # share of each new run time in the usual run time
 ROBOTS_MAX = 1024  # robots whose worker time is remembered; beyond it those without requests are forgotten
 
@@ -41,8 +44,8 @@ class FairQueue:
     runs, its robot is charged the usual run time (start-time fair queueing, Goyal, Vin and Cheng 1996). If
     the queue is full, the longest line loses its newest request.
 
-    Of the robots that are at most a usual run ahead, the one whose answer becomes useless first is served
-    first. So nobody gains by always being in a hurry.
+    Of the robots that are at most AHEAD_S ahead, or a usual run if that is longer, the one whose answer
+    becomes useless first is served first. So nobody gains by always being in a hurry.
     """
 
     def __init__(self, queue_max: int) -> None:
@@ -134,13 +137,14 @@ class FairQueue:
     def _first_of(self, robots: Collection[bytes]) -> tuple[bytes, float]:
         """Whose request is next, and the least worker time of these robots.
 
-        Of the robots that are at most a usual run ahead of the least one, that whose answer is useless first.
+        Of the robots that are little ahead of the least one, that whose answer is useless first.
         """
         least = min(robots, key=lambda robot: (self._had_s[robot], self._lines[robot][0].arrived))
         least_s = self._had_s[least]
         urgent = [one for one in robots if self._lines[one][0].useless_s < math.inf]
         if urgent:
-            near = [one for one in urgent if self._had_s[one] <= least_s + self.usual_s]
+            ahead_s = max(AHEAD_S, self.usual_s)
+            near = [one for one in urgent if self._had_s[one] <= least_s + ahead_s]
             least = min(near, key=lambda robot: self._lines[robot][0].useless_s, default=least)
         return least, least_s
 
