@@ -18,6 +18,8 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
 from benchmarks.keyring import Keys
+from benchmarks.servers import cloud_server
+from offboard import Offloader
 from offboard.cloud_server.http_api import LOOKS_A_STREAM
 from offboard.common.live.live_port import LivePort
 from offboard.loadgen.play.watch import RunLive
@@ -26,6 +28,7 @@ from offboard.loadgen.testbed.testbed import Setup
 from tests.browser.conftest import Opened
 from tests.browser.test_report import CONTRAST, DESKTOP, LEAST_CONTRAST, LEAST_LETTERS, LETTERS_PX, PHONE
 from tests.integration.test_live_robot import free_address
+from tests.joint_tasks import joint_count
 from tests.testbeds import MAP
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(240)]
@@ -280,6 +283,22 @@ def test_the_page_of_a_server(demo: Demo, look: Look) -> None:
     expect(page.locator("#state")).to_have_text("live", timeout=SOON_MS)
     assert {address.partition("/live")[0] for address in opened.requests} == {demo.server}
     assert [one for one in opened.complaints if "401" not in one] == []
+
+
+def test_the_page_says_how_many_requests_run_together(look: Look) -> None:
+    """In the mean, and how long they were held for it; a server where none do says nothing of it."""
+    with (
+        cloud_server("tests.joint_tasks", CLOUD_WORKERS="1") as server,
+        Offloader.connect(server.endpoint, policy="cloud") as offload,
+    ):
+        page = look(f"http://127.0.0.1:{server.http_port}/live", viewport=DESKTOP).page
+        expect(page.locator("#figures")).to_contain_text("Workers replaced: 0", timeout=SOON_MS)
+        expect(page.locator("#figures")).not_to_contain_text("Requests in a run")
+        offload.wait_for_sites(joint_count, START_MS / 1000)
+        calls = [offload.submit(joint_count, 1.0, where="cloud") for _ in range(4)]
+        assert [one.result() for one in calls] == [4, 4, 4, 4]
+        said = re.compile(r"Requests in a run: 4, held for [\d.]+ m?s, in the mean")
+        expect(page.locator("#figures")).to_contain_text(said, timeout=SOON_MS)
 
 
 def test_the_page_comes_back_after_the_server_was_killed(demo: Demo, look: Look) -> None:

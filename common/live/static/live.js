@@ -146,6 +146,15 @@ function showTasks() {
 const placeOf = task => task.decision.both ? "all sites" : task.decision.site;
 const shortly = number => number === 0 ? "0" : Number(number.toPrecision(3)).toLocaleString();
 
+// What there is to say of a server where requests run together, or are refused as too late.
+function together(server) {
+  const runs = total(server, "offboard_server_run_requests_count"), late = total(server, "offboard_server_too_late_requests_total");
+  const mean = shortly(total(server, "offboard_server_run_requests_sum") / runs);
+  const held = ms(total(server, "offboard_server_held_seconds_sum") / runs);
+  return [...(runs ? [`Requests in a run: ${mean}, held for ${held}, in the mean`] : []),
+    ...(late ? [`Refused as too late: ${late}`] : [])];
+}
+
 function showServer() {
   const samples = memory.samplesUntil(until), server = samples[samples.length - 1].server;
   const { robots, seconds } = sinceStart(samples), all = sum(robots.map(one => one.run_s));
@@ -163,7 +172,7 @@ function showServer() {
     `Refused handshakes: ${total(server, "offboard_server_refused_handshakes_total")}`,
     `Dropped messages: ${total(server, "offboard_server_dropped_messages_total")}`,
     `Robots cut off: ${total(server, "offboard_server_cut_off_connections_total")}`,
-    `Workers replaced: ${total(server, "offboard_server_worker_restarts_total")}`];
+    `Workers replaced: ${total(server, "offboard_server_worker_restarts_total")}`, ...together(server)];
   by("figures").replaceChildren(...facts.map(text => Object.assign(document.createElement("p"), { textContent: text })));
   by("figures").hidden = false;
   drawServer(samples);
