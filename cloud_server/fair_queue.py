@@ -122,6 +122,8 @@ class FairQueue:
         self._least_s = self._had_s[robot]
         if len(robots) > 1:
             robot, self._least_s = self._first_of(robots)
+        if fits is not None:  # the others have not had their turn
+            self._least_s = min(map(self._had_s.__getitem__, self._lines))
         line = self._lines[robot]
         work = line.popleft()
         if not line:

@@ -63,6 +63,7 @@ class _Arrivals:
     come: int = 0
     last_s: float = -math.inf  # of the last request or answer
     held_since_s: float | None = None
+    held_until_s: float = -math.inf
 
     def expected_s(self) -> float | None:
         """The gap until the next request, or that of the largest smaller number; None: not known."""
@@ -93,13 +94,14 @@ class Gathering:
         self._runs = 0
         self._last = ""  # the kind that ran last
 
-    def arrived(self, group: Group, now_s: float) -> None:
-        """A request of this group has come."""
-        arrivals = self._arrivals.get(group)
-        if arrivals is None:
-            if len(self._arrivals) >= GROUPS_MAX:
-                del self._arrivals[next(iter(self._arrivals))]
-            arrivals = self._arrivals[group] = _Arrivals()
+    def arrived(self, group: Group, waiting: int, now_s: float) -> None:
+        """A request of this group has come, while so many of its requests wait."""
+        arrivals = self._arrivals.pop(group, None) or _Arrivals()
+        self._arrivals[group] = arrivals  # the last one to be forgotten
+        if len(self._arrivals) > GROUPS_MAX:
+            del self._arrivals[next(iter(self._arrivals))]
+        if not waiting:  # what was held has been cancelled, or has started
+            arrivals.held_since_s = None
         if 0 < arrivals.come < AT_MOST_MAX:
             arrivals.note(now_s - arrivals.last_s)
         arrivals.come += 1
@@ -129,7 +131,7 @@ class Gathering:
             patient_s = max(PATIENCE * gap_s, RISK * (run_s or 0.0) / count)
             until_s = min(until_s, arrivals.last_s + patient_s)
         if until_s > now_s:
-            arrivals.held_since_s = since_s
+            arrivals.held_since_s, arrivals.held_until_s = since_s, until_s
         return until_s
 
     def began(self, group: Group, count: int, now_s: float) -> tuple[int, float]:
@@ -137,7 +139,9 @@ class Gathering:
         arrivals = self._arrivals.get(group)
         held_s = 0.0
         if arrivals is not None and arrivals.held_since_s is not None:
-            held_s, arrivals.held_since_s = now_s - arrivals.held_since_s, None
+            # Afterwards it waited for a worker.
+            held_s = min(now_s, arrivals.held_until_s) - arrivals.held_since_s
+            arrivals.held_since_s = None
         self._held_s += TYPICAL_RATE * (held_s - self._held_s)
         before = self._typical.get(group[0], float(count))
         self._typical[group[0]] = before + TYPICAL_RATE * (count - before)

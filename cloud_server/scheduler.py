@@ -22,6 +22,7 @@ from offboard.common.load import LoadWatch
 from offboard.common.wire.blobs import BlobStore
 from offboard.common.wire.messages import Reply, Request, byte_count
 
+TRIED_EVERY = 10  # requests that should come too late, of which one runs: the server may be faster by now
 RUN_BYTES_MAX = 64 << 20  # of the requests that run together, without their blobs
 
 log = logging.getLogger("offboard.cloud_server")
@@ -72,6 +73,8 @@ class Scheduler:
         self._running: set[Work] = set()
         self._gathering = Gathering()
         self._runs = 0  # a run may hold several requests
+        self._hurried = False  # whether any request has said when its answer is useless
+        self._too_late_of: Counter[str] = Counter()  # by kind
         self.wakes_s = math.inf  # when held requests start at the latest
         self._chosen: list[Work] = []  # counts as running; the thread that chose it starts it
 
@@ -95,7 +98,7 @@ class Scheduler:
         """Put a request into the queue, or answer why not."""
         work = Work(peer, request, {}, time.monotonic(), robot=self._access.robot_of(peer))
         if request.useless_s is not None:
-            work.useless_s = work.arrived + request.useless_s
+            work.useless_s, self._hurried = work.arrived + request.useless_s, True
         kind = tasks.find_kind(request.kind)
         refusal = self._refusal(work, kind)
         if refusal is not None:
@@ -103,7 +106,7 @@ class Scheduler:
             return
         if kind is not None and kind.together is not None:
             work.group = request.kind, request.key
-            self._gathering.arrived(work.group, work.arrived)
+            self._gathering.arrived(work.group, self._queue.groups[work.group], work.arrived)
         evicted = self._queue.add(work)
         if evicted is not None:
             self.refuse(evicted.peer, evicted.request, self._full())
@@ -134,7 +137,7 @@ class Scheduler:
     def _too_late(self, work: Work, now: float, *, waits: bool = True) -> Refusal | None:
         """Why the answer to this request cannot come in time; None if it can, or if nobody knows.
 
-        Its run may be as short as the shortest one of its kind.
+        Its run may be as short as the shortest one of its kind. One of TRIED_EVERY runs all the same.
         """
         kind = work.request.kind
         least_s = self._gathering.least_s(kind)
@@ -142,6 +145,10 @@ class Scheduler:
             return None
         waits_s = self._waits_s(now) if waits else 0.0
         if now + waits_s + least_s <= work.useless_s:
+            return None
+        self._too_late_of[kind] += 1
+        if self._too_late_of[kind] % TRIED_EVERY == 0:
+            work.useless_s = math.inf
             return None
         self._metrics.too_late.labels(kind).inc()
         text = f"its answer would come after {waits_s + least_s:.3g} s, when nobody needs it"
@@ -221,7 +228,10 @@ class Scheduler:
         if group is None or together is None:
             return True
         now = time.monotonic()
-        until_s = self._gathering.until_s(group, together, self._queue.groups[group], now)
+        count = self._queue.groups[group]
+        until_s = self._gathering.until_s(group, together, count, now)
+        if work.useless_s < math.inf:
+            until_s = min(until_s, work.useless_s - (self._gathering.run_s(group[0], count) or 0.0))
         if until_s <= now:
             return True
         self.wakes_s = min(self.wakes_s, until_s)
@@ -259,13 +269,14 @@ class Scheduler:
         self._runs -= 1
         if work.group is not None:
             self._ended(work, outcome)
-        elif work.useless_s < math.inf and outcome.status == "ok":
+        elif self._hurried and outcome.status == "ok":
             self._gathering.learn(work.request.kind, 1, outcome.run_s)
         if not work.more:
             self._answer(work, outcome)
             return
         works, work.more = (work, *work.more), ()
-        if outcome.crashed or outcome.status == "busy":  # one of them may be the culprit
+        if len(outcome.more) + 1 != len(works):  # the worker died, or had no memory: one may be the culprit
+            outcome.together = len(works)
             for one in reversed(works):
                 self._alone(one, outcome)
             return
@@ -282,8 +293,9 @@ class Scheduler:
         self._failures.say(work.request.kind, outcome.note)
 
     def _alone(self, work: Work, outcome: Outcome) -> None:
-        """The worker of a run died: let this request of it wait again, to run alone, if it may run twice."""
-        if not work.wanted or (outcome.crashed and not tasks.kind_named(work.request.kind).duplicate):
+        """A run has no outcomes: let this request of it wait again, to run alone, if it may run twice."""
+        ran = outcome.status != "busy"
+        if not work.wanted or (ran and not tasks.kind_named(work.request.kind).duplicate):
             self._answer(work, outcome)
             return
         self._running.discard(work)

@@ -129,8 +129,7 @@ class Session:
                 self._answers.send_multipart([self._client, b"", answer])
 
     def _answer(self, protocol: Groot, data: bytes, sites: PolicySites) -> bytes:
-        request = protocol.read(data)
-        endpoint = request.get("endpoint", "get_action") if isinstance(request, dict) else None
+        endpoint = protocol.read_call(data).get("endpoint", "get_action")
         if endpoint == "ping":
             return protocol.pack_value(READY)
         if endpoint == "get_action":

@@ -99,9 +99,17 @@ class Groot:
         return packed
 
     def read_request(self, data: bytes) -> Any:
-        request = self.read(data)
+        request = self.read_call(data)
         call = GrootCall(request.get("endpoint", "get_action"), request.get("data"))
         return observation_of(call)
+
+    def read_call(self, data: bytes) -> dict[str, Any]:
+        """The request of a client, with the name of its endpoint. ProtocolError if it is none."""
+        check_items(data, "the request", ProtocolError)
+        request = self._value(unpack_bounded(data, OBSERVATION_BYTES_MAX), 0)
+        if not isinstance(request, dict):
+            raise ProtocolError("the request is no map")
+        return request
 
     def pack_answer(self, value: Any) -> bytes:
         return self.pack_value(list(value) if isinstance(value, tuple) else [value, {}])

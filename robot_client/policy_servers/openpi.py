@@ -77,7 +77,7 @@ class OpenPi:
         return raw.data
 
     def read_request(self, data: bytes) -> Any:
-        return unpack(data)
+        return unpack(data, OBSERVATION_BYTES_MAX)
 
     def pack_answer(self, value: Any) -> bytes:
         return pack(value)
@@ -113,10 +113,10 @@ def pack(observation: Any) -> bytes:
     return packed
 
 
-def unpack(data: bytes) -> Any:
+def unpack(data: bytes, bytes_max: int = ANSWER_BYTES_MAX) -> Any:
     """The value in a message. Its arrays are read-only. ProtocolError for anything malformed."""
     check_items(data, "the value", ProtocolError)
-    return _value(unpack_bounded(data, ANSWER_BYTES_MAX), 0)
+    return _value(unpack_bounded(data, bytes_max), 0)
 
 
 def _tree_of(value: Any) -> Any:

@@ -29,7 +29,7 @@ def closed_loop(
                 now_s += gap_s
                 to_come -= 1
                 waiting += 1
-                gathering.arrived(GROUP, now_s)
+                gathering.arrived(GROUP, waiting - 1, now_s)
             else:
                 now_s = max(now_s, until_s)
                 break
@@ -38,7 +38,7 @@ def closed_loop(
         runs.append((size, held_s))
         waiting -= size
         for _ in range(to_come):  # they come while it runs
-            gathering.arrived(GROUP, now_s + gap_s)
+            gathering.arrived(GROUP, waiting, now_s + gap_s)
             waiting += 1
         now_s = max(now_s, free_s) + run_s(size)
         gathering.ended(number)
@@ -66,16 +66,16 @@ def test_rare_requests_are_not_held() -> None:
     gathering = Gathering()
     gathering.learn("gpu", 1, run_s(1))
     for n in range(20):
-        gathering.arrived(GROUP, 0.5 * n)
+        gathering.arrived(GROUP, 0, 0.5 * n)
     assert gathering.until_s(GROUP, TOGETHER, 1, 10.0) == -math.inf
 
 
 def test_no_wait_is_longer_than_allowed() -> None:
     """Of a group that has just come, nothing is known: it waits as long as `wait_s`, and no longer."""
     gathering = Gathering()
-    gathering.arrived(GROUP, 5.0)
+    gathering.arrived(GROUP, 0, 5.0)
     assert gathering.until_s(GROUP, TOGETHER, 1, 5.0) == pytest.approx(5.01)
-    gathering.arrived(GROUP, 5.009)
+    gathering.arrived(GROUP, 1, 5.009)
     assert gathering.until_s(GROUP, TOGETHER, 2, 5.009) == pytest.approx(5.01)
     assert gathering.until_s(GROUP, TOGETHER, 8, 5.009) == -math.inf, "it is full"
     assert gathering.until_s(GROUP, Together(list, wait_s=0.0), 1, 5.0) == -math.inf
@@ -104,8 +104,20 @@ def test_what_others_cost_is_told_as_a_wait() -> None:
 
 
 def test_the_groups_of_keys_are_limited() -> None:
-    """Robots choose keys, so the oldest group is forgotten."""
+    """Robots choose keys, so the group that was unused for longest is forgotten."""
     gathering = Gathering()
     for n in range(2 * GROUPS_MAX):
-        gathering.arrived(("gpu", str(n)), float(n))
+        gathering.arrived(("gpu", str(n)), 0, float(n))
+        gathering.arrived(GROUP, 0, float(n))
     assert len(gathering._arrivals) == GROUPS_MAX
+    assert GROUP in gathering._arrivals, "it is in use"
+
+
+def test_a_held_request_that_left_is_forgotten() -> None:
+    """The next one, an hour later, is held anew, and counts with its own wait."""
+    gathering = Gathering()
+    gathering.arrived(GROUP, 0, 0.0)
+    assert gathering.until_s(GROUP, TOGETHER, 1, 0.0) == pytest.approx(0.01)
+    gathering.arrived(GROUP, 0, 3600.0)
+    assert gathering.until_s(GROUP, TOGETHER, 1, 3600.0) == pytest.approx(3600.01)
+    assert gathering.began(GROUP, 1, 3700.0)[1] == pytest.approx(0.01), "then it waited for a worker"
