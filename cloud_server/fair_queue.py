@@ -56,6 +56,7 @@ class FairQueue:
         self._least_s = 0.0  # worker time of the robot chosen last; a returning robot starts with it
         self.usual_s = 0.0
         self._count = 0
+        self._hurried = False  # whether any request has said when its answer is useless
         self._held = _HeldBytes()
         self.groups: Counter[tuple[str, str]] = Counter()  # waiting requests that may run together
 
@@ -83,7 +84,12 @@ class FairQueue:
             if evicted.group is not None:
                 self._ungroup(evicted.group)
         self._held.add(work)
-        self._had_s[work.robot] = max(self._had_s.get(work.robot, 0.0), self._least_s)
+        least_s = self._least_s
+        if work.useless_s < math.inf:
+            self._hurried = True
+        elif self._hurried and work.robot in self._had_s:  # those that wait may be ahead of it
+            least_s -= max(AHEAD_S, self.usual_s)
+        self._had_s[work.robot] = max(self._had_s.get(work.robot, 0.0), least_s)
         self._lines.setdefault(work.robot, deque()).append(work)
         self._count += 1
         if work.group is not None:
@@ -162,7 +168,7 @@ class FairQueue:
             del self._running[robot]
         if not self._lines and not self._running:
             self._had_s.clear()
-            self._least_s = 0.0
+            self._least_s, self._hurried = 0.0, False
         elif len(self._had_s) > ROBOTS_MAX:
             asking = self._lines.keys() | self._running.keys()
             self._had_s = {one: self._had_s[one] for one in asking}

@@ -187,10 +187,10 @@ class Gathering:
             return 0.0
         others_s = (self.run_s(kind, typical) or alone_s) - alone_s
         if free > 0 and not waiting:
-            return self._held_s + others_s
+            return round(self._held_s + others_s, 6)
         first_s = self.left_s(now_s)
         if free > 0:
             first_s = self.run_s(kind, min(waiting, together.at_most)) or 0.0
             waiting -= together.at_most
         full_s = self.run_s(kind, together.at_most) or 0.0
-        return first_s + max(0, waiting) // together.at_most * full_s + others_s
+        return round(first_s + max(0, waiting) // together.at_most * full_s + others_s, 6)

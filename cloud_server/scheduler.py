@@ -230,8 +230,10 @@ class Scheduler:
         now = time.monotonic()
         count = self._queue.groups[group]
         until_s = self._gathering.until_s(group, together, count, now)
-        if work.useless_s < math.inf:
-            until_s = min(until_s, work.useless_s - (self._gathering.run_s(group[0], count) or 0.0))
+        if until_s > now:
+            useful_s = min(work.request.budget_s, work.useless_s - work.arrived)
+            run_s = self._gathering.run_s(group[0], count) or 0.5 * useful_s  # until it is known
+            until_s = min(until_s, work.arrived + useful_s - run_s)
         if until_s <= now:
             return True
         self.wakes_s = min(self.wakes_s, until_s)

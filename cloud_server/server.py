@@ -169,7 +169,8 @@ class Server:
     def _turn(self) -> list[Work]:
         """Wait for messages and read them; returns the work to start."""
         wakes_s = self._scheduler.wakes_s
-        self._channel.wait(POLL_S if wakes_s == math.inf else max(0.0, wakes_s - time.monotonic()))
+        held = wakes_s < math.inf
+        self._channel.wait(max(0.0, min(POLL_S, wakes_s - time.monotonic())) if held else POLL_S)
         with self._channel.lock:
             now = self._last_turn = time.monotonic()
             self._tend_executor()

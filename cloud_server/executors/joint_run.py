@@ -1,6 +1,7 @@
 """One call of a function for several requests, as `Together` of a task asks for."""
 
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -23,9 +24,9 @@ def run_joint(call: Call, states: TaskStates) -> Outcome:
 class JointRun:
     """Calls of one kind that begin together. Each gets an outcome of its own.
 
-    A call whose arguments cannot be read, or whose key is another one, does not take part. If the function
-    raises or returns no list of results, each call is run alone, one after the other; those of a kind that
-    must not run twice fail.
+    A call whose arguments cannot be read, or whose key is not that of most, does not take part. If the
+    function raises or returns no list of results, each call is run alone, one after the other; those of a
+    kind that must not run twice fail.
     """
 
     def __init__(self, calls: Sequence[Call], states: TaskStates) -> None:
@@ -49,19 +50,18 @@ class JointRun:
         return [self._done[number] for number in range(len(self._calls))]
 
     def _read(self, together: Together) -> dict[int, tuple[Any, ...]]:
-        """The arguments of the calls that take part: those with the key of the first one."""
-        items: dict[int, tuple[Any, ...]] = {}
-        first: str | None = None
+        """The arguments of the calls that take part: those with the key that most of them have."""
+        read: dict[int, tuple[Any, ...]] = {}
+        keys: dict[int, str] = {}
         for number, call in enumerate(self._calls):
             try:
                 args = tuple(arguments(self._kind, call))
-                key = together.key_of(args)
+                keys[number] = together.key_of(args)
             except Exception:  # noqa: BLE001 - what it is, its own run says
                 continue
-            first = key if first is None else first
-            if key == first:
-                items[number] = args
-        return items
+            read[number] = args
+        usual = Counter(keys.values()).most_common(1)
+        return {number: args for number, args in read.items() if keys[number] == usual[0][0]}
 
     def _run(self, together: Together, items: dict[int, tuple[Any, ...]]) -> None:
         kind = self._kind

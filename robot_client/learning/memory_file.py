@@ -103,6 +103,7 @@ def _observation(given: Any) -> Observation:
 
 
 def _condition(given: Any) -> Condition:
+    given = {"queue_s": 0.0, **given}  # files of 0.2.0 before it was measured lack it
     unknown = given.keys() - set(Condition._fields)
     if unknown:
         raise ValueError(f"unknown condition {sorted(unknown)[0]!r}")

@@ -146,6 +146,29 @@ def test_always_being_in_a_hurry_does_not_pay(took_s: float) -> None:
     assert found[b"b"] <= found[b"a"] <= max(1.05 * found[b"b"], found[b"b"] + 2)
 
 
+@pytest.mark.parametrize("took_s", [0.005, 0.06, 0.3])
+def test_hurried_robots_with_a_backlog_do_not_push_others_back(took_s: float) -> None:
+    """Two that always have three requests waiting, and one with a single request that returns a run later."""
+    queue, found = FairQueue(100), Counter[bytes]()
+    for robot in (b"a", b"b"):
+        for _ in range(3):
+            queue.add(hurried(robot, 0.0, hurry=True))
+    queue.add(hurried(b"n", 0.0, hurry=False))
+    now_s, away = 0.0, False
+    for _ in range(round(60 / took_s)):
+        work = queue.next()
+        assert work is not None
+        now_s += took_s
+        if away:
+            queue.add(hurried(b"n", now_s, hurry=False))
+        away = work.robot == b"n"
+        if not away:
+            queue.add(hurried(work.robot, now_s, hurry=True))
+        queue.done(work, took_s)
+        found[work.robot] += 1
+    assert found[b"n"] >= 0.9 * min(found[b"a"], found[b"b"])
+
+
 def test_the_earliest_useless_answer_goes_first() -> None:
     """Among robots that have had about as much."""
     queue = FairQueue(8)

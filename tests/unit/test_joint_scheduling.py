@@ -92,6 +92,17 @@ def test_what_must_not_run_twice_fails_with_its_run(scheduler: Scheduler, replie
     assert (scheduler.running, scheduler.waiting) == (0, 0)
 
 
+def test_no_request_is_held_past_its_own_time(scheduler: Scheduler) -> None:
+    """A task may allow a longer wait than the robot that asks."""
+    impatient = request(joint_once, 1)
+    impatient.budget_s = 0.2
+    scheduler.request(b"robot", impatient)
+    assert scheduler.take_chosen() == []
+    assert scheduler.wakes_s - time.monotonic() < 0.15
+    time.sleep(0.12)
+    assert len(scheduler.take_chosen()) == 1
+
+
 def test_a_slow_first_run_does_not_lock_deadlines_out(scheduler: Scheduler, replies: Replies) -> None:
     """One of TRIED_EVERY requests runs all the same, and then the server knows better."""
 
