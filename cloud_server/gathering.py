@@ -123,12 +123,11 @@ class Gathering:
             return -math.inf
         since_s = now_s if arrivals.held_since_s is None else arrivals.held_since_s
         until_s = since_s + together.wait_s
-        gap_s = arrivals.expected_s()
-        if gap_s is not None:
-            run_s = self.run_s(group[0], count)
-            if run_s is not None and count * gap_s >= run_s:
+        gap_s, run_s = arrivals.expected_s(), self.run_s(group[0], count)
+        if gap_s is not None and run_s is not None:
+            if count * gap_s >= run_s:
                 return -math.inf
-            patient_s = max(PATIENCE * gap_s, RISK * (run_s or 0.0) / count)
+            patient_s = max(PATIENCE * gap_s, RISK * run_s / count)
             until_s = min(until_s, arrivals.last_s + patient_s)
         if until_s > now_s:
             arrivals.held_since_s, arrivals.held_until_s = since_s, until_s
