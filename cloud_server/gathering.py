@@ -40,7 +40,7 @@ class RunTimes:
         self._ns = KEPT * self._ns + count * run_s
 
     def seconds(self, count: float) -> float | None:
-        """The expected time of a run of so many; None if nothing is known.
+        """The expected time of a run that holds `count` requests; None if nothing is known.
 
         It never falls with the number. As long as all runs were of one size, it does not depend on it.
         """
@@ -78,10 +78,10 @@ class _Arrivals:
 class Gathering:
     """What is learned of the kinds with `together`. `used`: whether any run had one.
 
-    A request is held, if the next one is expected so soon that all that wait lose less than the next one
-    gains, which is a whole run: count x gap < time of a run. After PATIENCE gaps, and once the wait has cost
-    RISK of that, no more is expected. The gap is learned from the requests that came
-    since the last answer, by how many there were: robots that wait for answers ask again right after them.
+    A request is held if the next one should come soon: all that wait then lose less than the next one gains,
+    which is a whole run (count x gap < time of a run). After PATIENCE gaps, and once the wait has cost RISK
+    of that, no more is expected. The gap is learned by the number of requests since the last answer, because
+    robots that wait for answers ask again right after them.
     """
 
     def __init__(self) -> None:
@@ -95,7 +95,7 @@ class Gathering:
         self._last = ""  # the kind that ran last
 
     def arrived(self, group: Group, waiting: int, now_s: float) -> None:
-        """A request of this group has come, while so many of its requests wait."""
+        """A request of this group has come. `waiting`: those of the group that were there before it."""
         arrivals = self._arrivals.pop(group, None) or _Arrivals()
         self._arrivals[group] = arrivals  # the last one to be forgotten
         if len(self._arrivals) > GROUPS_MAX:
@@ -108,7 +108,7 @@ class Gathering:
         arrivals.last_s = now_s
 
     def answered(self, group: Group, waiting: int, now_s: float) -> None:
-        """A run of this group has ended while so many of its requests wait."""
+        """A run of this group has ended. `waiting`: the requests of the group that wait now."""
         arrivals = self._arrivals.get(group)
         if arrivals is None:
             return
@@ -157,7 +157,7 @@ class Gathering:
         return max(0.0, min(self._ends_s.values(), default=now_s) - now_s)
 
     def learn(self, kind: str, count: int, run_s: float) -> None:
-        """A run of so many requests of this kind took so long."""
+        """A run of this kind with `count` requests took `run_s` seconds."""
         self._times.setdefault(kind, RunTimes()).learn(count, run_s)
 
     def run_s(self, kind: str, count: float) -> float | None:
@@ -170,14 +170,15 @@ class Gathering:
         return None if times is None else times.least_s
 
     def own_s(self, kind: str, count: int, run_s: float) -> float:
-        """The part of a run of so many that one of its requests would have taken alone."""
+        """The part of a run of `count` requests that one of them would have taken alone."""
         alone_s, usual_s = self.run_s(kind, 1), self.run_s(kind, count)
         return run_s * alone_s / usual_s if alone_s and usual_s else run_s
 
     def waits_s(self, waiting: int, free: int, now_s: float) -> float:
-        """How long a request that came now would wait while so many wait and so many workers are free.
+        """How long a request that came now would wait. `waiting`: requests, of any kind; `free`: workers.
 
-        That is until its run begins, and then for those that run with it; of the kind that ran last.
+        It waits until its run begins, and then for those that run with it. It counts as one of the kind that
+        ran last.
         """
         kind = self._last
         together = tasks.kind_named(kind).together if kind else None

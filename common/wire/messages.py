@@ -27,6 +27,7 @@ FRAMES_MAX = 2 + ARRAYS_MAX  # header, value, arrays
 ERROR_LENGTH_MAX = 2000
 ID_MAX = 2**63 - 1
 COUNT_MAX = 2**31 - 1
+MICROSECONDS = 6  # digits of a wait: a robot keeps it in a file, which takes no smaller number
 STATUSES = ("ok", "failed", "unknown_task", "busy", "expired", "need_blob")
 
 
@@ -225,7 +226,7 @@ def _reply(fields: Fields, rest: list[Buffer]) -> Reply:
         load=fields.share("load"),
         capacity=fields.share("capacity"),
         traceback=fields.text("traceback", TRACEBACK_LENGTH_MAX) if "traceback" in fields.values else "",
-        waits_s=fields.seconds("waits_s") if "waits_s" in fields.values else 0.0,
+        waits_s=round(fields.seconds("waits_s"), MICROSECONDS) if "waits_s" in fields.values else 0.0,
     )
 
 
@@ -261,7 +262,7 @@ _READERS: dict[str, Callable[[Fields, list[Buffer]], Message]] = {
         id=fields.whole("id", 0, ID_MAX),
         load=fields.share("load"),
         capacity=fields.share("capacity"),
-        waits_s=fields.seconds("waits_s") if "waits_s" in fields.values else 0.0,
+        waits_s=round(fields.seconds("waits_s"), MICROSECONDS) if "waits_s" in fields.values else 0.0,
     ),
     "cancel": lambda fields, _: Cancel(fields.whole("id", 0, ID_MAX)),
     "blob": lambda fields, rest: Blob(

@@ -304,7 +304,7 @@ class CloudRunner:
             return
         if not isinstance(message, wire.Pong | wire.Reply):
             return
-        report = ServerReport(message.queue_depth, message.load, message.capacity, round(message.waits_s, 6))
+        report = ServerReport(message.queue_depth, message.load, message.capacity, message.waits_s)
         if isinstance(message, wire.Pong):
             self._conversation.pong(message.id, received_s, report)
             return
