@@ -14,6 +14,7 @@ from offboard.loadgen.testbed.testbed import Setup
 from offboard.robot_client.offloader import Offloader
 
 ROOT = Path(__file__).parents[1]
+pytest.register_assert_rewrite("tests.testbeds")  # its failures show values, as those of test modules
 # The compiled planner is kept beside the checkout, as `make` does it.
 os.environ.setdefault("NUMBA_CACHE_DIR", str(ROOT / ".cache" / "numba"))
 # A shell's background job ignores Ctrl-C, and so would every process that a test starts and interrupts.

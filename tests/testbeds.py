@@ -3,6 +3,7 @@
 They share one `Bench`, whose testbed was made with `setups`, and each leaves cloud and relay running.
 """
 
+import contextlib
 import itertools
 import json
 import os
@@ -16,6 +17,7 @@ from typing import Any
 import pytest
 
 from offboard.common.command_line import INTERRUPTED_EXIT
+from offboard.common.errors import OffloadError
 from offboard.loadgen.robot_files import read_trace
 from offboard.loadgen.testbed.testbed import Setup, Testbed
 
@@ -59,6 +61,20 @@ def setups(out: Path) -> dict[str, Setup]:
         "robot-2": robot("robot-2", tasks=ENDLESS, policy="cloud"),
         "robot-3": robot("robot-3", tasks=ENDLESS, policy="onboard"),
     }
+
+
+def keep(bench: Bench, sentence: Callable[[Bench], None]) -> None:
+    """Check a sentence; if it fails, leave cloud and relay running, so that the others can be checked."""
+    try:
+        sentence(bench)
+    except BaseException:
+        for part in ("wan", "cloud"):
+            with contextlib.suppress(OffloadError):
+                bench.bed.join(part)  # if it was cut off
+            if bench.bed.exit_code(part) is None:
+                bench.bed.kill(part)  # it may be paused
+            bench.bed.start(part)
+        raise
 
 
 def the_parts_work_together(bench: Bench) -> None:
@@ -106,7 +122,7 @@ def a_stopped_part_says_its_exit_code(bench: Bench) -> None:
     """A stopped cloud finishes its tasks and exits with 0; a stopped robot exits as if interrupted."""
     robot_asks_the_cloud(bench)
     bench.bed.stop("cloud")
-    assert bench.bed.exit_code("cloud") == 0
+    assert bench.bed.exit_code("cloud") == 0, tail(bench, "cloud")
     bench.bed.stop("robot-2")
     assert bench.bed.exit_code("robot-2") == INTERRUPTED_EXIT
     bench.bed.start("cloud")
@@ -273,6 +289,11 @@ def newest(bench: Bench, robot: str = "robot-2") -> Any:
         file.seek(max(0, trace.stat().st_size - TAIL_BYTES))
         lines = file.read().split(b"\n")[:-1]
     return json.loads(lines[-1]) if lines else None
+
+
+def tail(bench: Bench, part: str) -> str:
+    """The end of what a part has logged."""
+    return (bench.bed.out / "logs" / f"{part}.log").read_text()[-TAIL_BYTES:]
 
 
 def cloud_s(record: dict[str, Any]) -> float:

@@ -10,7 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-REPEATED_MAX = 3
+REPEATED_MAX = 10
 FAILED = Path(".pytest_cache/v/cache/lastfailed")
 TESTS_FAILED = 1  # pytest's exit code; all others are errors of another kind
 

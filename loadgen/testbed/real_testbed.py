@@ -20,7 +20,7 @@ from offboard.loadgen.relay.relay_client import RelayClient
 from offboard.loadgen.testbed.testbed import CLOUD, ROBOT, WAN, Setup, kind_of, relay_of, servers_among
 
 POLL_S = 0.05
-TERMINATE_S = 5.0
+TERMINATE_S = 15.0  # a cloud with a tenth of a CPU takes 5 s to end
 KILL_S = 5.0
 TAIL_LINES = 15
 TAIL_BYTES = 1 << 16

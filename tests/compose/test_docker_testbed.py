@@ -17,7 +17,7 @@ from offboard.loadgen.testbed.docker_engine import OWNER
 from offboard.loadgen.testbed.docker_testbed import DockerTestbed
 from offboard.loadgen.testbed.testbed import Setup
 from tests.compose.conftest import ROOT, docker, made_by_docker
-from tests.testbeds import CONTRACT, Bench, setups, start
+from tests.testbeds import CONTRACT, Bench, keep, setups, start
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600), pytest.mark.usefixtures("engine")]
 
@@ -92,7 +92,7 @@ def name(bed: DockerTestbed, part: str) -> str:
 @pytest.mark.parametrize("sentence", CONTRACT, ids=lambda sentence: sentence.__name__)
 def test_the_docker_testbed_keeps_the_contract(bench: Bench, sentence: Callable[[Bench], None]) -> None:
     """Each sentence of the contract holds with containers."""
-    sentence(bench)
+    keep(bench, sentence)
 
 
 def test_an_unknown_flag_is_reported_in_the_words_of_the_part(

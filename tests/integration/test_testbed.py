@@ -12,7 +12,7 @@ from offboard.common.errors import ConfigError
 from offboard.loadgen.testbed.docker_testbed import DockerTestbed
 from offboard.loadgen.testbed.local_testbed import HOG, LocalTestbed
 from offboard.loadgen.testbed.testbed import Setup
-from tests.testbeds import CONTRACT, Bench, setups
+from tests.testbeds import CONTRACT, Bench, keep, setups
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
 
@@ -47,7 +47,7 @@ def hogs() -> list[int]:
 @pytest.mark.parametrize("sentence", CONTRACT, ids=lambda sentence: sentence.__name__)
 def test_the_local_testbed_keeps_the_contract(bench: Bench, sentence: Callable[[Bench], None]) -> None:
     """Each sentence of the contract holds with local processes."""
-    sentence(bench)
+    keep(bench, sentence)
 
 
 def test_an_unknown_flag_is_reported_in_the_words_of_the_part(tmp_path: Path) -> None:
