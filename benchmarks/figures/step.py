@@ -23,7 +23,7 @@ PART = "{part}"  # in a command: the name of the part
 OUT = "{out}"  # in a command: the folder that belongs to the step or part
 WORK = Path("out/figures/work")
 SCENARIOS = (Path("loadgen/scenarios"), Path("loadgen/links"))
-DATASETS = ("paper", "congested", "apriltags")  # in the order of their page
+DATASETS = ("paper", "congested", "apriltags", "drive", "drive-busy")  # in the order of their page
 SOAK = "soak"  # half an hour: `make chaos` plays it
 
 

@@ -29,7 +29,7 @@ class ClaimsConfig(RowsConfig):
     """With which windows and predictors the claims are checked."""
 
     windows: tuple[str, ...] = setting(
-        ("10", "50", "100", FULL_WINDOW),
+        ("5", "10", "20", "50", "100", "500", FULL_WINDOW),
         "window lengths N; full: fit on the first 80 % of the rows, scored on the rest",
         metavar="N,N,..",
     )
@@ -38,6 +38,8 @@ class ClaimsConfig(RowsConfig):
         f"predictors to compare with {LEAST_SQUARES}: {rivals.PREDICTOR_HELP}; or {ALL}",
         metavar="NAME,NAME,..",
     )
+
+    verdicts: bool = setting(False, "print one verdict for each claim of the paper, over all files")
 
     def __post_init__(self) -> None:
         check(self)
@@ -97,6 +99,7 @@ class Claimed:
 
 
 POSITIVE = Claimed(low=0.0)
+NEGATIVE = Claimed(high=0.0)
 BELOW_ONE = Claimed(high=1.0)
 ABOVE_ONE = Claimed(low=1.0)
 

@@ -1,4 +1,4 @@
-"""Claim 6: least squares needs less time than the other predictors to be trained and to predict."""
+"""Claim 13: least squares needs less time than the other predictors to be trained and to predict."""
 
 import statistics
 import time
@@ -12,7 +12,7 @@ from offboard.robot_client.predictors import LEAST_SQUARES, Model
 from offboard.robot_client.predictors.base import Call, Run
 from offboard.robot_client.predictors.plain import model_of
 
-CLAIM = 6
+CLAIM = 13
 # The median of six rounds lies between the least and the greatest with a probability of 1 - 2 / 2^6 = 97 %.
 ROUNDS = 6
 TRAINING, PREDICTION = "training", "prediction"

@@ -15,8 +15,10 @@ from offboard.loadgen.replay.recorded_tasks import PARTS, RecordedTask, read_tas
 from offboard.loadgen.table.measured_rows import (
     ALLOWED,
     HEADER,
+    MORE_SIZES,
     VALUE_MAX,
     is_csv,
+    more_sizes,
     read_cells,
     short,
     write_whole,
@@ -76,14 +78,16 @@ def write_dataset(path: Path, tasks: Sequence[RecordedTask]) -> None:
 def read_dataset(path: Path) -> list[RecordedTask]:
     """The tasks of a dataset. A cell may be empty, and a column absent, except those of HEADER."""
     return [
-        _task({name: _read(where, name, text) for name, text in cells.items()})
+        _task({name: _read(where, name, text) for name, text in cells.items()}, more_sizes(where, cells))
         for where, cells in read_cells(path, [name for name in COLUMNS if name not in HEADER])
     ]
 
 
 def _values(task: RecordedTask) -> dict[str, Any]:
     """The value of each column; None: unknown."""
-    values: dict[str, Any] = {"size": task.size, "work": task.work, "timeout_s": task.timeout_s}
+    size, *more = task.size if isinstance(task.size, tuple) else (task.size,)
+    values: dict[str, Any] = {"size": size, "work": task.work, "timeout_s": task.timeout_s}
+    values |= dict.fromkeys(MORE_SIZES) | dict(zip(MORE_SIZES, more, strict=False))
     for site in SITES:
         run, condition = task.runs[site], task.conditions.get(site, UNMEASURED)
         values[f"{site}_s"] = run.seconds
@@ -114,7 +118,7 @@ def _packed_text(packed: Packed) -> str:
 
 def _read(where: str, name: str, text: str) -> Any:
     """The value of one cell; None: it is empty."""
-    if not text.strip() and name not in HEADER:
+    if not text.strip() and name not in (*HEADER, *MORE_SIZES):
         return None
     cell = COLUMNS[name]
     try:
@@ -123,11 +127,11 @@ def _read(where: str, name: str, text: str) -> Any:
         raise DataError(f"{where}: {name}: {short(text)} is not {cell.allowed}") from None
 
 
-def _task(values: Mapping[str, Any]) -> RecordedTask:
+def _task(values: Mapping[str, Any], more: Sequence[str]) -> RecordedTask:
     send_bytes = values.get("cloud_send_bytes")
     sending = Sending(send_bytes, values.get("cloud_send_large") or ()) if send_bytes else NOTHING
     return RecordedTask(
-        size=values["size"],
+        size=(values["size"], *(values[name] for name in more)) if more else values["size"],
         runs={site: _execution(site, values) for site in SITES},
         conditions={site: _condition(site, values) for site in SITES},
         sendings={CLOUD: sending},
@@ -206,7 +210,7 @@ _FEATURES = {
     "capacity": Cell(_above_zero, f"a number above 0, at most {VALUE_MAX:g}"),
 }
 COLUMNS: Mapping[str, Cell] = {
-    **dict.fromkeys(HEADER, _NUMBER),
+    **dict.fromkeys((*HEADER, *MORE_SIZES), _NUMBER),
     "work": _NUMBER,
     **{f"{site}_{part}": _NUMBER for site in SITES for part in PARTS},
     "cloud_bytes_out": _BYTES,

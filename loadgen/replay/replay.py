@@ -13,6 +13,7 @@ import numpy as np
 
 from offboard.common.config import REQUIRED
 from offboard.common.errors import DataError
+from offboard.common.tasks import first_number
 from offboard.loadgen import rivals
 from offboard.loadgen.policy_name import split_objective
 from offboard.loadgen.progress import progress
@@ -22,7 +23,7 @@ from offboard.loadgen.replay.replay_settings import ReplayConfig
 from offboard.loadgen.replay.virtual_robot import VirtualRobot, compare, same_percent
 from offboard.loadgen.table import confidence_intervals, table_two_figures
 from offboard.loadgen.table.confidence_intervals import Picks
-from offboard.loadgen.table.measured_rows import Column, Rows, read_lived
+from offboard.loadgen.table.measured_rows import FIRST_NUMBER, Column, Rows, read_lived
 from offboard.loadgen.table.measurement_notes import read_noted
 from offboard.loadgen.table.table_formats import Table, column, headings_of
 from offboard.loadgen.table.table_settings import FULL
@@ -32,6 +33,7 @@ from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.policies import Policy
 from offboard.robot_client.policies.objectives import MEAN, Mean
 from offboard.robot_client.settings import Settings
+from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 ORACLE = "oracle"
 RECORDED = "as recorded"
@@ -159,6 +161,13 @@ def _made(policy: str, config: ReplayConfig) -> tuple[Policy, Memories]:
     return policies.make(name, config.seed), settings.make_memories(name)
 
 
+def _takes_several_numbers(policy: str, config: ReplayConfig) -> bool:
+    """Whether what this policy predicts depends on all numbers of a size."""
+    name, _ = split_objective(policy, "policy")
+    predicts = name not in (ONBOARD, CLOUD)
+    return predicts and rivals.takes_several_numbers(config.predictor or policies.predictor_of(name))
+
+
 def _tell_work(tasks: Sequence[RecordedTask]) -> bool:
     return any(one.work is not None for one in tasks)
 
@@ -199,9 +208,14 @@ def _mode_lines(
     step: Callable[[], object],
 ) -> Iterator[PolicyScore]:
     """The lines of one feedback mode; `step` is called after each policy."""
+    first = rows.by_first_number()
+    by_first = [replace(one, size=first_number(one.size)) for one in tasks]
     for name in (*config.policies, ORACLE):
         for line in _lines(tasks, rows, name, config, feedback=feedback):
             yield replace(line, same_percent=None if line.bound else same.get(name))
+        if first is not None and name != ORACLE and _takes_several_numbers(name, config):
+            for line in _lines(by_first, first, name, config, feedback=feedback):
+                yield replace(line, policy=FIRST_NUMBER.format(name))
         step()
 
 

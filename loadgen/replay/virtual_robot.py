@@ -5,12 +5,13 @@ decisions can then be compared with those of the run.
 """
 
 import contextlib
+import functools
 import itertools
 import math
 import operator
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from offboard.common.errors import OffloadError
 from offboard.common.tasks import Size, task
@@ -45,7 +46,7 @@ class VirtualRobot:
     def __init__(
         self, policy: Policy, memories: Memories, *, tells_work: bool, sites: Sequence[str] = (ONBOARD, CLOUD)
     ) -> None:
-        self._function = _replayed_with_work if tells_work else _replayed
+        self._tells_work = tells_work
         self._clock = VirtualClock()
         self._zero_s: float | None = None  # when the first task began, on the clock of the run
         self._allowance = Allowance()
@@ -88,7 +89,7 @@ class VirtualRobot:
         def run(number: int, decision: Decision) -> Walk:
             one = tasks[number]
             self._begin(number, one, instead=decision, ask=decision.policy not in NOT_BY_A_RULE)
-            yield from self._offload.steps(self._function, one.size, number, timeout_s=one.timeout_s)
+            yield from self._offload.steps(self._function(one), one.size, number, timeout_s=one.timeout_s)
             del under_way[number]
 
         for number in sorted(range(len(tasks)), key=lambda number: tasks[number].i):
@@ -112,7 +113,12 @@ class VirtualRobot:
     def _run(self, number: int, recorded: RecordedTask, *, instead: Decision | None, ask: bool) -> None:
         self._begin(number, recorded, instead=instead, ask=ask)
         with contextlib.suppress(OffloadError):  # as in the run, no site may have answered
-            self._offload(self._function, recorded.size, number, timeout_s=recorded.timeout_s)
+            function = self._function(recorded)
+            self._offload(function, recorded.size, number, timeout_s=recorded.timeout_s)
+
+    def _function(self, recorded: RecordedTask) -> Callable[..., Any]:
+        numbers = len(recorded.size) if isinstance(recorded.size, tuple) else 1
+        return _looked_up(numbers, tells_work=self._tells_work)
 
     def _begin(self, number: int, recorded: RecordedTask, *, instead: Decision | None, ask: bool) -> None:
         self._chooser.begin(instead=instead, ask=ask)
@@ -207,16 +213,18 @@ def same(run: Decision | None, replayed: Decision) -> bool:
     return one == other
 
 
-@task("replayed", size=lambda size, number: size)  # noqa: ARG005 - the size is known
-def _replayed(size: Size, number: int) -> None:  # noqa: ARG001
-    raise AssertionError("a replayed task is looked up, not run")
+@functools.cache
+def _looked_up(numbers: int, *, tells_work: bool) -> Callable[..., Any]:
+    """The task of all recorded tasks whose sizes have this many numbers; its function is never run."""
+    name = f"replayed_{numbers}{'_with_work' if tells_work else ''}"
+
+    @task(name, size=lambda size, number: size, work=_work if tells_work else None)  # noqa: ARG005
+    def looked_up(size: Size, number: int) -> float:  # noqa: ARG001
+        raise AssertionError("a replayed task is looked up, not run")
+
+    return looked_up
 
 
 def _work(told: float | None) -> float:
     """NaN: the result of this task did not tell its work."""
     return math.nan if told is None else told
-
-
-@task("replayed_with_work", size=lambda size, number: size, work=_work)  # noqa: ARG005
-def _replayed_with_work(size: Size, number: int) -> float:  # noqa: ARG001
-    raise AssertionError("a replayed task is looked up, not run")

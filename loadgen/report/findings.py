@@ -109,8 +109,9 @@ def _times(findings: Findings) -> Chart:
     if shown is None:
         return Chart(name, title, "Not drawn: no task ran on both sites.")
     thinned = f" {POINTS_MAX:,} of {count:,} points are drawn." if count > POINTS_MAX else ""
+    first = "" if findings.rows.more is None else " The size is the first number of each."
     caption = (
-        f"The same {count:,} tasks on both sites. The lines are least-squares fits over all of them. "
+        f"The same {count:,} tasks on both sites.{first} The lines are least-squares fits over all of them. "
         f"{_crossing(shown)}{thinned}"
     )
     return Chart(name, title, caption, shown)

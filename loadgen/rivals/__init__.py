@@ -3,8 +3,10 @@
 A robot knows them only by the path of their class, as it knows the classes of a user.
 """
 
+from offboard.common.errors import MissingExtra
 from offboard.robot_client import predictors
 from offboard.robot_client.predictors import Model, Predictor
+from offboard.robot_client.predictors.window import WINDOW
 
 _HOME = "offboard.loadgen.rivals"
 _PREDICTORS = {
@@ -31,6 +33,14 @@ def predictor(name: str, where: str = "predictor") -> str:
 def make(name: str, window: int, seed: int = 0) -> Predictor | Model:
     """A new predictor; MissingExtra if its library is not installed."""
     return predictors.make(predictor(name), window, seed)
+
+
+def takes_several_numbers(name: str) -> bool:
+    """Whether this predictor uses all numbers of a size, and not only the first one."""
+    try:
+        return bool(getattr(make(name, WINDOW), "several_numbers", False))
+    except MissingExtra:
+        return False
 
 
 def slow(name: str) -> bool:

@@ -7,7 +7,7 @@
 import csv
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +16,21 @@ import numpy.typing as npt
 
 from offboard.common.errors import ConfigError, DataError
 from offboard.common.security.plain_files import replace_file
+from offboard.common.tasks import SIZE_NUMBERS_MAX, Size
 from offboard.loadgen.robot_files import read_trace
 from offboard.robot_client.policies import PINNED
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 HEADER = ("size", "onboard_s", "cloud_s")
+MORE_SIZES = tuple(f"size_{number}" for number in range(2, SIZE_NUMBERS_MAX + 1))  # of several numbers
 ROWS_MAX = 1_000_000
 VALUE_MAX = 1e15  # for seconds and sizes; keeps every sum and square finite
 ALLOWED = f"a finite number from 0 to {VALUE_MAX:g}"
 
+FIRST_NUMBER = "{}, first number"  # the name of what predicts from the first number of each size only
+SEVERAL_NUMBERS = "Each size has {} numbers; r and what says so use the first one, all other lines use all."
 SHOWN_MAX = 60  # characters of a wrong value that an error message shows
 
-Row = tuple[float, float, float]  # size, onboard_s, cloud_s
 Column = npt.NDArray[np.float64]
 
 
@@ -35,8 +38,8 @@ Column = npt.NDArray[np.float64]
 class Rows:
     """Three columns of equal length, in the order in which the tasks ran.
 
-    `left_out` counts the tasks without both times. Each line of `notes` says something about how the rows
-    were measured.
+    `size`: of several numbers, the first one; `more` (rows x numbers): the others. `left_out` counts the
+    tasks without both times. Each line of `notes` says something about how the rows were measured.
     """
 
     size: Column
@@ -44,6 +47,7 @@ class Rows:
     cloud_s: Column
     left_out: int = 0
     notes: tuple[str, ...] = ()
+    more: Column | None = None
 
     def __len__(self) -> int:
         return len(self.size)
@@ -58,7 +62,19 @@ class Rows:
         return {"source": str(path), "rows": len(self), "left_out": self.left_out}
 
     def since(self, start: int) -> "Rows":
-        return Rows(self.size[start:], self.onboard_s[start:], self.cloud_s[start:])
+        more = None if self.more is None else self.more[start:]
+        return Rows(self.size[start:], self.onboard_s[start:], self.cloud_s[start:], more=more)
+
+    def sizes(self) -> Sequence[Size]:
+        """The size of each row; a tuple if it has several numbers."""
+        if self.more is None:
+            found: list[float] = self.size.tolist()
+            return found
+        return [tuple(one) for one in np.column_stack((self.size, self.more)).tolist()]
+
+    def by_first_number(self) -> "Rows | None":
+        """The same rows with only the first number of each size; None if there is only one."""
+        return None if self.more is None else replace(self, more=None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +86,7 @@ class Lived:
 
 
 class NoOneTable(DataError):
-    """The tasks of a trace do not fit one table: there are several kinds, or a size has several numbers."""
+    """The tasks of a trace do not fit one table, because there are several kinds."""
 
 
 def read(path: Path, kind: str | None = None, *, least: int = 1) -> Rows:
@@ -149,11 +165,20 @@ def short(value: Any) -> str:
 
 
 def _read_csv(path: Path) -> Rows:
-    found: list[Row] = []
-    for where, cells in read_cells(path):
-        size, onboard_s, cloud_s = (number(where, name, cells[name]) for name in HEADER)
-        found.append((size, onboard_s, cloud_s))
+    found = []
+    for where, cells in read_cells(path, MORE_SIZES):
+        names = (*HEADER, *more_sizes(where, cells))
+        found.append([number(where, name, cells[name]) for name in names])
     return _rows(found)
+
+
+def more_sizes(where: str, cells: Collection[str]) -> tuple[str, ...]:
+    """The columns of further numbers of a size among these; DataError if one before them is missing."""
+    names = tuple(filter(cells.__contains__, MORE_SIZES))
+    if names != MORE_SIZES[: len(names)]:
+        missing = next(name for name in MORE_SIZES if name not in names)
+        raise DataError(f"{where}: there is a column {names[-1]!r}, but no column {missing!r}")
+    return names
 
 
 def _rows_of_cells(
@@ -189,7 +214,7 @@ def _places(path: Path, header: Sequence[str], further: Collection[str]) -> Mapp
 
 
 def _read_trace(path: Path, kind: str | None, least: int) -> Rows:
-    found: list[Row] = []
+    found: list[list[float]] = []
     first_lines: dict[str, int] = {}  # of each kind
     left_out = 0
     for line, fields in enumerate(read_trace(path), 1):
@@ -202,6 +227,9 @@ def _read_trace(path: Path, kind: str | None, least: int) -> Rows:
         first_lines.setdefault(str(fields["kind"]), line)
         _check_room(path, len(found))
         found.append(row)
+        if len(row) != len(found[0]) and len(first_lines) == 1:
+            counts = f"{len(row) - 2} numbers, but that of the first row has {len(found[0]) - 2}"
+            raise DataError(f"{path}:{line}: size: {short(fields['size'])} has {counts}")
     if len(found) < least:
         raise DataError(
             f"{path}: no {kind or 'task'} was answered by both sites; measure some with "
@@ -217,8 +245,8 @@ def _check_one_kind(path: Path, first_lines: dict[str, int]) -> None:
         raise NoOneTable(f"{path}: the trace holds tasks of several kinds: {kinds}; choose one with --kind")
 
 
-def _trace_row(where: str, fields: dict[str, Any]) -> Row | None:
-    """The size and both times; None if a site did not finish the task."""
+def _trace_row(where: str, fields: dict[str, Any]) -> list[float] | None:
+    """As in the header of a dataset, then the further numbers; None if a site did not finish the task."""
     seconds: dict[str, float] = {}
     try:
         for one in fields["executions"]:
@@ -230,10 +258,9 @@ def _trace_row(where: str, fields: dict[str, Any]) -> Row | None:
         ) from None
     if ONBOARD not in seconds or CLOUD not in seconds:
         return None
-    size = fields["size"]
-    if isinstance(size, list):
-        raise NoOneTable(f"{where}: size: {short(size)} has several numbers; one is needed here")
-    return number(where, "size", size), seconds[ONBOARD], seconds[CLOUD]
+    size, *more = fields["size"] if isinstance(fields["size"], list) and fields["size"] else [fields["size"]]
+    sizes = [number(where, "size", one) for one in (size, *more)]
+    return [sizes[0], seconds[ONBOARD], seconds[CLOUD], *sizes[1:]]
 
 
 def _check_room(path: Path, count: int) -> None:
@@ -241,6 +268,7 @@ def _check_room(path: Path, count: int) -> None:
         raise DataError(f"{path}: more than {ROWS_MAX} rows, which is the most allowed")
 
 
-def _rows(found: list[Row], left_out: int = 0) -> Rows:
-    size, onboard_s, cloud_s = np.array(found, dtype=np.float64).reshape(-1, 3).T.copy()
-    return Rows(size, onboard_s, cloud_s, left_out)
+def _rows(found: Sequence[Sequence[float]], left_out: int = 0) -> Rows:
+    width = len(found[0]) if found else len(HEADER)
+    size, onboard_s, cloud_s, *more = np.array(found, dtype=np.float64).reshape(-1, width).T.copy()
+    return Rows(size, onboard_s, cloud_s, left_out, more=np.column_stack(more) if more else None)

@@ -19,7 +19,7 @@ from offboard.common.errors import DataError
 from offboard.common.wording import duration
 from offboard.loadgen.robot_files import alone_path, read_trace
 from offboard.loadgen.table.confidence_intervals import Blocks
-from offboard.loadgen.table.measured_rows import SHOWN_MAX, VALUE_MAX, Rows, is_csv, read
+from offboard.loadgen.table.measured_rows import SEVERAL_NUMBERS, SHOWN_MAX, VALUE_MAX, Rows, is_csv, read
 from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 ALONE = "trace.alone.jsonl"  # in the folder of a run
@@ -31,7 +31,9 @@ WAYS = (frozenset({ONBOARD}), frozenset({CLOUD}), frozenset({ONBOARD, CLOUD}))
 
 def read_noted(path: Path, kind: str | None = None, *, least: int = 1) -> Rows:
     """`measured_rows.read`, with the notes."""
-    return replace(read(path, kind, least=least), notes=notes(path))
+    rows = read(path, kind, least=least)
+    several = [] if rows.more is None else [SEVERAL_NUMBERS.format(1 + rows.more.shape[1])]
+    return replace(rows, notes=(*notes(path), *several))
 
 
 def notes(path: Path) -> tuple[str, ...]:
@@ -146,7 +148,7 @@ class _Times(NamedTuple):
 
 
 # One record of the trace: the size, and the times by site; no times if any of its executions failed.
-_Run = tuple[float, Mapping[str, _Times]]
+_Run = tuple[tuple[float, ...], Mapping[str, _Times]]
 _Plan = Mapping[frozenset[str], Mapping[str, _Times]]  # the sites that it ran on -> site -> times
 
 
@@ -207,7 +209,8 @@ def _runs(path: Path) -> Iterator[_Run]:
         except (TypeError, KeyError) as error:
             needed = "site, seconds, ok, censored, run_s and network_s"
             raise DataError(f"{where}: executions: {error!r}; each needs {needed}") from None
-        yield _number(f"{where}: size", fields["size"]), times
+        sizes = fields["size"] if isinstance(fields["size"], list) else [fields["size"]]
+        yield tuple(_number(f"{where}: size", one) for one in sizes), times
 
 
 def _times(where: str, one: Mapping[str, Any]) -> _Times:

@@ -63,6 +63,7 @@ class TableConfig(MeasuredTimesConfig):
         f"predictors to evaluate: {rivals.PREDICTOR_HELP}; or {ALL}",
         metavar="NAME,NAME,..",
     )
+    published: bool = setting(False, "put the lines of the paper's Table II below those of the same N")
     every_window: bool = setting(
         False, "run slow predictors (forest, ARIMA, LSTMs) with every N, not only full; may take an hour"
     )

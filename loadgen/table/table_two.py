@@ -13,22 +13,33 @@ from typing import Any
 import numpy as np
 
 from offboard.common.errors import MissingExtra
-from offboard.common.tasks import Kind
+from offboard.common.tasks import Kind, Size
 from offboard.loadgen import rivals
 from offboard.loadgen.progress import progress
 from offboard.loadgen.table import confidence_intervals
 from offboard.loadgen.table.confidence_intervals import Picks
-from offboard.loadgen.table.measured_rows import Column, Rows
+from offboard.loadgen.table.measured_rows import FIRST_NUMBER, Column, Rows
 from offboard.loadgen.table.measurement_notes import read_noted
 from offboard.loadgen.table.table_formats import Table
 from offboard.loadgen.table.table_settings import ALL, CHOSEN, FULL, FULL_WINDOW, NONE, TableConfig
-from offboard.loadgen.table.table_two_figures import FIRST, HEADINGS, Score, Scored, figures, mean_r, plain
+from offboard.loadgen.table.table_two_figures import (
+    FIRST,
+    HEADINGS,
+    PUBLISHED,
+    Score,
+    Scored,
+    figures,
+    mean_r,
+    plain,
+)
+from offboard.robot_client import predictors
 from offboard.robot_client.learning.memories import Memories
 from offboard.robot_client.learning.site import SiteMemory
 from offboard.robot_client.sites.runner import CLOUD, NOTHING, ONBOARD, UNMEASURED, Execution
 
 ROW = Kind("row", function=float, size=float)
 SITES: tuple[str, ...] = (ONBOARD, CLOUD)
+THE_PAPER = "the paper"
 
 
 def run_table(path: Path, config: TableConfig) -> int:
@@ -51,9 +62,11 @@ def tables(path: Path, rows: Rows, config: TableConfig) -> list[Table]:
 
 
 def _table(path: Path, rows: Rows, config: TableConfig, scores: list[Score], *, feedback: str) -> Table:
-    names = config.names()
+    if config.published:
+        scores = [one for score in scores for one in (score, *_printed(score))]
+    names = tuple(dict.fromkeys(one.predictor for one in scores if one.predictor))
     about = f"predictor{'s' if len(names) > 1 else ''} {', '.join(names)}, feedback {feedback}"
-    hidden = {"predictor": len(names) == 1, "bound": not config.bootstrap}
+    hidden = {"predictor": len(names) <= 1, "bound": not config.bootstrap}
     return Table(
         caption=f"{path}: {rows.counted()}, {about}.",
         about={**rows.about(path), "feedback": feedback},
@@ -64,12 +77,20 @@ def _table(path: Path, rows: Rows, config: TableConfig, scores: list[Score], *, 
     )
 
 
+def _printed(score: Score) -> Iterator[Score]:
+    """The line that the paper printed for the same N, if this is a line that it can be compared with."""
+    if score.predictor == predictors.LEAST_SQUARES and not score.bound and score.window in PUBLISHED:
+        yield replace(PUBLISHED[score.window], predictor=THE_PAPER)
+
+
 class Evaluation:
     """Predictors and constant rules, replayed over `rows`."""
 
     def __init__(self, rows: Rows, config: TableConfig) -> None:
         self._rows = rows
         self._config = config
+        first = rows.by_first_number()
+        self._by_first_number = None if first is None else Evaluation(first, config)
         # These are the same for every table, so they are computed once.
         self._split = cache(self._find_split)
         self._correlations = cache(self._find_correlations)
@@ -83,6 +104,9 @@ class Evaluation:
         """
         for name, window in planned(self._config):
             yield from self._predictor_scores(name, window, feedback)
+            if self._by_first_number is not None and rivals.takes_several_numbers(name):
+                for line in self._by_first_number._predictor_scores(name, window, feedback):
+                    yield replace(line, predictor=FIRST_NUMBER.format(name))
             step()
         rows = self._rows
         oracle = rows.cloud_s < rows.onboard_s
@@ -142,7 +166,7 @@ class Evaluation:
                 yield replace(line, scored=count, bound=bound, **end, **r_end)
 
     def _find_correlations(self, length: int | None) -> dict[str, Any]:
-        if length is None:
+        if length is None or self._rows.more is not None:
             return {}
         rows = self._rows
         return {
@@ -151,7 +175,7 @@ class Evaluation:
         }
 
     def _find_correlation_ends(self, length: int | None) -> tuple[dict[str, Any], ...]:
-        if length is None:
+        if length is None or self._rows.more is not None:
             return ({},) * len(confidence_intervals.BOUNDS)
         rows = self._rows
 
@@ -182,7 +206,7 @@ def predict(rows: Rows, length: int, *, predictor: str, feedback: str, seed: int
     """
     memory = Memories(partial(rivals.make, predictor, length, seed)).of(ROW, SITES)
     predicted = np.empty((2, len(rows) - length))
-    triples = zip(rows.size.tolist(), rows.onboard_s.tolist(), rows.cloud_s.tolist(), strict=True)
+    triples = zip(rows.sizes(), rows.onboard_s.tolist(), rows.cloud_s.tolist(), strict=True)
     for at, (size, onboard_s, cloud_s) in enumerate(triples, start=-length):
         learning = SITES
         if at >= 0:
@@ -198,7 +222,7 @@ def predict(rows: Rows, length: int, *, predictor: str, feedback: str, seed: int
     return predicted[0], predicted[1]
 
 
-def _seconds(memory: SiteMemory, size: float) -> float:
+def _seconds(memory: SiteMemory, size: Size) -> float:
     outlook = memory.outlook(size, UNMEASURED, in_flight=0, sending=NOTHING)
     assert outlook.predicted_s is not None, "a predictor that has learnt something can predict"
     return outlook.predicted_s

@@ -289,8 +289,9 @@ def test_a_changed_scenario_makes_a_figure_old(tmp_path: Path) -> None:
 @pytest.mark.parametrize("unit", [next(step.units()) for one in SECTIONS for step in one.steps])
 def test_a_step_that_plays_scenarios_reads_them(unit: Unit) -> None:
     """No step with `loadgen compare`, `checks` or `dataset` was forgotten."""
-    if any(command.split()[1] in ("compare", "checks", "dataset") for command in unit.commands()):
-        played = [find_scenario(word) for command in unit.commands() for word in command.split()[2:3]]
+    plays = [one.split() for one in unit.commands() if one.split()[1] in ("compare", "checks", "dataset")]
+    if plays:
+        played = [find_scenario(word) for words in plays for word in words[2:3]]
         assert {path.resolve().relative_to(ROOT).as_posix() for path in played} <= unit.reads(ROOT).keys()
 
 

@@ -194,12 +194,12 @@ def test_tables_of_several_kinds_need_the_flag_kind(tmp_path: Path) -> None:
     assert {task["kind"] for task in packed_look(text)["tasks"]} == {"walk"}
 
 
-def test_sizes_of_several_numbers_are_shown_without_tables(tmp_path: Path) -> None:
-    """The page shows the tasks, and says why it has no tables."""
+def test_a_task_whose_size_has_several_numbers_is_counted(tmp_path: Path) -> None:
+    """The page shows the tasks, and counts those that were measured."""
     path = trace_of(tmp_path, ("pinned", "cloud", {"onboard": 0.2, "cloud": 0.1}, 0.2))
     path.write_text(json.dumps(json.loads(path.read_text()) | {"size": [1.0, 2.0]}) + "\n")
     run_report(path, ReportConfig(out=tmp_path))
-    assert "size: [1.0, 2.0] has several numbers" in (tmp_path / "report.html").read_text()
+    assert "1 tasks were measured on both sites" in (tmp_path / "report.html").read_text()
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Kinds whose size has several numbers: from the size function to the trace, the memory file and the rule."""
 
 import json
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from random import Random
@@ -10,6 +11,9 @@ import pytest
 
 from offboard.common.errors import BadValue, DataError
 from offboard.common.tasks import SIZE_NUMBERS_MAX, Kind, Task, task
+from offboard.loadgen.__main__ import main
+from offboard.loadgen.replay.dataset_file import measured_tasks, read_dataset, write_dataset
+from offboard.loadgen.replay.recorded_tasks import read_tasks
 from offboard.loadgen.robot_files import read_trace
 from offboard.loadgen.table import measured_rows
 from offboard.robot_client import policies, predictors
@@ -168,8 +172,8 @@ def test_a_batch_takes_items_of_several_numbers(make: Make) -> None:
     assert seen[0] == items[-1]
 
 
-def test_a_trace_keeps_the_numbers_and_a_table_refuses_them(make: Make, tmp_path: Path) -> None:
-    """A line holds a list; a table needs one number, and says where the list is."""
+def test_a_trace_keeps_the_numbers_and_a_table_reads_them(make: Make, tmp_path: Path) -> None:
+    """A line holds a list; a dataset that is written from the trace has the same numbers in columns."""
     path = tmp_path / "trace.jsonl"
     trace = Trace(path)
     records = ask(make(observers=[trace.write]), 12)
@@ -177,10 +181,71 @@ def test_a_trace_keeps_the_numbers_and_a_table_refuses_them(make: Make, tmp_path
     lines = list(read_trace(path))
     assert [tuple(line["size"]) for line in lines] == [record.size for record in records]
     assert not any("work" in line["features"] for line in lines)
-    with pytest.raises(
-        DataError, match=r"trace\.jsonl:1: size: \[.*\] has several numbers; one is needed here"
-    ):
+    rows = measured_rows.read(path)
+    measured = measured_tasks(read_tasks(path, None))
+    assert rows.sizes() == [task.size for task in measured] != []
+    write_dataset(tmp_path / "rows.csv", measured)
+    assert (tmp_path / "rows.csv").read_text().startswith("size,")
+    assert measured_rows.read(tmp_path / "rows.csv").sizes() == rows.sizes()
+    assert [task.size for task in read_dataset(tmp_path / "rows.csv")] == rows.sizes()
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "said"),
+    [
+        ("size,size_3,onboard_s,cloud_s", "1,2,3,4", "a column 'size_3', but no column 'size_2'"),
+        ("size,size_2,onboard_s,cloud_s", "1,,3,4", "size_2: '' is not a finite number from 0 to 1e+15"),
+    ],
+)
+def test_a_number_of_a_size_cannot_be_left_out(tmp_path: Path, header: str, row: str, said: str) -> None:
+    """Both readers of datasets name the line and the column."""
+    path = tmp_path / "rows.csv"
+    path.write_text(f"{header}\n{row}\n")
+    for reader in (measured_rows.read, read_dataset):
+        with pytest.raises(DataError, match=re.escape(said)):
+            reader(path)
+
+
+def test_a_trace_whose_sizes_differ_in_length_is_refused(make: Make, tmp_path: Path) -> None:
+    """The line is named, and what the first one had."""
+    path = tmp_path / "trace.jsonl"
+    trace = Trace(path)
+    ask(make(observers=[trace.write]), 3)
+    trace.close()
+    first, second, *_ = path.read_text().splitlines()
+    path.write_text(f"{first}\n{json.dumps(json.loads(second) | {'size': 4.0})}\n")
+    with pytest.raises(DataError, match=r"trace\.jsonl:2: size: 4\.0 has 1 numbers, but .* first row has 2"):
         measured_rows.read(path)
+
+
+def test_tables_and_replays_show_all_numbers_and_the_first_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Where the time depends on the second number alone, only the prediction from all is right."""
+    random, path = Random(3), tmp_path / "rows.csv"
+    lines = ["size,size_2,onboard_s,cloud_s"]
+    for _ in range(120):
+        first, second = random.uniform(1, 9), random.uniform(0, 1)
+        lines.append(f"{first},{second},{0.1 + second},{0.6}")
+    path.write_text("\n".join(lines))
+    assert main(["table", str(path), "--windows", "20,full", "--format", "json"]) == 0
+    (table,) = json.loads(capsys.readouterr().out)["tables"]
+    accuracy = {(one["predictor"], one["window"]): one["accuracy_percent"] for one in table["scores"]}
+    assert accuracy["least-squares", "20"] == accuracy["least-squares", "full"] == 100.0
+    assert accuracy["least-squares, first number", "20"] < 80.0
+    assert (
+        main(["replay", str(path), "--policies", "paper,default,cloud", "--window", "20", "--format", "json"])
+        == 0
+    )
+    (table,) = json.loads(capsys.readouterr().out)["tables"]
+    over = {one["policy"]: one["time_over_oracle"] for one in table["scores"]}
+    assert list(over) == ["paper", "paper, first number", "default", "cloud", "oracle"]
+    assert over["paper"] == pytest.approx(1.0)
+    assert over["paper, first number"] > 1.05
+    assert main(["report", str(path), "--out", str(tmp_path), "--window", "20"]) == 0
+    page = (tmp_path / "report.html").read_text()
+    assert "least-squares, first number" in page
+    assert "The size is the first number of each." in page
 
 
 def test_a_restart_is_warm(make: Make) -> None:
