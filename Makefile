@@ -27,7 +27,7 @@ ROS2_READY := .cache/ros2-kilted/.ready .cache/ros2-jazzy/.ready
 help: ## list the targets
 	@grep -E '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
-demo: $(BENCH_READY) ## plan 350 paths on a real map with three processes on loopback; writes out/demo/
+demo: $(BENCH_READY) ## plan on a real map through an outage, with three processes on loopback; writes out/demo/
 	$(BIN)/loadgen demo --out out/demo
 
 install: $(DEV_READY) ## install everything that is needed to work on the code
@@ -120,8 +120,8 @@ up: ## start the three containers and print the robot's table; the server stays 
 down: ## remove the containers and their volumes
 	docker compose --profile observe down --volumes
 
-table: $(BENCH_READY) ## print Table II of the last demo
-	$(BIN)/loadgen table out/demo/trace.jsonl --windows 5,10,20,30,40,50
+table: $(BENCH_READY) ## print Table II of the dataset `paper`, beside that of the paper
+	$(BIN)/loadgen table loadgen/datasets/paper.csv --published
 
 wheel: $(DEV_READY) ## build dist/*.whl
 	$(BIN)/python -m build --wheel

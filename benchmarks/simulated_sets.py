@@ -150,10 +150,10 @@ def mean(figures: Figures) -> float:
 
 
 def _simulated() -> Iterator[Path]:
-    """The shipped scenarios that can be simulated and that leave all decisions to the policy."""
+    """The shipped scenarios with checks that can be simulated and whose tasks come one after the other."""
     for name in shipped():
         scenario = read_scenario(path := find_scenario(name))
-        if scenario.workload.arrivals != CLOSED or scenario.workload.measure:
+        if scenario.workload.arrivals != CLOSED or not scenario.checks:
             continue
         try:
             check_simulated(scenario)

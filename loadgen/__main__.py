@@ -61,12 +61,12 @@ class RunConfig:
 class DemoConfig:
     """How the demo is played."""
 
-    out: Path = setting(Path("out/demo"), "folder for trace.jsonl, table.md and the logs", metavar="DIR")
+    out: Path = setting(Path("out/demo"), "folder for the two runs", metavar="DIR")
 
 
 def _demo(argv: Sequence[str]) -> int:
     config = _config("demo", DemoConfig, argv)
-    from offboard.loadgen.play.play_scenario import play_demo
+    from offboard.loadgen.play.demo import play_demo
 
     return play_demo(config.out)
 
@@ -257,7 +257,7 @@ def _find_modules_here() -> None:
 
 
 COMMANDS = {
-    "demo": Command("make 350 plans on a real map, with three processes on loopback, and Table II", _demo),
+    "demo": Command("plan on a real map through an outage, with Offboard and with the published rule", _demo),
     "run": Command("play a scenario, and judge its checks", _run),
     "watch": Command("show a run on a page, while it goes on or later, with a time slider", _watch),
     "compare": Command("play scenarios with several policies and seeds, and compare the policies", _compare),

@@ -142,7 +142,8 @@ def _system_in(service: str) -> dict[str, str | None]:
 
 def _conditions(scenario: Scenario, testbed: str) -> str:
     """One line that says where and how the rows were measured."""
-    workload, link = scenario.workload, ", ".join(f"{key} {value}" for key, value in scenario.link.items())
+    workload = scenario.workload
+    link = ", ".join(f"{key} {_named(value)}" for key, value in scenario.link.items())
     return (
         f"Measured on the {testbed} testbed: {_asked(workload)}, "
         f"seed {scenario.seed}, robot {scenario.robot.cpus:g} CPU, link {link or 'direct'}."
@@ -161,4 +162,11 @@ def _settings(scenario: Scenario) -> dict[str, Any]:
     settings = asdict(scenario)
     if scenario.workload.map:
         settings["workload"]["map"] = scenario.workload.map.name
+    for of in (settings, *settings["servers"]):
+        of["link"] = {key: _named(value) for key, value in of["link"].items()}
     return settings
+
+
+def _named(value: Any) -> Any:
+    """The name of a file: where it lies on this computer says nothing elsewhere."""
+    return value.name if isinstance(value, Path) else value

@@ -26,7 +26,6 @@ from offboard.loadgen.play.run_files import (
     PICTURE,
     READINGS,
     SUMMARY,
-    TABLE,
     TRACE,
     RobotFiles,
     clear_folder,
@@ -40,16 +39,10 @@ from offboard.loadgen.scenario.outcome_figures import FIGURES
 from offboard.loadgen.scenario.outcome_files import read_answered, read_readings, read_references
 from offboard.loadgen.scenario.pass_fail_check import Verdict
 from offboard.loadgen.scenario.scenario import Scenario
-from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.scenario.site_shares import read_outage, share_lines, site_shares
 from offboard.loadgen.table.measured_rows import write_whole
-from offboard.loadgen.table.table_formats import render
-from offboard.loadgen.table.table_settings import TableConfig
-from offboard.loadgen.table.table_two import read_tables
 from offboard.loadgen.testbed.local_testbed import LocalTestbed
 from offboard.loadgen.testbed.testbed import Setup, Testbed
-
-DEMO_WINDOWS = ("5", "10", "20", "30", "40", "50")
 
 
 def _docker(out: Path, setups: Mapping[str, Setup]) -> Testbed:
@@ -127,19 +120,6 @@ def play(
     for line in _ending(played, out):
         say(line)
     return played
-
-
-def play_demo(out: Path) -> int:
-    """Play the shipped demo scenario, then print Table II of the plans that were measured on both sites."""
-    play(read_scenario(find_scenario("demo")), out, page=Page.SERVED).check_robots()
-    config = TableConfig(windows=DEMO_WINDOWS, feedback="both")
-    tables = read_tables(out / TRACE, config)
-    (out / TABLE).write_text(render(tables, config.format))
-    print(f"\n{config.text(tables)}\nwritten: {out / TABLE}; charts: loadgen report {out}")
-    if (out / PICTURE).exists():
-        print(f"picture of the last plan: {out / PICTURE}")
-    print(f"the run on a page: loadgen watch {out}")
-    return 0
 
 
 def _servers_of(scenario: Scenario) -> str:

@@ -18,7 +18,6 @@ LINK = "link.jsonl"  # of the relay of `cloud`; that of `edge` writes link-edge.
 EVENTS = "events.jsonl"
 READINGS = "usage.jsonl"
 SUMMARY = robot_files.SUMMARY
-TABLE = "table.md"
 PICTURE = "plan.png"
 ROBOT_SEED_STEP = 1_000_003  # large: robots of one run differ, and so do runs with neighbouring seeds
 

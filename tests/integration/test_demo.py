@@ -8,11 +8,12 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from offboard.loadgen.play import play_scenario
+from offboard.loadgen.play import demo
 from offboard.loadgen.robot_files import read_trace
 from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 
@@ -86,17 +87,27 @@ def test_a_scenario_can_be_played_to_its_end(tmp_path: Path) -> None:
     assert all(one["bytes_out"] < 100_000 for record in records for one in record["executions"])
 
 
-def test_the_demo_says_how_to_look_at_it(
+def test_the_demo_ends_in_three_sentences(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """At its start it names the address of its page, at its end a picture and the command for the page."""
-    short = read_scenario(find_scenario("demo")).changed(tasks=24, measure_all=True)
-    monkeypatch.setattr(play_scenario, "read_scenario", lambda _: short)
-    assert play_scenario.play_demo(tmp_path) == 0
-    first, *_, picture, watch = capsys.readouterr().out.splitlines()
+    """At its start it names the address of its page; at its end it compares both runs of the same plans."""
+    whole = read_scenario(find_scenario("demo"))
+    events = tuple(replace(event, at_task=at) for event, at in zip(whole.events, (10, 14), strict=True))
+    short = replace(whole.changed(tasks=24), events=events, robot=replace(whole.robot, window=4))
+    monkeypatch.setattr(demo, "read_scenario", lambda _: short)
+    assert demo.play_demo(tmp_path) == 0
+    first, *_, compared, result, next_step = capsys.readouterr().out.splitlines()
     assert re.fullmatch(r"live page: http://127\.0\.0\.1:\d+/live", first)
-    assert picture == f"picture of the last plan: {tmp_path / 'plan.png'}"
-    assert watch == f"the run on a page: loadgen watch {tmp_path}"
+    assert "on the same 24 plans; the link to the server was silent from plan 10 to plan 14." in compared
+    assert re.match(
+        r"Result: with Offboard a plan took [\d.]+ ms in the mean and [\d.]+ ms at the 99th", result
+    )
+    assert f"`loadgen watch {tmp_path}`" in next_step
+    assert f"{tmp_path / 'plan.png'} is a picture of the last plan" in next_step
+    runs = [list(read_trace(folder / "trace.jsonl")) for folder in (tmp_path, tmp_path / "paper")]
+    assert [one["size"] for one in runs[0]] == [one["size"] for one in runs[1]]
+    policies = [{one["decision"]["policy"] for one in run} for run in runs]
+    assert policies == [{"default"}, {"paper"}]
 
 
 def test_the_same_seed_gives_the_same_tasks(tmp_path: Path) -> None:

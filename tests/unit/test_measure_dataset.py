@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.figures.step import DATASETS
 from offboard.common.errors import ConfigError, DataError
 from offboard.loadgen.export.export import ExportConfig, run_export
-from offboard.loadgen.play.measure_dataset import DatasetConfig, run_dataset
+from offboard.loadgen.play.measure_dataset import DatasetConfig, _conditions, _settings, run_dataset
 from offboard.loadgen.play.play_scenario import play
-from offboard.loadgen.scenario.scenario_file import read_scenario
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
 from offboard.loadgen.table.measured_rows import read
 from offboard.loadgen.table.measurement_notes import notes
 from offboard.loadgen.table.table_formats import render
@@ -53,6 +54,16 @@ def test_a_failed_export_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"folder\.csv: cannot be written: is a folder"):
         run_export(tmp_path / "d.csv", ExportConfig(csv=tmp_path / "folder.csv"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["d.csv", "folder.csv"]
+
+
+@pytest.mark.parametrize("name", DATASETS)
+def test_the_settings_of_a_dataset_name_no_folder_of_this_computer(name: str) -> None:
+    """They can be written as JSON, with the names of maps and recordings."""
+    scenario = read_scenario(find_scenario(name))
+    written = json.dumps(_settings(scenario)) + _conditions(scenario, "docker")
+    assert str(ROOT) not in written
+    for file in scenario.link.values():
+        assert not isinstance(file, Path) or file.name in written
 
 
 def test_notes_are_printed_with_the_table(tmp_path: Path) -> None:

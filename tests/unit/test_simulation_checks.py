@@ -15,7 +15,7 @@ POLICIES = ("default", "paper")
 SEEDS = 2  # of each scenario; tasks of another seed are planned once more
 TASKS_MAX = 400  # of a scenario that is played here
 OPEN_TASKS_MAX = 4000  # of one whose tasks come at a rate, so that it has no references
-LONG = {"demo", "paper", "congested"}  # they make data sets, and have no checks
+LONG = {"demo", "paper", "congested", "drive", "drive-busy"}  # they make data sets or are shown: no checks
 
 
 def scenario(name: str) -> Scenario:
@@ -36,7 +36,7 @@ SIMULATED = [name for name in shipped() if name not in REFUSED | LONG]
 
 
 def test_few_scenarios_are_left_out() -> None:
-    """Only applications with inputs, the soak with its faults, and those that make data sets are."""
+    """Only applications with inputs, the soak with its faults, and those without checks are."""
     applications = {name for name in shipped() if scenario(name).workload.inputs is not None}
     assert REFUSED - applications <= {"soak"}
     for name in SIMULATED:

@@ -1,0 +1,56 @@
+"""`loadgen demo`: one outage on a real map, with the default policy and with the published rule beside it."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from offboard.common.wording import rounded
+from offboard.loadgen.play.play_scenario import Played, play
+from offboard.loadgen.play.run_files import PICTURE
+from offboard.loadgen.play.watch import Page
+from offboard.loadgen.scenario.outcome_figures import FIGURES
+from offboard.loadgen.scenario.scenario import Scenario
+from offboard.loadgen.scenario.scenario_file import find_scenario, read_scenario
+
+PUBLISHED = "paper"  # the policy, and the folder of its run
+
+
+def play_demo(out: Path) -> int:
+    """Play the shipped demo scenario with both policies, and end in three sentences about them."""
+    scenario = read_scenario(find_scenario("demo"))
+    ours = play(scenario, out, page=Page.SERVED)
+    ours.check_robots()
+    print("\nThe same again, by the published rule:", flush=True)
+    theirs = play(scenario.changed(policy=PUBLISHED), out / PUBLISHED)
+    theirs.check_robots()
+    print("\n".join(["", *ending(scenario, ours, theirs, out)]))
+    return 0
+
+
+def ending(scenario: Scenario, ours: Played, theirs: Played, out: Path) -> list[str]:
+    """What was compared, what came out, and where to look next, for somebody who is new to the project."""
+    silent, back = (event.at_task for event in scenario.events)
+    picture = f"; {out / PICTURE} is a picture of the last plan" if (out / PICTURE).exists() else ""
+    return [
+        f"Compared: Offboard and the published rule that it began with, on the same {scenario.workload.tasks}"
+        f" plans; the link to the server was silent from plan {silent} to plan {back}.",
+        f"Result: with Offboard a plan took {_ms('mean_ms', ours)} in the mean and {_ms('p99_ms', ours)} at"
+        f" the 99th percentile, with the published rule {_ms('mean_ms', theirs)} and"
+        f" {_ms('p99_ms', theirs)}; after the outage, Offboard sent {_cloud(ours, back)} of the plans to the"
+        f" server, and the published rule {_cloud(theirs, back)}.",
+        f"Next: `loadgen watch {out}` shows each plan and why it ran where it did{picture}; docs/results.md"
+        " has recorded links, and the cases where another policy is faster.",
+    ]
+
+
+def _ms(figure: str, played: Played) -> str:
+    return f"{rounded(_value(figure, played))} ms"
+
+
+def _cloud(played: Played, from_task: int | None) -> str:
+    after = replace(played, outcome=played.outcome.between(from_task or 0))
+    return f"{rounded(_value('cloud_percent', after), 2)} %"
+
+
+def _value(figure: str, played: Played) -> Any:
+    return FIGURES[figure].compute(played.outcome)
