@@ -124,14 +124,17 @@ def two_links(
 
 def paired(links: Sequence[RecordedLink]) -> Iterator[tuple[RecordedLink, RecordedLink]]:
     """Recordings of the two networks on the same kind of road, each used once."""
-    road = {link: link.name.split("-n8")[0].split("-n78")[0] for link in links}
-    for place in dict.fromkeys(road.values()):
-        there = [link for link in links if road[link] == place]
+    for place in dict.fromkeys(map(_road, links)):
+        there = [link for link in links if _road(link) == place]
         yield from zip(
             [link for link in there if "-n78-" in link.name],
             [link for link in there if "-n8-" in link.name],
             strict=False,
         )
+
+
+def _road(link: RecordedLink) -> str:
+    return link.name.partition("-n8")[0].partition("-n78")[0]
 
 
 def servers_table(taken: Mapping[str, Mapping[str, Taken]]) -> Table:
@@ -171,6 +174,7 @@ def links_table(kind: str, pairs: Sequence[Mapping[str, Taken]]) -> Table:
     rows = [
         [
             name.replace("server", "link"),
+            str(len(pairs)),
             f"{1e3 * float(np.mean([pair[name].mean_s for pair in pairs])):.0f}",
             f"{1e3 * float(np.mean([pair[name].p99_s for pair in pairs])):.0f}",
             _mean(ratios(name, single)),
@@ -185,9 +189,9 @@ def links_table(kind: str, pairs: Sequence[Mapping[str, Taken]]) -> Table:
     behind = _geometric(ratios(OFFBOARD, lambda pair: pair[REPLICATE].p99_s))
     both = float(np.mean([pair[OFFBOARD].both_percent for pair in pairs]))
     return Table(
-        f"Two links of one robot, {kind}: {len(pairs)} pairs of recordings",
+        f"Two links of one robot, {kind}",
         (
-            *("strategy", "mean ms", "P99 ms", "P99 / better single link", "P99 / both links"),
+            *("strategy", "pairs", "mean ms", "P99 ms", "P99 / better single link", "P99 / both links"),
             *("on both links %", "runs", "MB"),
         ),
         rows,
