@@ -32,14 +32,17 @@ def ending(scenario: Scenario, ours: Played, theirs: Played, out: Path) -> list[
     silent, back = (event.at_task for event in scenario.events)
     picture = f"; {out / PICTURE} is a picture of the last plan" if (out / PICTURE).exists() else ""
     return [
-        f"Compared: Offboard and the published rule that it began with, on the same {scenario.workload.tasks}"
-        f" plans; the link to the server was silent from plan {silent} to plan {back}.",
-        f"Result: with Offboard a plan took {_ms('mean_ms', ours)} in the mean and {_ms('p99_ms', ours)} at"
-        f" the 99th percentile, with the published rule {_ms('mean_ms', theirs)} and"
-        f" {_ms('p99_ms', theirs)}; after the outage, Offboard sent {_cloud(ours, back)} of the plans to the"
-        f" server, and the published rule {_cloud(theirs, back)}.",
+        f"Compared: the same {scenario.workload.tasks} plans, in real processes on this machine, with"
+        " Offboard and with the published rule from which this project started; the link to the server was"
+        f" silent from plan {silent} to plan {back}.",
+        f"Result: from question to path, a plan took {_ms('mean_ms', ours)} in the mean with Offboard and"
+        f" {_ms('mean_ms', theirs)} with the published rule, and one in a hundred took longer than"
+        f" {_ms('p99_ms', ours)} and {_ms('p99_ms', theirs)}; Offboard sent {_cloud(ours, 0, silent)} of the"
+        f" plans to the server before the silence and {_cloud(ours, back)} after it, the published rule"
+        f" {_cloud(theirs, 0, silent)} and {_cloud(theirs, back)}, because it learns only from the site that"
+        " it chooses.",
         f"Next: `loadgen watch {out}` shows each plan and why it ran where it did{picture}; docs/results.md"
-        " has recorded links, and the cases where another policy is faster.",
+        " has recorded links, more runs with intervals, and the cases where another policy is faster.",
     ]
 
 
@@ -47,9 +50,10 @@ def _ms(figure: str, played: Played) -> str:
     return f"{rounded(_value(figure, played))} ms"
 
 
-def _cloud(played: Played, from_task: int | None) -> str:
-    after = replace(played, outcome=played.outcome.between(from_task or 0))
-    return f"{rounded(_value('cloud_percent', after), 2)} %"
+def _cloud(played: Played, first: int | None, last: int | None = None) -> str:
+    """The share of these tasks that went to the server, without those that ran on both to be measured."""
+    part = replace(played, outcome=played.outcome.between(first or 0, last))
+    return f"{rounded(_value('cloud_percent', part), 2)} %"
 
 
 def _value(figure: str, played: Played) -> Any:
