@@ -17,20 +17,21 @@ from tests.table_loops import expected_table, lines_of, replay, rows_of
 
 FOLDER = Path(__file__).parents[2] / "loadgen" / "datasets"
 FIGURES = FOLDER.parents[1] / "docs" / "figures"
+OTHERS = {"robot-busy": 400}  # rows; for one claim of the paper, and in no table of all datasets
 NAMES = sorted(path.stem for path in FOLDER.glob("*.csv"))
 
 
 def test_every_dataset_has_its_json_file() -> None:
     """Each CSV has a JSON file that says how it was measured, and a step that measures it again."""
-    assert set(NAMES) <= set(DATASETS) <= set(shipped())
+    assert set(NAMES) == {*DATASETS, *OTHERS} <= set(shipped())
     assert sorted(path.stem for path in FOLDER.glob("*.json")) == NAMES
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_dataset_holds_a_thousand_measured_rows(name: str) -> None:
+def test_a_dataset_holds_all_rows_that_were_asked_for(name: str) -> None:
     """Its JSON file names the number of rows, the commit, the settings and the disturbance."""
     rows, about = read(FOLDER / f"{name}.csv"), json.loads((FOLDER / f"{name}.json").read_text())
-    assert len(rows) == about["rows"] == 1000
+    assert len(rows) == about["rows"] == OTHERS.get(name, 1000)
     assert about["testbed"] == "docker"
     assert "dirty" not in about["commit"]
     assert about["scenario"]["name"] == name
