@@ -81,13 +81,13 @@ JUDGED = (
         6,
         "the last N times capture exogenous factors",
         theirs="–",  # noqa: RUF001
-        decided_by=r"(accuracy %|time / better site), N = \d+, chosen",
+        decided_by=r"time / better site, N = \d+, chosen",
         shown=(
             ("accuracy % at N = 10", "accuracy %, N = 10, chosen"),
             ("at N = 50", "accuracy %, N = 50, chosen"),
             ("time / better site", "time / better site, N = 50, chosen"),
         ),
-        why="only where a load lasts: the times of the site that is not chosen become old",
+        why="only the chosen site learns, so the times of the other one are those of a load that is over",
     ),
     Judged(
         7,

@@ -54,15 +54,17 @@ def test_every_prediction_equals_plain_loops(name: str, feedback: str) -> None:
     lines, rows = rows_of((FOLDER / f"{name}.csv").read_text()), read(FOLDER / f"{name}.csv")
     evaluation = Evaluation(rows, TableConfig())
     for window in ("5", "50", "500", "full"):
+        length = len(lines) * 4 // 5 if window == "full" else int(window)
+        if length >= len(lines):
+            continue
         found = evaluation.predictions("least-squares", window, feedback)
         assert found is not None
-        length = 800 if window == "full" else int(window)
         steps = replay(lines, length, length, "none" if window == "full" else feedback)
         assert found.cloud_predicted_s == pytest.approx([step.p_cloud for step in steps], rel=0, abs=1e-9)
         assert found.onboard_predicted_s == pytest.approx([step.p_onboard for step in steps], rel=0, abs=1e-9)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", DATASETS)
 def test_the_results_page_has_what_the_command_prints(name: str) -> None:
     """The file of `make figures` holds what `loadgen table` prints for these rows, digit by digit."""
     file = FIGURES / "table-two" / f"{name}.json"
