@@ -48,7 +48,7 @@ JUDGED = (
         theirs="changes by 0.04",
         decided_by=r".*: r, N = .*",
         shown=(("cloud by", "cloud: r, N = .*"), ("onboard by", "onboard: r, N = .*")),
-        why="short windows have a slightly larger mean r",
+        why="so it is where nothing lasts; where a load lasts, short windows have a larger r",
     ),
     Judged(
         3,
@@ -117,7 +117,7 @@ JUDGED = (
         theirs="60, 79, 82 %",
         decided_by=r"accuracy %, N = (5|50|500)|accuracy points, .*",
         shown=tuple((f"% at N = {n}", f"accuracy %, N = {n}") for n in (5, 50, 500)),
-        why="times that follow the size more closely need fewer rows",
+        why="so it is where nothing lasts and times are a line; elsewhere long windows lose it again",
     ),
     Judged(
         10,
@@ -125,7 +125,7 @@ JUDGED = (
         theirs="3.1 points",
         decided_by="accuracy points, .*",
         shown=(("points", "accuracy points, N = 100 to 500"),),
-        why="a line through 50 rows is nearly as good as one through all",
+        why="more rows help where nothing changes, and forget too slowly where something does",
     ),
     Judged(
         11,
@@ -141,7 +141,7 @@ JUDGED = (
         theirs="by 7.6 points",
         decided_by="ahead of lstm.*",
         shown=(("points", "ahead of lstm.*"),),
-        why="an LSTM that stops training in time chooses as well",
+        why="an LSTM that stops training in time chooses as well, or better",
     ),
     Judged(
         13,
