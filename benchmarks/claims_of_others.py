@@ -7,6 +7,7 @@ run on all sites. docs/claims_of_others.md says what each system claims, and aga
 """
 
 import argparse
+import csv
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -44,6 +45,7 @@ STRATEGIES: Mapping[str, str] = {
 KINDS = ("plans", "frames", "images")
 FROM_TASK = 30
 LINK_TASKS = 300
+SILENCE_MS = 1000.0
 RESAMPLES = 2000
 BETTER_MIN, BEHIND_MAX, RUNS_MAX = 5.5, 1.10, 1.3  # FogROS2-FT's shape
 LINKS_BETTER_MIN, LINKS_BEHIND_MAX, BOTH_MAX = 2.5, 1.15, 20.0  # FogROS2-PLR's shape
@@ -86,14 +88,20 @@ def _run(argv: Sequence[str]) -> int:
     parser.add_argument("recordings", type=Path, metavar="FOLDER", help="recorded runs on two 5G networks")
     parser.add_argument("--seeds", type=int, default=3, help="runs of each (%(default)s)")
     flags = parser.parse_args(argv)
-    pairs = list(paired(find_recordings(flags.recordings)))
-    if not pairs:
-        raise ConfigError(f"{flags.recordings}: no recordings of n8 and n78 on the same kind of road")
+    links = find_recordings(flags.recordings)
+    silent = [link for link in links if falls_silent(link)]
+    groups = {
+        "two networks": list(paired(links)),
+        "links that fall silent": list(zip(silent, [*silent[1:], *silent[:1]], strict=True)),
+    }
+    if not all(groups.values()):
+        raise ConfigError(f"{flags.recordings}: n8 and n78 on one kind of road are needed, and silences")
     with SimulationPool() as pool:
         print(servers_table({kind: replicas(kind, pool, flags.seeds) for kind in KINDS}), flush=True)
         for kind in ("plans", "frames"):
-            found = [two_links(kind, pair, pool, flags.seeds) for pair in pairs]
-            print(links_table(kind, found), flush=True)
+            for group, of_group in groups.items():
+                found = [two_links(kind, pair, pool, flags.seeds) for pair in of_group]
+                print(links_table(f"{kind}, {group}", found), flush=True)
     return 0
 
 
@@ -133,6 +141,13 @@ def paired(links: Sequence[RecordedLink]) -> Iterator[tuple[RecordedLink, Record
         )
 
 
+def falls_silent(link: RecordedLink) -> bool:
+    """Whether one of a hundred messages is held back for SILENCE_MS or more."""
+    with link.files["recording"].open(newline="") as file:
+        delays = [float(row["rtt_ms"]) for row in csv.DictReader(file) if row.get("rtt_ms")]
+    return bool(delays) and float(np.percentile(delays, 99)) >= SILENCE_MS
+
+
 def _road(link: RecordedLink) -> str:
     return link.name.partition("-n8")[0].partition("-n78")[0]
 
@@ -161,7 +176,7 @@ def servers_table(taken: Mapping[str, Mapping[str, Taken]]) -> Table:
     )
 
 
-def links_table(kind: str, pairs: Sequence[Mapping[str, Taken]]) -> Table:
+def links_table(about: str, pairs: Sequence[Mapping[str, Taken]]) -> Table:
     """Geometric means over the pairs of links, with intervals over pairs."""
 
     def ratios(name: str, base: Any) -> list[float]:
@@ -189,7 +204,7 @@ def links_table(kind: str, pairs: Sequence[Mapping[str, Taken]]) -> Table:
     behind = _geometric(ratios(OFFBOARD, lambda pair: pair[REPLICATE].p99_s))
     both = float(np.mean([pair[OFFBOARD].both_percent for pair in pairs]))
     return Table(
-        f"Two links of one robot, {kind}",
+        f"Two links of one robot: {about}",
         (
             *("strategy", "pairs", "mean ms", "P99 ms", "P99 / better single link", "P99 / both links"),
             *("on both links %", "runs", "MB"),
@@ -215,7 +230,8 @@ def _played(
 
 def _from_a_start(link: RecordedLink, seed: int) -> dict[str, Any]:
     """The flags of a link that plays this recording from a start that the seed draws."""
-    recorded = LinkFlags(**link.files).link.up.recording
+    flags: dict[str, Any] = dict(link.files)
+    recorded = LinkFlags(**flags).link.up.recording
     assert recorded is not None, "the link has a recording"
     place = Random(f"{seed}/{link.name}").random()
     return {**link.files, "recording_from_s": place * recorded.recording.length_s}
