@@ -27,7 +27,7 @@ ROWS_MAX = 1_000_000
 VALUE_MAX = 1e15  # for seconds and sizes; keeps every sum and square finite
 ALLOWED = f"a finite number from 0 to {VALUE_MAX:g}"
 
-FIRST_NUMBER = "{}, first number"  # the name of what predicts from the first number of each size only
+FIRST_NUMBER = "{} (first number)"  # the name of what predicts from the first number of each size only
 SEVERAL_NUMBERS = "Each size has {} numbers; r and what says so use the first one, all other lines use all."
 SHOWN_MAX = 60  # characters of a wrong value that an error message shows
 

@@ -232,19 +232,19 @@ def test_tables_and_replays_show_all_numbers_and_the_first_one(
     (table,) = json.loads(capsys.readouterr().out)["tables"]
     accuracy = {(one["predictor"], one["window"]): one["accuracy_percent"] for one in table["scores"]}
     assert accuracy["least-squares", "20"] == accuracy["least-squares", "full"] == 100.0
-    assert accuracy["least-squares, first number", "20"] < 80.0
+    assert accuracy["least-squares (first number)", "20"] < 80.0
     assert (
         main(["replay", str(path), "--policies", "paper,default,cloud", "--window", "20", "--format", "json"])
         == 0
     )
     (table,) = json.loads(capsys.readouterr().out)["tables"]
     over = {one["policy"]: one["time_over_oracle"] for one in table["scores"]}
-    assert list(over) == ["paper", "paper, first number", "default", "cloud", "oracle"]
+    assert list(over) == ["paper", "paper (first number)", "default", "cloud", "oracle"]
     assert over["paper"] == pytest.approx(1.0)
-    assert over["paper, first number"] > 1.05
+    assert over["paper (first number)"] > 1.05
     assert main(["report", str(path), "--out", str(tmp_path), "--window", "20"]) == 0
     page = (tmp_path / "report.html").read_text()
-    assert "least-squares, first number" in page
+    assert "least-squares (first number)" in page
     assert "The size is the first number of each." in page
 
 
