@@ -43,7 +43,7 @@ STRATEGIES: Mapping[str, str] = {
     OFFBOARD: "default",
 }
 KINDS = ("plans", "frames", "images")
-FROM_TASK = 30
+FROM_TASK = 60  # the window of the published rule is full after 50 tasks
 LINK_TASKS = 300
 SILENCE_MS = 1000.0
 RESAMPLES = 2000
@@ -108,7 +108,7 @@ def _run(argv: Sequence[str]) -> int:
 def replicas(kind: str, pool: SimulationPool, seeds: int) -> dict[str, Taken]:
     """Three equal servers, each of them slow or without a link for a while."""
     (scenario,) = read_scenarios([str(HERE / "replicas" / f"replicas-{kind}.toml")])
-    return _played(scenario, pool, seeds)
+    return _played(_seeded(scenario, seeds), pool)
 
 
 def two_links(
@@ -118,16 +118,20 @@ def two_links(
     (scenario,) = read_scenarios([f"link-{kind}"], tasks=LINK_TASKS)
     rest = {key: value for key, value in scenario.link.items() if "recording" not in key}
 
-    def over(first: RecordedLink, second: RecordedLink) -> Scenario:
-        servers = tuple(
-            CloudPart(name, link=_from_a_start(link, scenario.seed))
-            for name, link in ((CLOUD, first), ("second", second))
-        )
-        return replace(scenario, link=rest, servers=servers)
+    def over(first: RecordedLink, second: RecordedLink) -> list[Scenario]:
+        return [
+            replace(
+                one,
+                link=rest,
+                servers=tuple(
+                    CloudPart(name, link=_from_a_start(link, one.seed))
+                    for name, link in ((CLOUD, first), ("second", second))
+                ),
+            )
+            for one in _seeded(scenario, seeds)
+        ]
 
-    found = _played(over(*pair), pool, seeds)
-    swapped = _played(over(pair[1], pair[0]), pool, seeds, {OTHER: CLOUD})
-    return found | swapped
+    return _played(over(*pair), pool) | _played(over(pair[1], pair[0]), pool, {OTHER: CLOUD})
 
 
 def paired(links: Sequence[RecordedLink]) -> Iterator[tuple[RecordedLink, RecordedLink]]:
@@ -220,10 +224,13 @@ def links_table(about: str, pairs: Sequence[Mapping[str, Taken]]) -> Table:
     )
 
 
+def _seeded(scenario: Scenario, seeds: int) -> list[Scenario]:
+    return [scenario.changed(seed=scenario.seed + n, reference=0) for n in range(seeds)]
+
+
 def _played(
-    scenario: Scenario, pool: SimulationPool, seeds: int, strategies: Mapping[str, str] = STRATEGIES
+    units: Sequence[Scenario], pool: SimulationPool, strategies: Mapping[str, str] = STRATEGIES
 ) -> dict[str, Taken]:
-    units = [scenario.changed(seed=scenario.seed + n, reference=0) for n in range(seeds)]
     played = pool.play(units, {name: {"policy": policy} for name, policy in strategies.items()})
     return {name: Taken.of(outcomes) for name, outcomes in played.items()}
 

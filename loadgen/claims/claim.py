@@ -88,8 +88,13 @@ class Claimed:
     high: float = math.inf
 
     def agrees(self, figure: Figure) -> str:
-        """Yes or no if the whole interval is inside or outside of the limits; otherwise unclear."""
+        """Yes or no if the whole interval is inside or outside of the limits; otherwise unclear.
+
+        UNDEFINED if there is no figure.
+        """
         value = figure.value
+        if value is None:
+            return UNDEFINED
         low, high = (value, value) if figure.exact else (figure.low, figure.high)
         if low is None or high is None:
             return UNCLEAR

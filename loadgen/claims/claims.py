@@ -39,17 +39,25 @@ MORE = {  # for each claim, the command that shows more of it
     17: "loadgen replay {file} --policies paper,onboard,cloud --bootstrap",
 }
 
+FIRST_ONLY = "All lines here use the first number of each size only."
+
 
 def run_claims(paths: Sequence[Path], config: ClaimsConfig) -> int:
     """Print one table for each dataset to stdout."""
     # All files first, so that mistakes show at once.
-    read = [(path, read_noted(path, config.kind), read_inputs(path)) for path in paths]
+    read = [(path, by_first_number(read_noted(path, config.kind)), read_inputs(path)) for path in paths]
     with progress("claims", len(paths) * _steps(config)) as shown:
         tables = [_table(path, rows, claims(rows, inputs, config, shown)) for path, rows, inputs in read]
     if config.verdicts:
         tables = [verdicts(tables)]
     sys.stdout.write(ColumnSettings(format=config.format).text(tables))
     return 0
+
+
+def by_first_number(rows: Rows) -> Rows:
+    """The claims are about sizes of one number."""
+    first = rows.by_first_number()
+    return rows if first is None else replace(first, notes=(*rows.notes, FIRST_ONLY))
 
 
 def _table(path: Path, rows: Rows, found: Iterator[Claim]) -> Table:

@@ -45,7 +45,9 @@ def lasting_loads(rows: Rows, config: ClaimsConfig) -> Iterator[Claim]:
     for site, figure in alike.items():
         yield claim(LASTING, f"{site}: r of neighbouring errors", figure)
     if not any((figure.low or 0.0) > LASTING_MIN for figure in alike.values()):
-        yield unknown(LASTING, "with loads that last", "no load lasts for many rows here")
+        known = all(figure.low is not None for figure in alike.values())
+        why = "no load lasts for many rows here" if known else "not enough rows"
+        yield unknown(LASTING, "with loads that last", why)
         return
     for feedback in (CHOSEN, FULL):
         for length in (SHORT, WINDOW):
@@ -70,7 +72,7 @@ def no_correlation_and_outliers(rows: Rows, config: ClaimsConfig) -> Iterator[Cl
     usual = np.ones(len(rows), dtype=bool)
     longer = {}
     for site in (ONBOARD, CLOUD):
-        held_up = random.random(len(rows)) < OUTLIER_SHARE
+        held_up = random.permutation(len(rows)) < max(1, round(OUTLIER_SHARE * len(rows)))
         usual &= ~held_up
         longer[f"{site}_s"] = np.where(held_up, OUTLIER_TIMES, 1.0) * getattr(rows, f"{site}_s")
     slowed, shown = _scored(replace(rows, **longer), WINDOW, CHOSEN, config), usual[WINDOW:].astype(float)

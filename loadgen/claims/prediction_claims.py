@@ -135,13 +135,14 @@ class PredictionClaims:
                 yield unknown(number, words, ENOUGH)
                 continue
             error_s, true_s = errors_of(scored, site)
-            theirs, claimed = None, Claimed(high=ERROR_MAX)
+            theirs: float | None = None
+            claimed: Claimed | None = Claimed(high=ERROR_MAX)
             if measure == MAE:
                 error_s = abs(error_s)
             else:
                 theirs = _published_residual(length, site)
-                most = ERROR_MAX if number == ERROR or theirs is None else abs(theirs)
-                claimed = Claimed(-most, most)
+                most = ERROR_MAX if number == ERROR else theirs and abs(theirs)
+                claimed = None if most is None else Claimed(-most, most)
             ours = ratio(self._config.blocks(len(true_s)), error_s, true_s).times(100)
             yield claim(number, words, ours, theirs=theirs, claimed=claimed)
 
@@ -249,7 +250,7 @@ def _gained(earlier: str, later: str) -> tuple[int, Claimed]:
     """The claim about the gain between two windows, and its limits."""
     if later == FULL_WINDOW:
         return ALL_DATA, POSITIVE
-    return (MARGINAL, Claimed(-GAIN_MAX, GAIN_MAX)) if int(earlier) >= WINDOW else (ACCURACY, POSITIVE)
+    return (MARGINAL, Claimed(high=GAIN_MAX)) if int(earlier) >= WINDOW else (ACCURACY, POSITIVE)
 
 
 def _published(window: str) -> Score:

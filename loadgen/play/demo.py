@@ -39,8 +39,8 @@ def ending(scenario: Scenario, ours: Played, theirs: Played, out: Path) -> list[
         f" {_ms('mean_ms', theirs)} with the published rule, and one in a hundred took longer than"
         f" {_ms('p99_ms', ours)} and {_ms('p99_ms', theirs)}; Offboard sent {_cloud(ours, 0, silent)} of the"
         f" plans to the server before the silence and {_cloud(ours, back)} after it, the published rule"
-        f" {_cloud(theirs, 0, silent)} and {_cloud(theirs, back)}, because it learns only from the site that"
-        " it chooses.",
+        f" {_cloud(theirs, 0, silent)} and {_cloud(theirs, back)}; it learns only from the site that it"
+        " chooses.",
         f"Next: `loadgen watch {out}` shows each plan and why it ran where it did{picture}; docs/results.md"
         " has recorded links, more runs with intervals, and the cases where another policy is faster.",
     ]

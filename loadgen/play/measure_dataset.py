@@ -144,9 +144,13 @@ def _conditions(scenario: Scenario, testbed: str) -> str:
     """One line that says where and how the rows were measured."""
     workload = scenario.workload
     link = ", ".join(f"{key} {_named(value)}" for key, value in scenario.link.items())
+    cloud = next(server for server in scenario.servers if server.name == CLOUD)
+    others = f", with {workload.robots - 1} more robots" if workload.robots > 1 else ""
+    events = f", {len(scenario.events)} events" if scenario.events else ""
     return (
         f"Measured on the {testbed} testbed: {_asked(workload)}, "
-        f"seed {scenario.seed}, robot {scenario.robot.cpus:g} CPU, link {link or 'direct'}."
+        f"seed {scenario.seed}, robot {scenario.robot.cpus:g} CPU, cloud {cloud.cpus:g} CPU{others}{events}, "
+        f"link {link or 'direct'}."
     )
 
 

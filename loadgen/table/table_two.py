@@ -4,9 +4,11 @@ Predictors are evaluated by a replay of Algorithm 1. `table_two_figures` compute
 """
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache, partial
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -62,11 +64,11 @@ def tables(path: Path, rows: Rows, config: TableConfig) -> list[Table]:
 
 
 def _table(path: Path, rows: Rows, config: TableConfig, scores: list[Score], *, feedback: str) -> Table:
-    if config.published:
-        scores = [one for score in scores for one in (score, *_printed(score))]
     names = tuple(dict.fromkeys(one.predictor for one in scores if one.predictor))
+    if config.published:
+        scores = list(_with_printed(scores))
     about = f"predictor{'s' if len(names) > 1 else ''} {', '.join(names)}, feedback {feedback}"
-    hidden = {"predictor": len(names) <= 1, "bound": not config.bootstrap}
+    hidden = {"predictor": len(names) <= 1 and not config.published, "bound": not config.bootstrap}
     return Table(
         caption=f"{path}: {rows.counted()}, {about}.",
         about={**rows.about(path), "feedback": feedback},
@@ -77,10 +79,14 @@ def _table(path: Path, rows: Rows, config: TableConfig, scores: list[Score], *, 
     )
 
 
-def _printed(score: Score) -> Iterator[Score]:
-    """The line that the paper printed for the same N, if this is a line that it can be compared with."""
-    if score.predictor == predictors.LEAST_SQUARES and not score.bound and score.window in PUBLISHED:
-        yield replace(PUBLISHED[score.window], predictor=THE_PAPER)
+def _with_printed(scores: Sequence[Score]) -> Iterator[Score]:
+    """After the lines of least squares for each N, what the paper printed for it."""
+    for window, lines in groupby(scores, attrgetter("window")):
+        found = list(lines)
+        yield from found
+        of_least_squares = any(line.predictor.startswith(predictors.LEAST_SQUARES) for line in found)
+        if of_least_squares and window in PUBLISHED:
+            yield replace(PUBLISHED[window], predictor=THE_PAPER)
 
 
 class Evaluation:

@@ -53,7 +53,7 @@ def test_the_parts_accept_every_flag_of_a_scenario(name: str, tmp_path: Path) ->
     if isinstance(robot, DriveConfig):
         assert (robot.map, robot.resolution) == (read.workload.map, 0.025)
     assert (robot.trace, robot.answers) == (tmp_path / "trace.jsonl", tmp_path / "answers.jsonl")
-    assert (wan.delay_ms, wan.seed) == (read.links()[CLOUD]["delay_ms"], read.seed)
+    assert (wan.delay_ms, wan.seed) == (read.links()[CLOUD].get("delay_ms", WanConfig.delay_ms), read.seed)
     assert len(configs) == 2 * len(read.servers) + read.workload.robots
 
 
