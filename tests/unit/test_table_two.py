@@ -29,6 +29,18 @@ def test_every_column_equals_plain_loops(print_table: Print, feedback: str) -> N
     assert found == expected_table(THOUSAND, PAPER_WINDOWS, feedback)
 
 
+def test_the_lines_of_the_paper_stand_below_ours(print_table: Print) -> None:
+    """Below the interval of the same N, as they were printed; an N that the paper has not gets none."""
+    printed_json = print_table(THOUSAND, windows=("7", "50"), published=True, bootstrap=True, format="json")
+    lines = json.loads(printed_json)["tables"][0]["scores"]
+    named = [(one["predictor"], one["window"], one["bound"]) for one in lines if one["predictor"]]
+    assert [one for one in named if one[1] == "7"] == [
+        ("least-squares", "7", b) for b in ("", "2.5 %", "97.5 %")
+    ]
+    assert named[-1] == ("the paper", "50", "")
+    assert next(one for one in lines if one["predictor"] == "the paper")["accuracy_percent"] == 78.8
+
+
 def test_only_chosen_feedback_keeps_a_stale_window(print_table: Print) -> None:
     """If the cloud is slow only in warm-up, chosen feedback never tries it again; full feedback soon does."""
     rows = [(1.0 + i % 2, 5.0, 9.0 if i < 2 else 1.0) for i in range(10)]

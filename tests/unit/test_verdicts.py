@@ -13,7 +13,7 @@ from offboard.loadgen.claims.claim import Claim, ClaimsConfig, Figure, claim
 from offboard.loadgen.claims.claims import run_claims
 from offboard.loadgen.claims.disturbed_claims import lasting_loads, no_correlation_and_outliers
 from offboard.loadgen.claims.site_claims import r_by_site, r_by_window, slopes
-from offboard.loadgen.claims.verdicts import FAILS, HOLDS, JUDGED, OPEN, verdicts
+from offboard.loadgen.claims.verdicts import FAILS, HOLDS, JUDGED, NOT_MEASURED, OPEN, verdicts
 from offboard.loadgen.table.measured_rows import Rows
 from offboard.loadgen.table.table_formats import Table
 from tests.table_loops import THOUSAND, csv_of
@@ -37,7 +37,7 @@ def judged(lines: list[Claim]) -> dict[int, Any]:
         (["yes", "no"], OPEN),
         (["no", "unclear", "unclear"], FAILS),
         (["no", "no", "yes"], FAILS),
-        ([], OPEN),
+        ([], NOT_MEASURED),
     ],
 )
 def test_a_claim_holds_if_more_than_half_of_its_lines_agree(says: list[str], verdict: str) -> None:
