@@ -120,7 +120,7 @@ up: ## start the three containers and print the robot's table; the server stays 
 down: ## remove the containers and their volumes
 	docker compose --profile observe down --volumes
 
-table: $(BENCH_READY) ## print Table II of the dataset `paper`, beside that of the paper
+table: $(BENCH_READY) ## print Table II of the dataset `paper`, next to that of the paper
 	$(BIN)/loadgen table loadgen/datasets/paper.csv --published
 
 wheel: $(DEV_READY) ## build dist/*.whl

@@ -67,7 +67,7 @@ def keep(bench: Bench, sentence: Callable[[Bench], None]) -> None:
     """Check a sentence; if it fails, leave cloud and relay running, so that the others can be checked."""
     try:
         sentence(bench)
-    except BaseException:
+    except BaseException:  # also a time limit or Ctrl-C: the next sentences need cloud and relay
         for part in ("wan", "cloud"):
             with contextlib.suppress(OffloadError):
                 bench.bed.join(part)  # if it was cut off

@@ -1,4 +1,4 @@
-"""`loadgen demo`: one outage on a real map, with the default policy and with the published rule beside it."""
+"""`loadgen demo`: one outage on a real map, with the default policy and then with the published rule."""
 
 from dataclasses import replace
 from pathlib import Path

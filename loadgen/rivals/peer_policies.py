@@ -21,54 +21,61 @@ ACCURACY = 0.01  # of the sketch, relative (Masson et al., DDSketch, VLDB 2019)
 SMALLEST_S = 1e-6
 
 
-class Replicate:
+class _AmongServers:
+    """Asks `choose` where a task runs, or runs it onboard while no server is there."""
+
+    name: str
+
+    def __init__(self, seed: int = 0) -> None:
+        pass
+
+    def decide(self, forecast: Forecast) -> Decision:
+        servers = [site for site in forecast.sites if site != ONBOARD]
+        if not servers:
+            return Decision(ONBOARD, "no server is there", self.name)
+        return self.choose(servers, forecast)
+
+    def choose(self, servers: list[str], forecast: Forecast) -> Decision:
+        raise NotImplementedError
+
+    def _all_of(self, chosen: list[str], forecast: Forecast, why: str) -> Decision:
+        spared = tuple(site for site in forecast.sites if site not in chosen)
+        return Decision(chosen[0], why, self.name, both=True, spared=spared)
+
+
+class Replicate(_AmongServers):
     """Every task runs on all servers at once, and the first answer is used."""
 
-    def __init__(self, seed: int = 0) -> None:
-        pass
+    name = "replicate"
 
-    def decide(self, forecast: Forecast) -> Decision:
-        servers = _servers(forecast)
-        if not servers:
-            return Decision(ONBOARD, "no server is there", "replicate")
-        spared = (ONBOARD,) if ONBOARD in forecast.sites else ()
-        return Decision(servers[0], "all servers at once", "replicate", both=True, spared=spared)
+    def choose(self, servers: list[str], forecast: Forecast) -> Decision:
+        return self._all_of(servers, forecast, "all servers at once")
 
 
-class TwoServers:
+class TwoServers(_AmongServers):
     """Every task runs at once on the two servers that should be fastest."""
 
-    def __init__(self, seed: int = 0) -> None:
-        pass
+    name = "two-servers"
 
-    def decide(self, forecast: Forecast) -> Decision:
-        servers = _servers(forecast)
-        if not servers:
-            return Decision(ONBOARD, "no server is there", "two-servers")
+    def choose(self, servers: list[str], forecast: Forecast) -> Decision:
         unknown = [site for site in servers if forecast.sites[site].predicted_s is None]
         costs = costs_of(forecast.only([site for site in servers if site not in unknown]))
         by_cost = [*unknown, *sorted(costs, key=costs.__getitem__)]
-        spared = tuple(site for site in forecast.sites if site not in by_cost[:2])
-        return Decision(by_cost[0], "the two fastest servers", "two-servers", both=True, spared=spared)
+        return self._all_of(by_cost[:2], forecast, "the two fastest servers")
 
 
-class HedgeAtP90:
+class HedgeAtP90(_AmongServers):
     """The first server, and the next one after the 90th percentile of the first one's times."""
 
+    name = "hedge-at-p90"
     predictor = "offboard.loadgen.rivals.peer_policies.QuantileSketch"
 
-    def __init__(self, seed: int = 0) -> None:
-        pass
-
-    def decide(self, forecast: Forecast) -> Decision:
-        servers = _servers(forecast)
-        if not servers:
-            return Decision(ONBOARD, "no server is there", "hedge-at-p90")
+    def choose(self, servers: list[str], forecast: Forecast) -> Decision:
         first, p90_s = servers[0], forecast.sites[servers[0]].predicted_s
         second = None
         if len(servers) > 1 and p90_s is not None and forecast.duplicates >= 1:
             second = Hedge(servers[1], p90_s)
-        return Decision(first, "the first server", "hedge-at-p90", second=second)
+        return Decision(first, "the first server", self.name, second=second)
 
 
 class QuantileSketch:
@@ -103,7 +110,3 @@ class QuantileSketch:
             if left <= 0:
                 return Prediction(exp((bucket - 0.5) * self._log_gamma), None)
         return None
-
-
-def _servers(forecast: Forecast) -> list[str]:
-    return [site for site in forecast.sites if site != ONBOARD]
