@@ -1,82 +1,53 @@
-"""Simulates what peers claim on the same shapes of test: several servers, and two links of one robot.
+"""Simulates what peers claim on the same shapes of test, next to Offboard.
 
-    python -m benchmarks.claims_of_others FOLDER_OF_5G_RECORDINGS [--seeds 3]
+    python -m benchmarks.claims_of_others PART FOLDER_OF_RECORDINGS [--seeds 3]
 
-The rules of peers are in `loadgen/rivals/peer_policies.py`. Tasks before FROM_TASK do not count: most of them
-run on all sites. docs/claims_of_others.md says what each system claims, and against what.
+- `contended`: three servers, the first of which other robots keep busy
+- `in-turn`: three servers, each of them slow or without a link for a while
+- `networks`: a robot with two links, recorded on two 5G networks; `silences`: on links that fall silent
+- `families`: one server behind each recording of each folder
+
+The rules of peers are in `loadgen/rivals/peer_policies.py`, the tasks in `application_costs`. Tasks before
+FROM_TASK do not count: most of them run on all sites. docs/claims_of_others.md says what each system claims.
 """
 
 import argparse
 import csv
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from random import Random
-from typing import Any
 
 import numpy as np
 
+from benchmarks.application_costs import NAMES
 from benchmarks.measure import Requirement, Table
+from benchmarks.peers_played import (
+    OFFBOARD,
+    ONE,
+    OTHER,
+    REPLICATE,
+    ROBOT_ALONE,
+    Taken,
+    contended,
+    on_one_link,
+    on_two_links,
+    played,
+    slow_in_turn,
+)
 from offboard.common.command_line import run_command
 from offboard.common.errors import ConfigError
 from offboard.loadgen.compare.recordings import RecordedLink, find_recordings
-from offboard.loadgen.compare.runs import read_scenarios
-from offboard.loadgen.relay.link.link_settings import LinkFlags
-from offboard.loadgen.scenario.outcome import Answered, Outcome
-from offboard.loadgen.scenario.scenario import CloudPart, Scenario
+from offboard.loadgen.progress import progress
 from offboard.loadgen.simulation.simulation_pool import SimulationPool
-from offboard.loadgen.table.table_two_figures import quantile
-from offboard.robot_client.sites.runner import CLOUD, ONBOARD
 
 PROG = "python -m benchmarks.claims_of_others"
-HERE = Path(__file__).parent
-PEERS = "offboard.loadgen.rivals.peer_policies"
-ONE, OTHER, REPLICATE, OFFBOARD = "one server", "the other link", "all servers at once", "Offboard"
-STRATEGIES: Mapping[str, str] = {
-    ONE: CLOUD,
-    "always onboard": ONBOARD,
-    "the published rule": "paper",
-    "hedge at P90 (as hedge-python)": f"{PEERS}.HedgeAtP90",
-    "two servers at once": f"{PEERS}.TwoServers",
-    REPLICATE: f"{PEERS}.Replicate",
-    OFFBOARD: "default",
-}
-KINDS = ("plans", "frames", "images")
-FROM_TASK = 60  # the window of the published rule is full after 50 tasks
-LINK_TASKS = 300
+CAR = "cicv5g"  # the family that has round trips on two networks
 SILENCE_MS = 1000.0
 RESAMPLES = 2000
 BETTER_MIN, BEHIND_MAX, RUNS_MAX = 5.5, 1.10, 1.3  # FogROS2-FT's shape
 LINKS_BETTER_MIN, LINKS_BEHIND_MAX, BOTH_MAX = 2.5, 1.15, 20.0  # FogROS2-PLR's shape
-
-
-@dataclass(frozen=True, slots=True)
-class Taken:
-    """What the counted tasks of one strategy took. `both_percent`: those that two or more servers ran."""
-
-    mean_s: float
-    p95_s: float
-    p99_s: float
-    runs: float
-    megabytes: float
-    both_percent: float
-    failed: int
-
-    @classmethod
-    def of(cls, outcomes: Sequence[Outcome]) -> "Taken":
-        tasks = list(_counted(outcomes))
-        seconds = np.array([one.response_s for one in tasks])
-        servers = [sum(site != ONBOARD for site in one.sites) for one in tasks]
-        return cls(
-            mean_s=float(seconds.mean()),
-            p95_s=float(quantile(seconds, 95)),
-            p99_s=float(quantile(seconds, 99)),
-            runs=float(np.mean([len(one.sites) for one in tasks])),
-            megabytes=float(np.mean([one.spent.bytes for one in tasks])) / 1e6,
-            both_percent=100 * float(np.mean([count > 1 for count in servers])),
-            failed=sum(one.error is not None for one in tasks),
-        )
+UNKNOWN = "-"
+Played = Mapping[str, Taken]
 
 
 def main(argv: Sequence[str]) -> int:
@@ -85,53 +56,77 @@ def main(argv: Sequence[str]) -> int:
 
 def _run(argv: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(prog=PROG, description=__doc__.splitlines()[0])
-    parser.add_argument("recordings", type=Path, metavar="FOLDER", help="recorded runs on two 5G networks")
+    parser.add_argument("part", choices=PARTS, metavar="PART", help=", ".join(PARTS))
+    parser.add_argument("recordings", type=Path, metavar="FOLDER", help="a folder for each family of them")
     parser.add_argument("--seeds", type=int, default=3, help="runs of each (%(default)s)")
     flags = parser.parse_args(argv)
-    links = find_recordings(flags.recordings)
-    silent = [link for link in links if falls_silent(link)]
-    groups = {
-        "two networks": list(paired(links)),
-        "links that fall silent": list(zip(silent, [*silent[1:], *silent[:1]], strict=True)),
-    }
-    if not all(groups.values()):
-        raise ConfigError(f"{flags.recordings}: n8 and n78 on one kind of road are needed, and silences")
     with SimulationPool() as pool:
-        print(servers_table({kind: replicas(kind, pool, flags.seeds) for kind in KINDS}), flush=True)
-        for kind in ("plans", "frames"):
-            for group, of_group in groups.items():
-                found = [two_links(kind, pair, pool, flags.seeds) for pair in of_group]
-                print(links_table(f"{kind}, {group}", found), flush=True)
+        print(PARTS[flags.part](flags.recordings, flags.seeds, pool))
     return 0
 
 
-def replicas(kind: str, pool: SimulationPool, seeds: int) -> dict[str, Taken]:
-    """Three equal servers, each of them slow or without a link for a while."""
-    (scenario,) = read_scenarios([str(HERE / "replicas" / f"replicas-{kind}.toml")])
-    return _played(_seeded(scenario, seeds), pool)
+def _contended(_: Path, seeds: int, pool: SimulationPool) -> Table:
+    found = _play([contended(name, seeds) for name in NAMES], pool)
+    return servers_table("the first one contended", dict(zip(NAMES, found, strict=True)))
 
 
-def two_links(
-    kind: str, pair: tuple[RecordedLink, RecordedLink], pool: SimulationPool, seeds: int
-) -> dict[str, Taken]:
-    """One robot with two links, each to an equal server, as FogROS2-PLR has two 5G providers."""
-    (scenario,) = read_scenarios([f"link-{kind}"], tasks=LINK_TASKS)
-    rest = {key: value for key, value in scenario.link.items() if "recording" not in key}
+def _in_turn(_: Path, seeds: int, pool: SimulationPool) -> Table:
+    found = _play([slow_in_turn(name, seeds) for name in NAMES], pool)
+    return servers_table("each slow for a while", dict(zip(NAMES, found, strict=True)))
 
-    def over(first: RecordedLink, second: RecordedLink) -> list[Scenario]:
-        return [
-            replace(
-                one,
-                link=rest,
-                servers=tuple(
-                    CloudPart(name, link=_from_a_start(link, one.seed))
-                    for name, link in ((CLOUD, first), ("second", second))
-                ),
-            )
-            for one in _seeded(scenario, seeds)
+
+def _networks(folder: Path, seeds: int, pool: SimulationPool) -> Table:
+    return _two_links("two networks", list(paired(_of_a_car(folder))), seeds, pool)
+
+
+def _silences(folder: Path, seeds: int, pool: SimulationPool) -> Table:
+    silent = [link for link in _of_a_car(folder) if falls_silent(link)]
+    pairs = list(zip(silent, [*silent[1:], *silent[:1]], strict=True))
+    return _two_links("links that fall silent", pairs, seeds, pool)
+
+
+def _families(folder: Path, seeds: int, pool: SimulationPool) -> Table:
+    cases = [on_one_link(name, link, seeds) for name in NAMES for link in find_recordings(folder)]
+    found: dict[tuple[str, str], list[Played]] = {}
+    for case, taken in zip(cases, _play(cases, pool), strict=True):
+        found.setdefault((case.task, case.group), []).append(taken)
+    return families_table(found)
+
+
+PARTS: Mapping[str, Callable[[Path, int, SimulationPool], Table]] = {
+    "contended": _contended,
+    "in-turn": _in_turn,
+    "networks": _networks,
+    "silences": _silences,
+    "families": _families,
+}
+
+
+def _play(cases: Sequence[object], pool: SimulationPool) -> Iterator[dict[str, Taken]]:
+    with progress("simulating", len(cases)) as shown:
+        for found in pool.map(played, cases):
+            shown.step()
+            yield found
+
+
+def _two_links(
+    about: str, pairs: Sequence[tuple[RecordedLink, RecordedLink]], seeds: int, pool: SimulationPool
+) -> Table:
+    if not pairs:
+        raise ConfigError("n8 and n78 on one kind of road are needed, and silences")
+    found = {}
+    for name in NAMES:
+        both = [on_two_links(name, pair, seeds) for pair in pairs]
+        first = _play([one for one, _ in both], pool)
+        found[name] = [
+            {**taken, OTHER: other[ONE]}
+            for taken, other in zip(first, _play([two for _, two in both], pool), strict=True)
         ]
+    return links_table(about, found)
 
-    return _played(over(*pair), pool) | _played(over(pair[1], pair[0]), pool, {OTHER: CLOUD})
+
+def _of_a_car(folder: Path) -> list[RecordedLink]:
+    return [link for link in find_recordings(folder) if link.family == CAR]
 
 
 def paired(links: Sequence[RecordedLink]) -> Iterator[tuple[RecordedLink, RecordedLink]]:
@@ -156,109 +151,111 @@ def _road(link: RecordedLink) -> str:
     return link.name.partition("-n8")[0].partition("-n78")[0]
 
 
-def servers_table(taken: Mapping[str, Mapping[str, Taken]]) -> Table:
-    rows, better = [], {}
-    for kind, of in taken.items():
-        one, everywhere, ours = of[ONE], of[REPLICATE], of[OFFBOARD]
-        better[kind] = one.p99_s / ours.p99_s
-        for name, found in of.items():
-            rows.append([kind, name, *_cells(found), f"{one.p99_s / found.p99_s:.2f}"])
-        rows[-1][-1] += f"; {ours.p99_s / everywhere.p99_s:.2f} of all at once"
-    worst = max(of[OFFBOARD].p99_s / of[REPLICATE].p99_s for of in taken.values())
-    runs = max(of[OFFBOARD].runs for of in taken.values())
+def servers_table(about: str, taken: Mapping[str, Played]) -> Table:
+    rows = [
+        [task, name, *_cells([found]), f"{of[ONE].percentile_s(99) / found.percentile_s(99):.2f}"]
+        for task, of in taken.items()
+        for name, found in of.items()
+    ]
+    ours = {task: of[OFFBOARD].percentile_s(99) for task, of in taken.items()}
+    better = max(of[ONE].percentile_s(99) / ours[task] for task, of in taken.items())
+    worst = max(ours[task] / of[REPLICATE].percentile_s(99) for task, of in taken.items())
+    runs = max(of[OFFBOARD].runs or 0.0 for of in taken.values())
     return Table(
-        "Three servers: one, all, or as Offboard chooses",
+        f"Three servers, {about}",
         ("task", "strategy", "mean ms", "P95 ms", "P99 ms", "runs", "MB", "P99 of one server / this"),
         rows,
         [
-            Requirement(
-                "P99 of one server / Offboard, best task", max(better.values()), BETTER_MIN, at_least=True
-            ),
+            Requirement("P99 of one server / Offboard, best task", better, BETTER_MIN, at_least=True),
             Requirement("P99 of Offboard / all servers at once, worst task", worst, BEHIND_MAX),
             Requirement("runs of Offboard for each task, most", runs, RUNS_MAX),
         ],
     )
 
 
-def links_table(about: str, pairs: Sequence[Mapping[str, Taken]]) -> Table:
+def links_table(about: str, taken: Mapping[str, Sequence[Played]]) -> Table:
     """Geometric means over the pairs of links, with intervals over pairs."""
-
-    def ratios(name: str, base: Any) -> list[float]:
-        return [pair[name].p99_s / base(pair) for pair in pairs]
-
-    def single(pair: Mapping[str, Taken]) -> float:
-        return min(pair[ONE].p99_s, pair[OTHER].p99_s)
-
-    names = [name for name in STRATEGIES if name != "two servers at once"]
-    rows = [
-        [
-            name.replace("server", "link"),
-            str(len(pairs)),
-            f"{1e3 * float(np.mean([pair[name].mean_s for pair in pairs])):.0f}",
-            f"{1e3 * float(np.mean([pair[name].p99_s for pair in pairs])):.0f}",
-            _mean(ratios(name, single)),
-            _mean(ratios(name, lambda pair: pair[REPLICATE].p99_s)),
-            f"{np.mean([pair[name].both_percent for pair in pairs]):.1f}",
-            f"{np.mean([pair[name].runs for pair in pairs]):.2f}",
-            f"{np.mean([pair[name].megabytes for pair in pairs]):.3f}",
-        ]
-        for name in names
-    ]
-    ours = [1 / one for one in ratios(OFFBOARD, single)]
-    behind = _geometric(ratios(OFFBOARD, lambda pair: pair[REPLICATE].p99_s))
-    both = float(np.mean([pair[OFFBOARD].both_percent for pair in pairs]))
+    rows, better, behind = [], [], []
+    for task, pairs in taken.items():
+        p99_s = {name: np.array([one[name].percentile_s(99) for one in pairs]) for name in pairs[0]}
+        single = np.minimum(p99_s[ONE], p99_s[OTHER])
+        better.append(_geometric(single / p99_s[OFFBOARD]))
+        behind.append(_geometric(p99_s[OFFBOARD] / p99_s[REPLICATE]))
+        for name in pairs[0]:
+            found = [pair[name] for pair in pairs]
+            rows.append([
+                task,
+                name.replace("server", "link"),
+                *_cells(found),
+                _mean(p99_s[name] / single),
+                _mean(p99_s[name] / p99_s[REPLICATE]),
+                f"{np.mean([one.both_percent for one in found]):.1f}",
+            ])  # fmt: skip
+    both = max(float(np.mean([one[OFFBOARD].both_percent for one in pairs])) for pairs in taken.values())
     return Table(
-        f"Two links of one robot: {about}",
+        f"Two links of one robot, {about}: {len(next(iter(taken.values())))} pairs",
         (
-            *("strategy", "pairs", "mean ms", "P99 ms", "P99 / better single link", "P99 / both links"),
-            *("on both links %", "runs", "MB"),
+            *("task", "strategy", "mean ms", "P95 ms", "P99 ms", "runs", "MB"),
+            *("P99 / better single link", "P99 / both links", "on both links %"),
         ),
         rows,
         [
             Requirement(
-                "P99 of the better single link / Offboard", _geometric(ours), LINKS_BETTER_MIN, at_least=True
+                "P99 of the better single link / Offboard, best task",
+                max(better),
+                LINKS_BETTER_MIN,
+                at_least=True,
             ),
-            Requirement("P99 of Offboard / both links at once", behind, LINKS_BEHIND_MAX),
-            Requirement("tasks of Offboard on both links", both, BOTH_MAX, "%"),
+            Requirement("P99 of Offboard / both links at once, worst task", max(behind), LINKS_BEHIND_MAX),
+            Requirement("tasks of Offboard on both links, most", both, BOTH_MAX, "%"),
         ],
     )
 
 
-def _seeded(scenario: Scenario, seeds: int) -> list[Scenario]:
-    return [scenario.changed(seed=scenario.seed + n, reference=0) for n in range(seeds)]
+def families_table(taken: Mapping[tuple[str, str], Sequence[Played]]) -> Table:
+    """Geometric means over recordings, with their intervals; the better constant is that of the recording."""
+    rows = []
+    for (task, family), links in taken.items():
+        better = [min((one[ONE], one[ROBOT_ALONE]), key=lambda of: of.mean_s) for one in links]
+        for name in links[0]:
+            found = [one[name] for one in links]
+            means = [one.mean_s / base.mean_s for one, base in zip(found, better, strict=True)]
+            tails = [
+                one.percentile_s(99) / base.percentile_s(99)
+                for one, base in zip(found, better, strict=True)
+            ]  # fmt: skip
+            shown = "always cloud" if name == ONE else name
+            rows.append([task, family, shown, *_cells(found), _mean(means), _mean(tails)])
+    counts = {family: len(links) for (_, family), links in taken.items()}
+    said = ", ".join(f"{count} of {family}" for family, count in counts.items())
+    return Table(
+        f"One server behind recorded links: {said}",
+        (
+            *("task", "family", "strategy", "mean ms", "P95 ms", "P99 ms", "runs", "MB"),
+            *("mean / better constant", "P99 / better constant"),
+        ),
+        rows,
+    )
 
 
-def _played(
-    units: Sequence[Scenario], pool: SimulationPool, strategies: Mapping[str, str] = STRATEGIES
-) -> dict[str, Taken]:
-    played = pool.play(units, {name: {"policy": policy} for name, policy in strategies.items()})
-    return {name: Taken.of(outcomes) for name, outcomes in played.items()}
+def _cells(found: Sequence[Taken]) -> list[str]:
+    """Mean, P95 and P99 in ms, runs and MB of a task: means over the links that these are of."""
+    times = np.array([[one.mean_s, one.percentile_s(95), one.percentile_s(99)] for one in found])
+    runs = [one.runs for one in found if one.runs is not None]
+    megabytes = [one.megabytes for one in found if one.megabytes is not None]
+    return [
+        *(f"{1e3 * mean_s:.0f}" for mean_s in times.mean(axis=0)),
+        f"{np.mean(runs):.2f}" if runs else UNKNOWN,
+        f"{np.mean(megabytes):.3f}" if megabytes else UNKNOWN,
+    ]
 
 
-def _from_a_start(link: RecordedLink, seed: int) -> dict[str, Any]:
-    """The flags of a link that plays this recording from a start that the seed draws."""
-    flags: dict[str, Any] = dict(link.files)
-    recorded = LinkFlags(**flags).link.up.recording
-    assert recorded is not None, "the link has a recording"
-    place = Random(f"{seed}/{link.name}").random()
-    return {**link.files, "recording_from_s": place * recorded.recording.length_s}
-
-
-def _counted(outcomes: Sequence[Outcome]) -> Iterator[Answered]:
-    return (one for run in outcomes for one in run.answered if one.i >= FROM_TASK)
-
-
-def _cells(found: Taken) -> list[str]:
-    times = (f"{1e3 * seconds:.0f}" for seconds in (found.mean_s, found.p95_s, found.p99_s))
-    return [*times, f"{found.runs:.2f}", f"{found.megabytes:.3f}"]
-
-
-def _geometric(values: Sequence[float]) -> float:
-    return float(np.exp(np.mean(np.log(values))))
+def _geometric(values: Iterable[float]) -> float:
+    return float(np.exp(np.mean(np.log(np.array(values)))))
 
 
 def _mean(values: Sequence[float]) -> str:
-    """The geometric mean and its interval over pairs."""
+    """The geometric mean and its interval over links."""
     picks = np.random.default_rng(1).integers(len(values), size=(RESAMPLES, len(values)))
     means = np.exp(np.log(np.array(values))[picks].mean(axis=1))
     low, high = np.percentile(means, (2.5, 97.5))

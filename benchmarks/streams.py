@@ -37,7 +37,7 @@ S_PER_QUALITY = 1.0  # what the quality that the onboard policy loses is worth i
 WORKERS = 2  # of the server: a chunk that is given up does not delay the next one
 RESAMPLES = 2000
 BLENDS = (0, 2, 6, 12)
-HALF = ", half a horizon"
+HALF = " (half a horizon)"
 
 
 @dataclass(frozen=True)
@@ -168,9 +168,9 @@ def rules(drive: Drive) -> dict[str, tuple[str, float | None, int]]:
     return {
         **{name: (name, None, 0) for name in ("broker", "half-empty", "fixed-interval")},
         **{f"{name}{HALF}": (name, per_half, BLEND) for name in DELAYS},
-        "stream, often": (STREAM, 2.5 * per_half, BLEND),
-        "stream, no limit": (STREAM, drive.hz, BLEND),
-        **{f"stream, blend {steps}": (STREAM, None, steps) for steps in BLENDS},
+        "stream (often)": (STREAM, 2.5 * per_half, BLEND),
+        "stream (no limit)": (STREAM, drive.hz, BLEND),
+        **{f"stream (blend {steps})": (STREAM, None, steps) for steps in BLENDS},
     }
 
 
@@ -190,7 +190,7 @@ def tables(found: Sequence[Drive]) -> Iterator[Table]:
     yield _forecast_table(of, sums, groups)
     rows = []
     for steps in BLENDS:
-        one = sums[f"stream, blend {steps}", "all"]
+        one = sums[f"stream (blend {steps})", "all"]
         figures = fmean(one.seams), fmean(one.errors), np.quantile(one.errors, 0.95)
         rows.append([str(steps), *(f"{figure:.4f}" for figure in figures)])
     yield Table("Seams", ["blend, steps", "seam", "distance to the target", "its 95 % quantile"], rows)
@@ -215,7 +215,7 @@ def _steps_table(
             f"{whole.per_second(ONBOARD):.2f}",
         ])  # fmt: skip
     columns = [
-        "rule", *(f"empty %, {group}" for group in groups), "mean of recordings", "age ms",
+        "rule", *(f"empty % {group}" for group in groups), "mean of recordings", "age ms",
         "server chunks/s", "onboard chunks/s",
     ]  # fmt: skip
     count = len(next(iter(of.values())))
@@ -224,7 +224,7 @@ def _steps_table(
 
 def _required(sums: Mapping[tuple[str, str], Played], groups: Sequence[str]) -> list[Requirement]:
     same, rival = sums[f"stream{HALF}", "all"], sums["half-empty", "all"]
-    every, unlimited = sums["fixed-interval", "all"], sums["stream, no limit", "all"]
+    every, unlimited = sums["fixed-interval", "all"], sums["stream (no limit)", "all"]
     found = [
         Requirement("empty steps over half-empty's", same.empty_percent / rival.empty_percent, 0.2),
         Requirement("empty steps over fixed-interval's", same.empty_percent / every.empty_percent, 0.2),

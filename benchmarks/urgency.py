@@ -15,12 +15,12 @@ import threading
 import time
 import urllib.request
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from unittest import mock
 
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.arrivals import USUAL, arrivals
 from benchmarks.measure import Requirement, Table
 from benchmarks.servers import cloud_server
 from offboard import Offloader, task
@@ -30,7 +30,6 @@ STREAMS, OTHERS = 8, 8
 HZ, HORIZON = 30.0, 50
 RUN_S = 0.06
 CALLS_PER_S = 1.2  # of each stream, which asks as often as it may
-DEMAND = Path(__file__).parent / "demand"
 FIRST_S = 10.0  # of a stream, which is not counted
 WAIT_S = 20.0
 LATE_S = 10.0  # the time limit of the others
@@ -54,15 +53,6 @@ def too_slow(observation: float) -> Floats:
 def policy(observation: float) -> Floats:
     time.sleep(RUN_S)
     return np.full((HORIZON, 1), observation)
-
-
-def arrivals(name: str, per_s: float, seconds: float, seed: int) -> list[float]:
-    """When the others ask, in seconds: as many successive gaps of a recording, from a drawn place, scaled."""
-    times = np.loadtxt(DEMAND / f"{name}.csv", skiprows=1)
-    count = int(per_s * seconds)
-    first = int(np.random.default_rng(seed).integers(len(times) - count))
-    part = times[first : first + count + 1] - times[first]
-    return [float(one) for one in part[:-1] * (seconds / part[-1])]
 
 
 class Others:
@@ -144,7 +134,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.urgency", description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=60.0, help="of each stream (default: %(default)s)")
     parser.add_argument("--load", type=float, default=0.9, help="of the worker (default: %(default)s)")
-    parser.add_argument("--demand", default="azure-code", help="a recording (default: %(default)s)")
+    parser.add_argument("--demand", default=USUAL, help="a recording (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="of the place in it (default: %(default)s)")
     flags = parser.parse_args()
     found: dict[bool, list[tuple[float, float, float]]] = {True: [], False: []}

@@ -24,6 +24,7 @@ NOT_CODE = (  # as patterns of git, from the root of the checkout
     "loadgen/datasets",
     "loadgen/scenarios",  # a measurement keeps the digest of those that it needs
     "benchmarks/capacity.json",
+    "benchmarks/costs",
     "benchmarks/figures",  # it runs the measurements, and writes the pages
     ".ci",
     ".gitignore",

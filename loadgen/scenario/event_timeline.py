@@ -78,8 +78,11 @@ class Timeline:
 
     def due(self, elapsed_s: float, answered: int) -> list[Event]:
         """The events that are due now and were not returned before."""
-        due = [event for event in self._left if _is_due(event, elapsed_s, answered)]
-        self._left = [event for event in self._left if event not in due]
+        due: list[Event] = []
+        left: list[Event] = []
+        for event in self._left:
+            (due if _is_due(event, elapsed_s, answered) else left).append(event)
+        self._left = left
         return due
 
     def left(self) -> Sequence[Event]:
