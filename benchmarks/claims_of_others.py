@@ -174,7 +174,7 @@ def servers_table(about: str, taken: Mapping[str, Played]) -> Table:
 
 
 def links_table(about: str, taken: Mapping[str, Sequence[Played]]) -> Table:
-    """Geometric means over the pairs of links, with intervals over pairs."""
+    """Means over the pairs of links; those of ratios are geometric, with intervals over pairs."""
     rows, better, behind = [], [], []
     for task, pairs in taken.items():
         p99_s = {name: np.array([one[name].percentile_s(99) for one in pairs]) for name in pairs[0]}
@@ -213,7 +213,7 @@ def links_table(about: str, taken: Mapping[str, Sequence[Played]]) -> Table:
 
 
 def families_table(taken: Mapping[tuple[str, str], Sequence[Played]]) -> Table:
-    """Geometric means over recordings, with their intervals; the better constant is that of the recording."""
+    """Means over recordings; those of ratios to the better constant are geometric, with intervals."""
     rows = []
     for (task, family), links in taken.items():
         better = [min((one[ONE], one[ROBOT_ALONE]), key=lambda of: of.mean_s) for one in links]

@@ -1,16 +1,18 @@
 """Measures every figure of the docs that is not up to date, and writes the pages that show them.
 
 A finished step is a file in docs/figures/, so Ctrl-C loses only the step under way: commit the files, and
-call it again later or on another machine. The files are up to date if no code was changed since then.
+call it again later or on another machine. A file is up to date if the code that its step runs was not changed
+since then.
 """
 
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from benchmarks.figures.measured import alone, keep, measure, read_all, why_old
+from benchmarks.figures.code_of_step import commit_of
+from benchmarks.figures.measured import Measured, alone, keep, measure, read_all, why_old
 from benchmarks.figures.page import pages
 from benchmarks.figures.step import ROOT, STEPS, Section, Unit, read_sections, units_of
 from offboard.common.command_line import CommandParser, add_flags, run_command
@@ -59,8 +61,8 @@ def _run(argv: Sequence[str]) -> int:
         raise ConfigError("this is no checkout that git can read, so the commit of the figures is unknown")
     change = f"the code was changed: commit {', '.join(changed[:MORE_FILES])} first"
     if config.list:
-        files, clean = read_all(chosen), commit.removesuffix("-dirty")
-        _print_states({unit: why_old(unit, files.get(unit.name), clean) for unit in chosen})
+        files = read_all(chosen)
+        _print_states({unit: _why_old(unit, files.get(unit.name)) for unit in chosen}, files)
         if changed:
             print(change)
         return 0
@@ -75,13 +77,13 @@ def _measure(units: Sequence[Unit], again: Sequence[Unit], sections: Sequence[Se
     """Measure one after the other. A step that fails leaves its older file; the others go on."""
     failed = []
     for number, unit in enumerate(units, 1):
-        why = why_old(unit, read_all([unit]).get(unit.name), commit)  # rows may be new since the last step
+        why = _why_old(unit, read_all([unit]).get(unit.name))  # rows may be new since the last step
         if not why and unit not in again:
             continue
         about = f"{why or 'again'}, about {unit.step.minutes:g} minutes"
         _say(f"{number} of {len(units)}: {unit.name}, {about}")
         try:
-            measured = measure(unit, commit, again=unit in again)
+            measured = measure(unit, _commit(unit), again=unit in again)
         except (OffloadError, OSError, subprocess.SubprocessError) as error:
             failed.append(f"{unit.name} is not measured: {error}")
             _say(failed[-1])
@@ -116,13 +118,23 @@ def _chosen(units: Sequence[Unit], names: Sequence[str], flag: str) -> list[Unit
     return [unit for unit in units if unit.name in names or unit.step.name in names]
 
 
-def _print_states(states: dict[Unit, str]) -> None:
+def _why_old(unit: Unit, measured: Measured | None) -> str:
+    return why_old(unit, measured, _commit(unit))
+
+
+def _commit(unit: Unit) -> str:
+    return commit_of(unit.commands()) or "unknown"
+
+
+def _print_states(states: dict[Unit, str], files: Mapping[str, Measured]) -> None:
     width = max(len(unit.name) for unit in states)
     for unit, why in states.items():
         needs = f"; needs {unit.step.needs}" if unit.step.needs else ""
         print(f"{unit.name:<{width}}  {unit.step.minutes:>5g} min  {why or 'up to date'}{needs}")
     left = sum(unit.step.minutes for unit, why in states.items() if why)
+    took_s = sum(one.seconds for one in files.values())
     print(f"{len(states)} measurements; those that are not up to date take about {left:g} minutes")
+    print(f"those that there are took {took_s / 3600:.1f} hours")
 
 
 def _say(text: str) -> None:

@@ -112,6 +112,7 @@ class Player:
                 self._recorded.remove(server)
         for event in self._timeline.due(now_s, answered):
             write_event(json.dumps(self._happened(event, self._began_s)) + "\n")
+            self._say(f"event: {event.in_words()}")
         if now_s >= self._next_sample_s:
             self._next_sample_s += READ_EVERY_S
             for part in sorted(self._parts - self._paused):

@@ -3,8 +3,11 @@
 An event is data here; `play` decides when to look for due events and applies them to the testbed.
 """
 
+import json
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +49,14 @@ class Event:
         where = {} if self.on is None else {ON: self.on}
         return {**when, **where, self.action: self.value}
 
+    def in_words(self) -> str:
+        """Such as `link outage = true`, `hogs cloud = 4` or `kill cloud`."""
+        if isinstance(self.value, Mapping):
+            said = " " + ", ".join(f"{name} = {json.dumps(one)}" for name, one in self.value.items())
+        else:
+            said = "" if self.value is True else f" {self.value}"
+        return f"{self.action}{said}" + ("" if self.on is None else f" on {self.on}")
+
     def apply(self, testbed: Testbed) -> None:
         match self.action:
             case "link":
@@ -70,23 +81,27 @@ class Event:
         return tuple(self.value) if self.action in ("cpus", "hogs") else ()
 
 
+_Numbered = tuple[int, Event]  # its place in the file
+
+
 class Timeline:
     """Returns each event once, when it is due. Events that are due together keep the order of the file."""
 
     def __init__(self, events: Sequence[Event]) -> None:
-        self._left = list(events)
+        numbered = list(enumerate(events))
+        self._timed = deque(sorted((one for one in numbered if one[1].at_s is not None), key=_when))
+        self._counted = deque(sorted((one for one in numbered if one[1].at_s is None), key=_when))
 
     def due(self, elapsed_s: float, answered: int) -> list[Event]:
         """The events that are due now and were not returned before."""
-        due: list[Event] = []
-        left: list[Event] = []
-        for event in self._left:
-            (due if _is_due(event, elapsed_s, answered) else left).append(event)
-        self._left = left
-        return due
+        due: list[_Numbered] = []
+        for queue, now in ((self._timed, elapsed_s), (self._counted, answered)):
+            while queue and _when(queue[0]) <= now:
+                due.append(queue.popleft())
+        return _in_order(due)
 
     def left(self) -> Sequence[Event]:
-        return tuple(self._left)
+        return tuple(_in_order([*self._timed, *self._counted]))
 
 
 def absent_at_first(events: Sequence[Event]) -> set[str]:
@@ -206,8 +221,13 @@ def _number(key: str, value: Any, low: float, high: float) -> float:
     return float(value)
 
 
-def _is_due(event: Event, elapsed_s: float, answered: int) -> bool:
-    if event.at_s is not None:
-        return elapsed_s >= event.at_s
-    assert event.at_task is not None
-    return answered >= event.at_task
+def _when(numbered: _Numbered) -> float:
+    """When an event is due: seconds, or answered tasks."""
+    _, event = numbered
+    when = event.at_task if event.at_s is None else event.at_s
+    assert when is not None, "checked when the file was read"
+    return when
+
+
+def _in_order(numbered: list[_Numbered]) -> list[Event]:
+    return [event for _, event in sorted(numbered, key=itemgetter(0))]

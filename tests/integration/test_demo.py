@@ -96,11 +96,23 @@ def test_the_demo_ends_in_three_sentences(
     short = replace(whole.changed(tasks=24), events=events, robot=replace(whole.robot, window=4))
     monkeypatch.setattr(demo, "read_scenario", lambda _: short)
     assert demo.play_demo(tmp_path) == 0
-    first, *_, compared, result, next_step = capsys.readouterr().out.splitlines()
+    first, *between, compared, result, next_step = capsys.readouterr().out.splitlines()
+    assert [line for line in between if line.startswith("event: ")] == [
+        "event: link outage = true",
+        "event: link outage = false",
+    ] * 2
     assert re.fullmatch(r"live page: http://127\.0\.0\.1:\d+/live", first)
-    assert "the same 24 plans, in real processes on this machine, with Offboard" in compared
-    assert compared.endswith("the link to the server was silent from plan 10 to plan 14.")
-    assert re.match(r"Result: from question to path, a plan took [\d.]+ ms in the mean with Offboard", result)
+    assert "the same 24 plans, once with Offboard and once with the published rule" in compared
+    assert compared.endswith("30 ms away, and a link that was silent from plan 10 to plan 14.")
+    assert re.match(r"Result: a plan took [\d.]+ ms in the mean with Offboard and [\d.]+ m?s with", result)
+    slowest = [
+        max(one["waited_s"] for one in read_trace(folder / "trace.jsonl"))
+        for folder in (tmp_path, tmp_path / "paper")
+    ]
+    said = re.search(r"the slowest one ([\d.]+) (m?s) and ([\d.]+) (m?s); Offboard sent", result)
+    assert said is not None
+    for seconds, number, unit in zip(slowest, said.groups()[::2], said.groups()[1::2], strict=True):
+        assert float(number) * (1e-3 if unit == "ms" else 1) == pytest.approx(seconds, rel=0.3, abs=0.02)
     assert f"`loadgen watch {tmp_path}`" in next_step
     assert f"{tmp_path / 'plan.png'} is a picture of the last plan" in next_step
     runs = [list(read_trace(folder / "trace.jsonl")) for folder in (tmp_path, tmp_path / "paper")]

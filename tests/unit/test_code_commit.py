@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.figures.code_of_step import benchmarks_of, commit_of
+from benchmarks.figures.step import ROOT
 from offboard.loadgen.play.machine import changed_code, commit_here
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="no git; remedy: apt-get install git")
@@ -91,3 +93,28 @@ def test_outside_a_checkout_there_is_none(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
     assert commit_here() is None
+
+
+def test_a_step_runs_the_benchmarks_that_it_names_and_those_that_they_import() -> None:
+    """Also by a path in a string, and as a table of `python -m benchmarks`; no other benchmarks."""
+
+    def names(*commands: str) -> set[str]:
+        return {path.stem for path in benchmarks_of(commands)}
+
+    assert names("loadgen compare calm --policies default") == set()
+    assert names("python -m benchmarks.streams .cache/links/cicv5g") == {"streams", "measure"}
+    assert {"ablations", "left_out", "against", "simulated_sets"} <= names("python -m benchmarks.ablations")
+    decision = names("python -m benchmarks decision")
+    assert {"__main__", "decision", "measure"} <= decision
+    assert decision.isdisjoint({"streams", "ablations", "claims_of_others", "pipeline"})
+
+
+def test_the_commit_of_a_step_is_not_older_than_that_of_the_product() -> None:
+    """And a step that runs no benchmark has the commit of the product."""
+    product = commit_of(["loadgen table"])
+    if product is None:
+        pytest.skip("this is no checkout")
+    for command in ("python -m benchmarks.streams X", "python -m benchmarks.claims_of_others families X"):
+        found = commit_of([command])
+        assert found is not None
+        subprocess.run(["git", "merge-base", "--is-ancestor", product, found], cwd=ROOT, check=True)
