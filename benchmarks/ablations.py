@@ -102,6 +102,7 @@ LEFT_OUT: dict[str, LeftOut] = {
     "change": _predictor("Change"),
     "change to slower": _predictor("BadNews"),
     "change to faster at once": _predictor("GoodNews"),
+    "change doubles at most": _predictor("Doubling"),
     "bound": _predictor("Bound"),
     "late runs": _predictor("Late"),
     "PACE": _predictor("Pace"),

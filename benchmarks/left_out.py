@@ -28,6 +28,7 @@ class Switched(Line):
     outliers = True  # a time beyond the reach counts only up to it
     good_news = True  # one outlier below the line is a change
     bad_news = True  # two outliers above it are one
+    doubling = True  # a change about doubles the time at most
 
     def learn(self, x: float, y: float, apart_s: float = 0.0) -> None:
         self.count += 1
@@ -44,6 +45,7 @@ class Switched(Line):
         again = side != 0 and side == self._side
         changed = (self.good_news and side < 0) or (self.bad_news and again)
         if changed:
+            error = min(error, unit) if self.doubling else error
             self._loosen(min(1.0, (error / unit) ** 2), apart_s)
             variance, reach = self._reach(x, unit)
         self._side = side
@@ -77,6 +79,10 @@ class _WithoutBadNews(Switched):
 
 class _WithoutChange(Switched):
     good_news = bad_news = False
+
+
+class _WithoutDoubling(Switched):
+    doubling = False
 
 
 class _WithoutTail(Line):
@@ -118,6 +124,12 @@ class Change(Parts):
     """No outlier is a change."""
 
     LINE = _WithoutChange
+
+
+class Doubling(Parts):
+    """A change may make a prediction as long as the time that showed it."""
+
+    LINE = _WithoutDoubling
 
 
 class Tail(Parts):

@@ -75,6 +75,9 @@ class Line:
         side = math.copysign(1.0, error) if abs(error) > reach else 0.0
         changed = side < 0 or (side != 0 and side == self._side)
         if changed:
+            error = min(
+                error, unit
+            )  # a change about doubles the time at most, until the next one confirms it
             self._loosen(min(1.0, (error / unit) ** 2), apart_s)
             variance, reach = self._reach(x, unit)
         self._side = side

@@ -70,14 +70,17 @@ def test_one_outlier_moves_the_line_little() -> None:
 
 
 def test_two_outliers_on_one_side_are_a_change() -> None:
-    """The second slow time in a row is believed for a large part, and never more than it says."""
+    """The second slow time in a row is believed for a large part, though it about doubles the line at most.
+
+    Otherwise two stalls of seconds keep a robot away from a server for as long as nobody asks it.
+    """
     line = taught(noise=0.05)
     before_s = line.at(1.0)
     news(line, 1.8, times=2)
     assert line.at(1.0) > 1.5 * before_s
     far = taught(noise=0.05)
     news(far, 10.0, times=2)
-    assert before_s * 1.5 < far.at(1.0) < before_s * 10.0
+    assert before_s * 1.5 < far.at(1.0) < before_s * 2.2
     news(far, 10.0 * before_s / far.at(1.0), times=6)
     assert far.at(1.0) == pytest.approx(10.0 * before_s, rel=0.1)
 
