@@ -46,7 +46,7 @@ LONG = (
                 "packing",
                 "recorded_run",
             ),
-            *("robot_workload", "scarce", "servers_on_loopback", "silent_outage"),
+            *("robot_workload", "scarce", "silent_outage"),
             *("stream_faults", "task_cost"),
             *("terminal", "values_cross", "wan_recording", "watch", "wheel"),
         )
@@ -64,7 +64,10 @@ ALONE = (
     "compose/test_image.py",
     *(
         f"integration/test_{name}.py"
-        for name in ("testbed", "three_sites", "variants", "wan", "wan_effects", "wan_speed")
+        for name in (
+            *("servers_on_loopback", "testbed", "three_sites", "variants"),
+            *("wan", "wan_effects", "wan_speed"),
+        )
     ),
 )
 

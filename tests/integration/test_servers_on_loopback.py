@@ -49,8 +49,7 @@ def test_the_near_server_is_used_until_it_dies(tmp_path: Path) -> None:
     assert (found["lost"], found["wrong"], found["failed"]) == (0, 0, 0)
     before, after = played.outcome.between(8, 20), played.outcome.between(25)
     assert (site_percent(before, "edge") or 0) >= 60
-    assert site_percent(after, "edge") == 0
-    assert (site_percent(after, "cloud") or 0) >= 50  # of fifteen tasks; next to other tests, not all
+    assert (site_percent(after, "edge"), site_percent(after, "cloud")) == (0, pytest.approx(100, abs=30))
     # The reference of the last task before the death of the server may come after it.
     references = [one for one in played.outcome.references if one.i < 19]
     assert all(one.seconds.keys() == {"onboard", "cloud", "edge"} for one in references)

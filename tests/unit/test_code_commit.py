@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.figures import code_of_step
 from benchmarks.figures.code_of_step import benchmarks_of, commit_of
-from benchmarks.figures.step import ROOT
 from offboard.loadgen.play.machine import changed_code, commit_here
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="no git; remedy: apt-get install git")
@@ -109,12 +109,27 @@ def test_a_step_runs_the_benchmarks_that_it_names_and_those_that_they_import() -
     assert decision.isdisjoint({"streams", "ablations", "claims_of_others", "pipeline"})
 
 
-def test_the_commit_of_a_step_is_not_older_than_that_of_the_product() -> None:
-    """And a step that runs no benchmark has the commit of the product."""
-    product = commit_of(["loadgen table"])
-    if product is None:
-        pytest.skip("this is no checkout")
-    for command in ("python -m benchmarks.streams X", "python -m benchmarks.claims_of_others families X"):
-        found = commit_of([command])
-        assert found is not None
-        subprocess.run(["git", "merge-base", "--is-ancestor", product, found], cwd=ROOT, check=True)
+@pytest.mark.usefixtures("checkout")
+def test_a_change_of_one_benchmark_makes_only_its_own_steps_older() -> None:
+    """The commit of a step is the last one of the product, or of a benchmark that it runs."""
+
+    def commits() -> list[str | None]:
+        for asked in (code_of_step._last, code_of_step._place):
+            asked.cache_clear()
+        return [commit_of([one]) for one in ("loadgen table", "python -m benchmarks.streams X")]
+
+    def head() -> str:
+        return git("rev-parse", "--short=12", "HEAD").strip()
+
+    try:
+        product = head()
+        assert commits() == [product, product]
+        commit("benchmarks/pipeline.py", "1")
+        assert commits() == [product, product]
+        commit("benchmarks/streams.py", "1")
+        assert commits() == [product, head()]
+        commit("code.py", "2")
+        assert commits() == [head(), head()]
+    finally:
+        for asked in (code_of_step._last, code_of_step._place):
+            asked.cache_clear()
